@@ -1,0 +1,81 @@
+"""What can go wrong, and how it is told: one base error, its few children, and the outcomes of a run.
+
+Bad input raises at once; its message is one sentence that says what was got and what is allowed. A numerical
+event during a run is not an exception but an `Outcome`, kept beside the data that was computed.
+"""
+
+import difflib
+import enum
+from collections.abc import Iterable
+
+
+class EchelonError(Exception):
+    """Base of every error that echelon raises on purpose; `exit_code` is what the command line returns."""
+
+    exit_code = 2
+
+
+class ModelError(EchelonError):
+    """An agent's model has a wrong shape, a non-finite value, a false trim or an impossible parameter."""
+
+
+class GraphError(EchelonError):
+    """A communication graph is malformed, disconnected or has no leader."""
+
+
+class FormationError(EchelonError):
+    """An offset has a wrong length, belongs to no agent or cannot be built."""
+
+
+class ReferenceError(EchelonError):
+    """A reference is malformed or cannot be followed by the model."""
+
+
+class GainError(EchelonError):
+    """A gain cannot be synthesized or does not fit the model, the graph or the law."""
+
+
+class LawError(EchelonError):
+    """A control law does not fit the model or is given an option it lacks."""
+
+
+class SimulationError(EchelonError):
+    """The settings of a simulation are out of range."""
+
+
+class ScenarioError(EchelonError):
+    """A scenario file has faults; the message holds one line for each of them."""
+
+
+class OutputError(EchelonError):
+    """Results cannot be written where they were asked for."""
+
+
+class MissingExtraError(EchelonError):
+    """An optional part of echelon is not installed."""
+
+    exit_code = 4
+
+
+class Outcome(enum.Enum):
+    """How a run ended; the value is the sentence that a person reads."""
+
+    COMPLETED = "The run reached its horizon."
+    DIVERGED = "A state stopped being finite; everything computed before it is kept."
+    INTERRUPTED = "The run was interrupted; everything computed before it is kept."
+
+    @property
+    def exit_code(self) -> int:
+        """Exit code of the command line for a run that ended so."""
+        return {Outcome.COMPLETED: 0, Outcome.DIVERGED: 3, Outcome.INTERRUPTED: 130}[self]
+
+
+def did_you_mean(got: object, allowed: Iterable[str]) -> str:
+    """Return `` (did you mean `name`?)`` when `got` is close to an allowed name, else an empty string."""
+    close = difflib.get_close_matches(str(got), list(allowed), n=1, cutoff=0.6)
+    return f" (did you mean `{close[0]}`?)" if close else ""
+
+
+def listing(names: Iterable[str]) -> str:
+    """Return names in back-ticks, separated by commas, for use inside a message."""
+    return ", ".join(f"`{name}`" for name in names)

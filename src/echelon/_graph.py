@@ -1,0 +1,292 @@
+"""The communication graph: undirected, weighted or not, with one or more leaders (paper, Definition 2)."""
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
+import scipy.sparse.linalg as spla
+
+from echelon._errors import GraphError
+from echelon._types import Matrix, States
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+# Below this many followers the dense eigenvalue routine is both faster and exact to rounding.
+_DENSE = 400
+
+
+@final
+class Graph:
+    """An immutable undirected graph on agents 0 .. N-1, some of which are leaders.
+
+    Attributes:
+        edges: (E, 2) integers, each edge once with the smaller agent first, in the order given.
+        weights: (E,) positive weights A_ij.
+        agents: the number N of agents, leaders included.
+        leaders: sorted agent numbers.
+        followers: all other agents, sorted.
+
+    Raises:
+        GraphError: an edge is a self-loop, repeated or out of range; a weight is not positive and finite; there
+            is no leader or nothing but leaders; the graph is disconnected.
+    """
+
+    def __init__(
+        self,
+        edges: Iterable[Sequence[float]],
+        leaders: Iterable[int] = (0,),
+        agents: int | None = None,
+    ) -> None:
+        """Check and keep the graph; an edge is (i, j) or (i, j, weight)."""
+        pairs, weights = _split([tuple(edge) for edge in edges])
+        self.agents = _count_agents(pairs, agents)
+        self.edges, self.weights = _checked_edges(pairs, weights, self.agents)
+        self.leaders = _checked_leaders(leaders, self.agents)
+        self.followers = tuple(np.setdiff1d(np.arange(self.agents), self.leaders).tolist())
+        if not self.followers:
+            raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
+        self._check_connected()
+        for array in (self.edges, self.weights):
+            array.setflags(write=False)
+
+    @classmethod
+    def from_edges(
+        cls, edges: Iterable[Sequence[float]], leaders: Iterable[int] = (0,), agents: int | None = None
+    ) -> "Graph":
+        """Return the graph of the given edges; `agents` defaults to the largest number named, plus one."""
+        return cls(edges, leaders, agents)
+
+    @classmethod
+    def from_networkx(cls, graph: "nx.Graph[Any]", leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1; `weight` is read.
+
+        Raises:
+            GraphError: the graph is directed or its nodes are not 0 .. N-1.
+        """
+        if graph.is_directed():
+            raise GraphError("the networkx graph is directed, and must be undirected.")
+        if set(graph.nodes) != set(range(len(graph))):
+            raise GraphError("the nodes of the networkx graph must be the whole numbers from 0 on, without a gap.")
+        edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
+        return cls(edges, leaders, len(graph))
+
+    @classmethod
+    def path(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the line 0 - 1 - ... - (agents - 1)."""
+        _at_least(agents, 2, "path")
+        return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents)
+
+    @classmethod
+    def ring(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the closed line."""
+        _at_least(agents, 3, "ring")
+        return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents)
+
+    @classmethod
+    def star(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the star with agent 0 in the middle."""
+        _at_least(agents, 2, "star")
+        return cls([(0, i) for i in range(1, agents)], leaders, agents)
+
+    @classmethod
+    def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the graph with every edge."""
+        _at_least(agents, 2, "complete")
+        return cls(np.stack(np.triu_indices(agents, 1), axis=1).tolist(), leaders, agents)
+
+    @classmethod
+    def grid(cls, rows: int, columns: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return rows x columns agents, numbered row by row, linked to the nearest four."""
+        _at_least(rows * columns, 2, "grid")
+        number = np.arange(rows * columns).reshape(rows, columns)
+        across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
+        down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
+        return cls(np.concatenate([across, down]).tolist(), leaders, rows * columns)
+
+    @classmethod
+    def geometric(cls, agents: int, radius: float, seed: int = 0, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return random points of the unit square, linked where closer than `radius`.
+
+        Raises:
+            GraphError: the radius is too small for the points to be connected.
+        """
+        from scipy.spatial import cKDTree
+
+        _at_least(agents, 2, "geometric")
+        points = np.random.default_rng(seed).uniform(size=(agents, 2))
+        pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+        return cls(pairs[np.lexsort(pairs.T[::-1])].tolist(), leaders, agents)
+
+    def adjacency(self) -> sp.csr_array:
+        """Return the symmetric adjacency matrix (N, N), sparse."""
+        i, j = self.edges.T
+        both = (np.concatenate([i, j]), np.concatenate([j, i]))
+        values = np.concatenate([self.weights, self.weights])
+        return sp.csr_array(sp.coo_array((values, both), shape=(self.agents, self.agents)))
+
+    def laplacian(self) -> sp.csr_array:
+        """Return the Laplacian (N, N), sparse; its rows sum to zero."""
+        return sp.csr_array(csgraph.laplacian(self.adjacency()))
+
+    def grounded_laplacian(self) -> sp.csr_array:
+        """Return the follower block of the Laplacian, sparse: the paper's L of Lemma 1, positive definite."""
+        rows = np.asarray(self.followers)
+        return sp.csr_array(self.laplacian()[rows][:, rows])
+
+    def inverse_grounded(self) -> Matrix:
+        """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
+        return np.linalg.inv(self.grounded_laplacian().toarray())
+
+    def grounded_spectrum(self) -> tuple[float, float]:
+        """Return the smallest and the largest eigenvalue of the grounded Laplacian."""
+        L = self.grounded_laplacian()
+        if len(self.followers) <= _DENSE:
+            values = np.linalg.eigvalsh(L.toarray())
+            return float(values[0]), float(values[-1])
+        smallest = spla.eigsh(sp.csc_array(L), k=1, sigma=0.0, return_eigenvectors=False)
+        largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
+        return float(smallest[0]), float(largest[0])
+
+    def neighbours(self, agent: int) -> tuple[int, ...]:
+        """Return the agents linked to `agent`, sorted."""
+        i, j = self.edges.T
+        return tuple(sorted(np.concatenate([j[i == agent], i[j == agent]]).tolist()))
+
+    def nearest_leader(self) -> tuple[int, ...]:
+        """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
+        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+        return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
+
+    def exchange(self) -> "Exchange":
+        """Return the computation of the disagreement on this graph, ready for JAX."""
+        i, j = self.edges.T
+        return Exchange(
+            receivers=np.concatenate([i, j]),
+            senders=np.concatenate([j, i]),
+            weights=np.concatenate([self.weights, self.weights]),
+        )
+
+    def disagreement(self, y: States) -> States:
+        """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""
+        return self.exchange()(y, y)
+
+    def relabelled(self, order: Sequence[int]) -> "Graph":
+        """Return the same graph with agent i renamed to order[i]."""
+        order = np.asarray(order)
+        edges = np.column_stack([order[self.edges], self.weights])
+        return Graph(edges.tolist(), order[list(self.leaders)].tolist(), self.agents)
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether two graphs have the same agents, leaders and edges in the same order."""
+        return (
+            isinstance(other, Graph)
+            and (self.agents, self.leaders) == (other.agents, other.leaders)
+            and np.array_equal(self.edges, other.edges)
+            and np.array_equal(self.weights, other.weights)
+        )
+
+    def __hash__(self) -> int:
+        """Hash what `__eq__` compares."""
+        return hash((self.agents, self.leaders, self.edges.tobytes(), self.weights.tobytes()))
+
+    def __repr__(self) -> str:
+        """Say the size."""
+        return f"Graph({self.agents} agents, {len(self.edges)} edges, leaders {list(self.leaders)})"
+
+    def _check_connected(self) -> None:
+        count, label = csgraph.connected_components(self.adjacency(), directed=False)
+        if count == 1:
+            return
+        reached = np.isin(label, label[list(self.leaders)])
+        lost = np.flatnonzero(~reached)
+        if len(lost):
+            raise GraphError(f"the graph is disconnected: {_some(lost)} no path to a leader ({_leaders(self)}).")
+        apart = np.flatnonzero(label != label[0])
+        raise GraphError(f"the graph is disconnected: {_some(apart)} no path to agent 0.")
+
+
+class Exchange(eqx.Module):
+    """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
+
+    The agents' own values and the values that they said are separate arguments, since on a real network the
+    second may be old or lost.
+    """
+
+    receivers: Matrix
+    senders: Matrix
+    weights: Matrix
+
+    def __call__(self, own: States, said: States) -> States:
+        """Return z (N, n), z_i = sum_j A_ij (own_i - said_j)."""
+        weights = jnp.asarray(self.weights, own.dtype)[:, None]
+        # Differences before sums: at consensus they vanish exactly, sums of positions would leave rounding.
+        differences = weights * (own[self.receivers] - said[self.senders])
+        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
+
+
+def _split(edges: list[tuple[float, ...]]) -> tuple[list[tuple[float, ...]], list[float]]:
+    for edge in edges:
+        if len(edge) not in (2, 3):
+            raise GraphError(f"an edge is {list(edge)}, and must be [i, j] or [i, j, weight].")
+    return [edge[:2] for edge in edges], [edge[2] if len(edge) == 3 else 1.0 for edge in edges]
+
+
+def _count_agents(pairs: list[tuple[float, ...]], agents: int | None) -> int:
+    named = max((int(max(pair)) for pair in pairs), default=0) + 1
+    if agents is None:
+        agents = named
+    _at_least(agents, 2, "graph")
+    if named > agents:
+        raise GraphError(f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}.")
+    return agents
+
+
+def _checked_edges(
+    pairs: list[tuple[float, ...]], weights: list[float], agents: int
+) -> tuple[Matrix, Matrix]:
+    seen: set[tuple[int, int]] = set()
+    for pair, weight in zip(pairs, weights, strict=True):
+        i, j = sorted(int(end) for end in pair)
+        if (i, j) != tuple(sorted(pair)) or i < 0:
+            raise GraphError(f"an edge is {list(pair)}, and agents are whole numbers from 0 to {agents - 1}.")
+        if i == j:
+            raise GraphError(f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents.")
+        if (i, j) in seen:
+            raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
+        if not 0.0 < weight < float("inf"):
+            raise GraphError(f"the weight of edge [{i}, {j}] is {weight}, and must be positive and finite.")
+        seen.add((i, j))
+    array = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return np.sort(array, axis=1), np.array(weights, dtype=np.float64)
+
+
+def _checked_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
+    chosen = tuple(sorted({int(leader) for leader in leaders}))
+    if not chosen:
+        raise GraphError("the graph has no leader; name at least one agent in `leaders`.")
+    for leader in chosen:
+        if not 0 <= leader < agents:
+            raise GraphError(f"leader {leader} is no agent; agents are numbered from 0 to {agents - 1}.")
+    return chosen
+
+
+def _at_least(agents: int, least: int, kind: str) -> None:
+    if agents < least:
+        raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
+
+
+def _some(agents: np.ndarray) -> str:
+    """Return a subject such as `agents 2, 3 have`, shortened when there are many."""
+    shown = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
+    return f"agent {shown} has" if len(agents) == 1 else f"agents {shown} have"
+
+
+def _leaders(graph: Graph) -> str:
+    kind = "leader" if len(graph.leaders) == 1 else "leaders"
+    return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"

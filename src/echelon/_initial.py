@@ -1,0 +1,62 @@
+"""Where the agents start: leaders on their reference, followers about their goals."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from echelon._errors import SimulationError
+from echelon._formation import Formation
+from echelon._graph import Graph
+from echelon.laws.law import Law
+from echelon.models.model import ControlAffine
+
+
+def initial_states(
+    model: ControlAffine,
+    graph: Graph,
+    formation: Formation,
+    leader: Law,
+    initial: Mapping[str, float] | np.ndarray | None,
+    start_error: Mapping[str, float],
+    seed: int,
+) -> np.ndarray:
+    """Return the states (N, n) at time zero.
+
+    A leader starts where its law says, at its own offset, plus `start_error`. A follower starts at its goal
+    relative to its nearest leader, plus a uniform random deviation within +- the spread of each state. The same
+    seed draws the same deviations whatever the spreads are.
+
+    Raises:
+        SimulationError: given states have a wrong shape or are not finite; a spread is negative.
+        ModelError: a spread or error names no state or group.
+    """
+    shape = (graph.agents, len(model.state_names))
+    if initial is not None and not isinstance(initial, Mapping):
+        return _given(initial, shape)
+    spread = _per_state(model, initial or {}, "initial spread")
+    if (spread < 0.0).any():
+        raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
+    error = _per_state(model, start_error, "start error")
+    leaders = np.asarray(leader.start(model), np.float64) + error
+    deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
+    deviations[list(graph.leaders)] = 0.0
+    return leaders + formation.offsets + deviations
+
+
+def _given(states: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    array = np.array(states, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise SimulationError(
+            f"initial states have shape {array.shape}, and must be finite with shape {shape} (agents, states)."
+        )
+    return array
+
+
+def _per_state(model: ControlAffine, named: Mapping[str, float], what: str) -> np.ndarray:
+    """Return one number a state from numbers by state or group; a state's own number wins over its group's."""
+    values = np.zeros(len(model.state_names))
+    for name in sorted(named, key=lambda name: name in model.state_names):
+        if not np.isfinite(named[name]):
+            raise SimulationError(f"the {what} of `{name}` is {named[name]}, and must be finite.")
+        values[list(model.states_called(name))] = named[name]
+    return values

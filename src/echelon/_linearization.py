@@ -1,0 +1,30 @@
+"""The linear system that a model is near its trim, in normalized inputs."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon._types import Matrix, State
+from echelon.models.model import ControlAffine
+
+
+class Linearization(NamedTuple):
+    """A (n, n) and B (n, m) of the deviation from the trim, float64."""
+
+    A: Matrix
+    B: Matrix
+
+
+def linearize(model: ControlAffine) -> Linearization:
+    """Return A = d(f + g u*)/dx and B = g S at the trim."""
+    x = jnp.asarray(np.asarray(model.trim[0], float))
+    A, B = _slopes(model, x)
+    return Linearization(np.asarray(A, np.float64), np.asarray(B, np.float64))
+
+
+@eqx.filter_jit
+def _slopes(model: ControlAffine, x: State) -> tuple[jax.Array, jax.Array]:
+    return jax.jacfwd(model.normalized_drift)(x), model.normalized_input_map(x)

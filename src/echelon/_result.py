@@ -1,0 +1,95 @@
+"""What a run leaves behind: everything that metrics, figures and files read, in float64 NumPy."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from echelon._errors import Outcome
+from echelon._formation import Formation
+from echelon._graph import Graph
+from echelon._types import Matrix
+from echelon.laws.law import Law
+from echelon.models.model import ControlAffine
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Settings(NamedTuple):
+    """How a run was computed: horizon and dt in s; see `simulate` for the rest."""
+
+    horizon: float
+    dt: float
+    integrator: str
+    limits: bool
+    store_every: int
+    precision: str
+    seed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """A run: T stored frames of N agents with n states and m inputs.
+
+    Attributes:
+        times: (T,) s.
+        states: (T, N, n).
+        inputs: (T, N, m), physical, as delivered by the actuators from each frame on.
+        reference: (T, n), the leader's reference state, or None where it follows nothing.
+        saturated: (N,) the fraction of steps in which an actuator limit changed the agent's input.
+        outcome: how the run ended; `message` says it with time and agent.
+        warnings: what is allowed but probably not meant, one sentence each.
+        model, graph, formation, leader, follower, settings: the parts that ran.
+        wall_time: seconds of computing, compilation included.
+        provenance: scenario text, versions and the like, as text.
+    """
+
+    times: Matrix
+    states: Matrix
+    inputs: Matrix
+    reference: Matrix | None
+    saturated: Matrix
+    outcome: Outcome
+    message: str
+    warnings: tuple[str, ...]
+    model: ControlAffine
+    graph: Graph
+    formation: Formation
+    leader: Law
+    follower: Law
+    settings: Settings
+    wall_time: float
+    provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def errors(self) -> Matrix:
+        """Deviation of each agent from its goal relative to its leader, (T, N, n); zero rows for leaders."""
+        y = self.states - self.formation.offsets
+        return y - y[:, list(self.graph.nearest_leader())]
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """Indices of the states that errors are measured on: the position where there is one, else all."""
+        return self.model.position_indices() or tuple(range(len(self.model.state_names)))
+
+    @property
+    def unit(self) -> str:
+        """The unit of errors: m for a position, `state` for abstract states."""
+        return "m" if self.model.position else "state"
+
+    def with_provenance(self, **texts: str) -> "Result":
+        """Return the same run with more provenance."""
+        return dataclasses.replace(self, provenance={**self.provenance, **texts})
+
+    def as_xarray(self) -> "xr.Dataset":
+        """Return the run as a labelled dataset (see `echelon.dataset`)."""
+        from echelon._archive import dataset
+
+        return dataset(self)
+
+
+def finite_or_none(value: Any) -> float | None:
+    """Return a number as a float, or None where it does not exist or is not finite."""
+    return float(value) if value is not None and np.isfinite(value) else None

@@ -1,0 +1,326 @@
+"""The closed loop in time: parts in, one `Result` out. This file sees only the interfaces of models and laws."""
+
+import functools
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon import _numerics
+from echelon._errors import Outcome, SimulationError, did_you_mean, listing
+from echelon._formation import Formation
+from echelon._graph import Exchange, Graph
+from echelon._initial import initial_states
+from echelon._result import Result, Settings
+from echelon._types import Inputs, Matrix, Scalar, States
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.models.check import check_model
+from echelon.models.model import ControlAffine
+
+Progress = Callable[[int, int], None]
+"""Called now and then with the steps done and the steps in all."""
+
+_CHUNKS = 100
+
+
+class Loop(eqx.Module):
+    """All that never changes during a run. Agents are kept in their own order; leaders act first in a step."""
+
+    model: ControlAffine
+    leader: Law
+    follower: Law
+    exchange: Exchange
+    offsets: Matrix
+    leaders: Matrix
+    followers: Matrix
+    sender: Matrix
+    order: Matrix
+    normalizer: Matrix
+    dt: float = eqx.field(static=True)
+    integrator: str = eqx.field(static=True)
+    limits: bool = eqx.field(static=True)
+
+
+class Moment(NamedTuple):
+    """All that changes: step number, states (N, n), memories of leaders and followers, saturated steps (N,)."""
+
+    step: jax.Array
+    states: States
+    leader_memory: Memory
+    follower_memory: Memory
+    saturated: jax.Array
+
+
+def simulate(
+    model: ControlAffine,
+    graph: Graph,
+    formation: Formation,
+    *,
+    leader: Law,
+    follower: Law,
+    initial: Mapping[str, float] | np.ndarray | None = None,
+    start_error: Mapping[str, float] | None = None,
+    horizon: float,
+    dt: float,
+    integrator: str = "rk4",
+    limits: bool = True,
+    store_every: int = 1,
+    seed: int = 0,
+    precision: _numerics.Precision = "float64",
+    progress: Progress | None = None,
+) -> Result:
+    """Run the closed loop and return what happened.
+
+    Args:
+        model: the agents, all alike.
+        graph: who hears whom, and who leads.
+        formation: the goal offsets, (N, n).
+        leader: law of the leaders.
+        follower: law of all others.
+        initial: spread of the followers' starts about their goals, per state or group (uniform within +- the
+            number), or all states (N, n) given.
+        start_error: what is added to the leaders' starts, per state or group.
+        horizon: length of the run, s; rounded to whole steps.
+        dt: step, s.
+        integrator: `rk4`, `euler` or `printed`; the input is held over a step.
+        limits: whether the model's actuator limits act.
+        store_every: steps between stored frames; the last state is always stored.
+        seed: of the random starts.
+        precision: `float64` or `float32`, whatever the flags of JAX are.
+        progress: called about a hundred times with (steps done, steps in all).
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others. A run that diverges or is interrupted by
+            Ctrl-C is no error: the result says so and holds what was computed.
+    """
+    settings = Settings(horizon, dt, integrator, limits, store_every, precision, seed)
+    check_settings(settings)
+    began = time.perf_counter()
+    with _numerics.precision(precision):
+        warnings = check_model(model)
+        leader, follower = leader.prepared(model, graph), follower.prepared(model, graph)
+        loop = _assemble(model, graph, formation, leader, follower, settings)
+        states = initial_states(model, graph, formation, leader, initial, start_error or {}, seed)
+        record = _run(loop, states, _frame_counts(settings), progress)
+        times = jnp.asarray(record.times)
+        reference = leader.reference_states(model, times) if len(record.times) else None
+    outcome, message = _verdict(record, graph)
+    return Result(
+        times=record.times,
+        states=record.states,
+        inputs=record.inputs,
+        reference=None if reference is None else np.asarray(reference, np.float64),
+        saturated=record.saturated,
+        outcome=outcome,
+        message=message,
+        warnings=warnings + _formation_warnings(model, formation),
+        model=model,
+        graph=graph,
+        formation=formation,
+        leader=leader,
+        follower=follower,
+        settings=settings,
+        wall_time=time.perf_counter() - began,
+    )
+
+
+def check_settings(settings: Settings) -> None:
+    """Check the numbers of a simulation.
+
+    Raises:
+        SimulationError: one is out of range.
+    """
+    horizon, dt = settings.horizon, settings.dt
+    for name, value in (("horizon", horizon), ("dt", dt)):
+        if not 0.0 < value < math.inf:
+            raise SimulationError(f"`{name}` is {value}, and must be a positive finite number of seconds.")
+    if horizon < dt:
+        raise SimulationError(f"`horizon` is {horizon} s, and must be at least one step `dt` = {dt} s.")
+    if settings.integrator not in _numerics.INTEGRATORS:
+        known = _numerics.INTEGRATORS
+        raise SimulationError(
+            f"`integrator` is `{settings.integrator}`, allowed are {listing(known)}"
+            f"{did_you_mean(settings.integrator, known)}."
+        )
+    if settings.store_every < 1:
+        raise SimulationError(f"`store_every` is {settings.store_every}, and must be at least 1.")
+    if settings.precision not in ("float64", "float32"):
+        raise SimulationError(f"`precision` is `{settings.precision}`, allowed are `float64` and `float32`.")
+
+
+def _assemble(
+    model: ControlAffine, graph: Graph, formation: Formation, leader: Law, follower: Law, settings: Settings
+) -> Loop:
+    shape = (graph.agents, len(model.state_names))
+    if formation.offsets.shape != shape:
+        raise SimulationError(
+            f"the formation has offsets {formation.offsets.shape}, and {graph.agents} agents with {shape[1]} "
+            f"states need {shape}."
+        )
+    leaders, followers = np.array(graph.leaders), np.array(graph.followers)
+    nearest = np.array(graph.nearest_leader())
+    return Loop(
+        model=model,
+        leader=leader,
+        follower=follower,
+        exchange=graph.exchange(),
+        offsets=np.asarray(formation.offsets),
+        leaders=leaders,
+        followers=followers,
+        sender=np.searchsorted(leaders, nearest[followers]),
+        order=np.argsort(np.concatenate([leaders, followers])),
+        normalizer=np.linalg.inv(np.asarray(model.input_scale, float)),
+        dt=settings.dt,
+        integrator=settings.integrator,
+        limits=settings.limits,
+    )
+
+
+# ---- one step -------------------------------------------------------------------------------------------------
+
+
+def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]:
+    """Return delivered inputs (N, m), who saturated (N,), and the next memories of leaders and followers."""
+    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
+    y = x - offsets
+    z = loop.exchange(y, y)
+    t = now.step.astype(x.dtype) * loop.dt
+
+    def act(law: Law, who: Matrix, said: Inputs, memory: Memory) -> tuple[Inputs, Inputs, Memory]:
+        view = LocalView(t, x[who], offsets[who], z[who], said)
+        axes = LocalView(None, 0, 0, 0, 0)  # type: ignore[arg-type]
+        wanted, memory = jax.vmap(law.update, in_axes=(None, axes, 0))(loop.model, view, memory)
+        return wanted, jax.vmap(loop.model.limit)(wanted) if loop.limits else wanted, memory
+
+    silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
+    wanted_l, u_l, memory_l = act(loop.leader, loop.leaders, silence, now.leader_memory)
+    said = _relayed(loop, u_l)
+    wanted_f, u_f, memory_f = act(loop.follower, loop.followers, said, now.follower_memory)
+    u = jnp.concatenate([u_l, u_f])[loop.order]
+    limited = jnp.any(u != jnp.concatenate([wanted_l, wanted_f])[loop.order], axis=1)
+    return u, limited, memory_l, memory_f
+
+
+def _relayed(loop: Loop, u: Inputs) -> Inputs:
+    """Return the normalized input that each follower is told, (followers, m)."""
+    if loop.follower.asks() == "none":
+        return jnp.zeros((len(loop.followers), u.shape[1]), u.dtype)
+    trim = jnp.asarray(loop.model.trim[1], u.dtype)
+    v = (u - trim) @ jnp.asarray(loop.normalizer, u.dtype).T
+    return v[loop.sender]
+
+
+def step(loop: Loop, now: Moment) -> Moment:
+    """Advance all agents by one dt with the inputs held."""
+    u, limited, memory_l, memory_f = control(loop, now)
+    advance = functools.partial(_numerics.INTEGRATORS[loop.integrator], loop.model.velocity, dt=loop.dt)
+    states = jax.vmap(advance)(now.states, u)
+    return Moment(now.step + 1, states, memory_l, memory_f, now.saturated + limited)
+
+
+@eqx.filter_jit
+def advance(loop: Loop, now: Moment, counts: jax.Array) -> tuple[Moment, tuple[States, Inputs]]:
+    """Store a frame and take counts[k] steps, for each k; return the last moment and the stored frames."""
+
+    def frame(now: Moment, count: Scalar) -> tuple[Moment, tuple[States, Inputs]]:
+        stored = (now.states, control(loop, now)[0])
+        return jax.lax.fori_loop(0, count, lambda _, moment: step(loop, moment), now), stored
+
+    return jax.lax.scan(frame, now, counts)
+
+
+# ---- the whole run --------------------------------------------------------------------------------------------
+
+
+class _Record(NamedTuple):
+    times: np.ndarray
+    states: np.ndarray
+    inputs: np.ndarray
+    saturated: np.ndarray
+    complete: bool
+    failed: tuple[float, int] | None
+
+
+def _frame_counts(settings: Settings) -> np.ndarray:
+    """Return the number of steps after each stored frame; zero after the last."""
+    steps = max(1, round(settings.horizon / settings.dt))
+    whole, rest = divmod(steps, settings.store_every)
+    return np.array([settings.store_every] * whole + [rest] * (rest > 0) + [0], dtype=np.int32)
+
+
+def _start(loop: Loop, states: np.ndarray) -> Moment:
+    def remember(law: Law, who: Matrix) -> Memory:
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(who), *jnp.shape(leaf))), law.init())
+
+    return Moment(
+        step=jnp.zeros((), jnp.int32),
+        states=jnp.asarray(states),
+        leader_memory=remember(loop.leader, loop.leaders),
+        follower_memory=remember(loop.follower, loop.followers),
+        saturated=jnp.zeros(len(states), jnp.int32),
+    )
+
+
+def _run(loop: Loop, states: np.ndarray, counts: np.ndarray, progress: Progress | None) -> _Record:
+    """Advance chunk by chunk, so that progress shows and Ctrl-C or a divergence keeps what was computed."""
+    size = math.ceil(len(counts) / _CHUNKS)
+    padded = np.concatenate([counts, np.zeros(-len(counts) % size, np.int32)])
+    now, frames, done = _start(loop, states), [], 0
+    try:
+        for chunk in padded.reshape(-1, size):
+            now, stored = advance(loop, now, jnp.asarray(chunk))
+            frames.append(jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), stored))
+            done += int(chunk.sum())
+            if progress is not None:
+                progress(done, int(counts.sum()))
+            if not np.isfinite(frames[-1][0]).all():
+                break
+    except KeyboardInterrupt:
+        pass
+    return _collect(loop, counts, frames, now)
+
+
+def _collect(loop: Loop, counts: np.ndarray, frames: list[Any], now: Moment) -> _Record:
+    """Join the stored frames, cut at the first one that is not finite."""
+    states, inputs = (
+        np.concatenate([frame[k] for frame in frames])[: len(counts)] if frames else np.zeros((0,))
+        for k in (0, 1)
+    )
+    times = loop.dt * np.concatenate([[0], np.cumsum(counts[:-1])])[: len(states)]
+    lost = ~np.isfinite(states).all(axis=-1) if frames else np.zeros((0, 1), bool)
+    failed = None
+    if lost.any():
+        cut = int(np.argmax(lost.any(axis=1)))
+        failed = (float(times[cut]), int(np.argmax(lost[cut])))
+        times, states, inputs = times[:cut], states[:cut], inputs[:cut]
+    saturated = np.asarray(now.saturated, np.float64) / max(1, int(now.step))
+    return _Record(times, states, inputs, saturated, len(times) == len(counts), failed)
+
+
+def _verdict(record: _Record, graph: Graph) -> tuple[Outcome, str]:
+    if record.failed is not None:
+        when, agent = record.failed
+        role = "leader" if agent in graph.leaders else "follower"
+        return Outcome.DIVERGED, f"The state of {role} {agent} stopped being finite by t = {when:.6g} s."
+    if record.complete:
+        return Outcome.COMPLETED, Outcome.COMPLETED.value
+    reached = record.times[-1] if len(record.times) else 0.0
+    return Outcome.INTERRUPTED, f"The run was interrupted at t = {reached:.6g} s; what was computed is kept."
+
+
+def _formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
+    """Tell of offsets that the dynamics do not respect, and of goals that coincide."""
+    broken = formation.broken_symmetries(model)
+    told = [
+        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, so the agents settle "
+        "off their goals."
+        for agent, reason in list(broken.items())[:1]
+    ]
+    pairs = formation.coincident() if model.position and formation.offsets.any() else ()
+    told += [f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]]
+    return tuple(told)

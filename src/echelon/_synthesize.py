@@ -1,0 +1,19 @@
+"""The verb that turns a model, a graph and a method into a gain."""
+
+from echelon._graph import Graph
+from echelon._numerics import precision
+from echelon.gains.gain import Gain, Method
+from echelon.models.check import check_model
+from echelon.models.model import ControlAffine
+
+
+def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
+    """Return the gain of the consensus law for agents `model` on `graph`, with its certificate; in float64.
+
+    Raises:
+        ModelError: the model is malformed.
+        GainError: the method does not apply, with the reason.
+    """
+    with precision("float64"):
+        check_model(model)
+        return method.solve(model, graph)

@@ -1,0 +1,126 @@
+"""What a synthesis returns: the gain that the law runs with, and the certificate that says what it promises."""
+
+import abc
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
+
+import equinox as eqx
+import numpy as np
+
+from echelon._errors import GainError
+from echelon._graph import Graph
+from echelon._types import Matrix
+from echelon.models.model import ControlAffine
+
+Kind: TypeAlias = Literal["proof", "vertices", "samples", "linearization"]
+Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Matrix
+
+
+class Certificate(eqx.Module):
+    """What is known of a gain on a graph, by linearization at the trim: nothing here is a global proof.
+
+    Attributes:
+        kind: the kind of argument behind the abscissas.
+        lambda_min, lambda_max: extreme eigenvalues of the grounded Laplacian.
+        abscissas: largest real part of A - c lambda B R^-1 B'P at lambda_min and at lambda_max, 1/s; all modes in
+            between are covered only where the gain's edge covers them.
+        edge: smallest coupling for which the linearization is proved stable, or None where no bound is known.
+        observable: rank of the observability matrix of (A, g'P), out of n; below n, disagreements exist that
+            never enter the input.
+    """
+
+    kind: Kind = eqx.field(static=True)
+    lambda_min: float
+    lambda_max: float
+    abscissas: tuple[float, float]
+    edge: float | None
+    observable: int = eqx.field(static=True)
+
+    @property
+    def stable(self) -> bool:
+        """Whether the linearized disagreement decays at both ends of the spectrum."""
+        return max(self.abscissas) < 0.0
+
+
+class Gain(eqx.Module):
+    """Everything that the consensus law u = u_ff - c R^-1 g'P z needs; float64 NumPy.
+
+    Attributes:
+        P: (n, n) symmetric positive definite, acting on states.
+        R: (m, m) symmetric positive definite, acting on normalized inputs.
+        coupling: c > 0.
+        method: the name of the synthesis.
+        certificate: what is promised.
+
+    Raises:
+        GainError: P or R is not symmetric positive definite, or c is not positive.
+    """
+
+    P: Matrix
+    R: Matrix
+    coupling: float
+    method: str = eqx.field(static=True)
+    certificate: Certificate
+    R_inverse: Matrix
+
+    def __init__(
+        self, P: Matrix, R: Matrix, coupling: float, method: str, certificate: Certificate
+    ) -> None:
+        """Refuse matrices that are not symmetric positive definite and a coupling that is not positive."""
+        check_definite("P", P)
+        check_definite("R", R)
+        if not 0.0 < coupling < float("inf"):
+            raise GainError(f"`coupling` is {coupling}, and must be positive and finite.")
+        self.P, self.R, self.R_inverse = P, R, np.linalg.inv(R)
+        self.coupling, self.method, self.certificate = float(coupling), method, certificate
+
+
+class Method(eqx.Module):
+    """A way to synthesize a gain."""
+
+    @abc.abstractmethod
+    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
+        """Return the gain for a checked model on a graph.
+
+        Raises:
+            GainError: the method does not apply, with the reason.
+        """
+
+
+def check_definite(name: str, matrix: np.ndarray) -> None:
+    """Check that a matrix is finite, symmetric (to 1e-9 of its size) and positive definite.
+
+    Raises:
+        GainError: it is not.
+    """
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise GainError(f"`{name}` has shape {matrix.shape}, and must be square.")
+    if not np.isfinite(matrix).all():
+        raise GainError(f"`{name}` holds a number that is not finite.")
+    gap = np.abs(matrix - matrix.T)
+    if gap.max() > 1e-9 * np.abs(matrix).max():
+        i, j = np.unravel_index(np.argmax(gap), gap.shape)
+        raise GainError(
+            f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} and entry [{j}, {i}] is "
+            f"{matrix[j, i]:.6g}."
+        )
+    least = float(np.linalg.eigvalsh(matrix)[0])
+    if least <= 0.0:
+        raise GainError(f"`{name}` is not positive definite: its smallest eigenvalue is {least:.6g}.")
+
+
+def as_matrix(name: str, value: Weight, size: int) -> Matrix:
+    """Return a weight as a square matrix; a plain list of numbers is a diagonal.
+
+    Raises:
+        GainError: it is neither `size` numbers nor a `size` x `size` matrix.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise GainError(f"`{name}` is {value}, and must be {size} numbers or {size} x {size}.") from None
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape != (size, size):
+        raise GainError(f"`{name}` has shape {array.shape}, and must be {size} numbers or {size} x {size}.")
+    return array

@@ -1,0 +1,47 @@
+"""A gain of one's own; with P = I and c = 1 it is the paper's (literal)."""
+
+from typing import Literal
+
+import numpy as np
+
+from echelon._certificates import certify
+from echelon._errors import GainError
+from echelon._graph import Graph
+from echelon._linearization import linearize
+from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_definite
+from echelon.models.model import ControlAffine
+
+
+class Given(Method):
+    """The user's own P, with no promise beyond what its linearization shows.
+
+    Args:
+        P: n numbers (a diagonal), (n, n), or "identity".
+        R: weight of the normalized input, m numbers or (m, m); the identity when left out.
+        coupling: c.
+    """
+
+    P: Weight | Literal["identity"] = "identity"
+    R: Weight | None = None
+    coupling: float = 1.0
+
+    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
+        """Return the gain.
+
+        Raises:
+            GainError: P or R is not symmetric positive definite, or the coupling is not positive.
+        """
+        n, m = len(model.state_names), len(model.input_names)
+        P = self._matrix(n)
+        R = np.eye(m) if self.R is None else as_matrix("R", self.R, m)
+        for name, matrix in (("P", P), ("R", R)):
+            check_definite(name, matrix)
+        certificate = certify(linearize(model), graph, P, R, self.coupling, edge=None)
+        return Gain(P=P, R=R, coupling=float(self.coupling), method="given", certificate=certificate)
+
+    def _matrix(self, n: int) -> np.ndarray:
+        if isinstance(self.P, str):
+            if self.P != "identity":
+                raise GainError(f"`P` is `{self.P}`, and must be a matrix, a diagonal or `identity`.")
+            return np.eye(n)
+        return as_matrix("P", self.P, n)

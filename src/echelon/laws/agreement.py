@@ -1,0 +1,33 @@
+"""The formation law for single integrators of Mesbahi and Egerstedt (paper, Theorem 1)."""
+
+from echelon._errors import LawError
+from echelon._graph import Graph
+from echelon._types import Input
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.models.integrator import SingleIntegrator
+from echelon.models.model import ControlAffine
+
+
+class Agreement(Law):
+    """u_i = -sum_j A_ij ((x_i - x_j) - (xi_i - xi_j)).
+
+    Run by all agents alike, it drives every x_i - xi_i to one common constant, the mean of their starts.
+    """
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Neighbours' states."""
+        return ("neighbours' states",)
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "Agreement":
+        """Refuse a model that is no single integrator."""
+        if not isinstance(model, SingleIntegrator):
+            raise LawError(
+                f"the law `agreement` is made for `SingleIntegrator`, and the model is `{type(model).__name__}`; "
+                "use `consensus`."
+            )
+        return self
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the velocity of one agent."""
+        return -view.disagreement, memory

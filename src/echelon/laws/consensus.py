@@ -1,0 +1,58 @@
+"""The paper's follower law, with the coupling, input weight and feed-forward that make it work."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from echelon._errors import LawError
+from echelon._graph import Graph
+from echelon._types import Input, State
+from echelon.gains.gain import Gain
+from echelon.laws.law import Feedforward, Law, LocalView, Memory, check_gain_fits
+from echelon.models.model import ControlAffine
+
+
+class Consensus(Law):
+    """u_i = u* + S (v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)), the paper's law at c = 1, R = I, v_ff = 0.
+
+    Args:
+        gain: P, R and c.
+        feedforward: `none`, or `relay`: the leader's normalized input of the same step, after its limits. The
+            paper's network does not give this to followers that are not the leader's neighbours.
+        trim: whether the trim input u* is applied; the paper's printed law has none (literal: False).
+    """
+
+    gain: Gain
+    feedforward: Feedforward = eqx.field(default="none", static=True)
+    trim: bool = eqx.field(default=True, static=True)
+
+    def __check_init__(self) -> None:
+        """Refuse an unknown feed-forward."""
+        if self.feedforward not in ("none", "relay"):
+            raise LawError(f"`feedforward` is `{self.feedforward}`, allowed are `none` and `relay`.")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Neighbours' states; the leader's input when relayed."""
+        relayed = ("the leader's input of the same step",) if self.feedforward == "relay" else ()
+        return ("neighbours' states", *relayed)
+
+    def asks(self) -> Feedforward:
+        """Return the chosen feed-forward."""
+        return self.feedforward
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "Consensus":
+        """Check that the gain fits the model."""
+        check_gain_fits(self, model, self.gain.P.shape, self.gain.R.shape)
+        return self
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the input of one agent."""
+        v = view.feedforward - feedback(self.gain, model, view.x, view.disagreement)
+        return model.physical(v, trim=self.trim), memory
+
+
+def feedback(gain: Gain, model: ControlAffine, x: State, error: State) -> Input:
+    """Return c R^-1 (g(x) S)'P error, a normalized input (m,)."""
+    weighted = jnp.asarray(gain.P, x.dtype) @ error
+    pulled = model.normalized_input_map(x).T @ weighted
+    return gain.coupling * (jnp.asarray(gain.R_inverse, x.dtype) @ pulled)

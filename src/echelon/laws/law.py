@@ -1,0 +1,86 @@
+"""The interface of a control law, and all that one agent may know when it runs one."""
+
+import abc
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon._errors import LawError
+from echelon._graph import Graph
+from echelon._types import Input, Scalar, State
+from echelon.models.model import ControlAffine
+
+Feedforward: TypeAlias = Literal["none", "relay"]
+Memory: TypeAlias = Any
+
+
+class LocalView(NamedTuple):
+    """What one agent knows at one time.
+
+    Attributes:
+        t: time, s.
+        x: own state (n,).
+        offset: own goal offset xi (n,).
+        disagreement: z = e + d (n,), from what the neighbours said.
+        feedforward: normalized input (m,) sent by the agent's leader, or zeros.
+    """
+
+    t: Scalar
+    x: State
+    offset: State
+    disagreement: State
+    feedforward: Input
+
+
+class Law(eqx.Module):
+    """A control law, the same pure function for one agent in its own process and for a million in a batch."""
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What the law must be told by others, in words."""
+        return ()
+
+    def asks(self) -> Feedforward:
+        """Return which feed-forward the law asks for: `none`, or `relay`, its leader's input of the same step."""
+        return "none"
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the state (n,) in which a leader under this law begins; the trim unless replaced."""
+        return jnp.asarray(np.asarray(model.trim[0], float))
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+        """Return the states (T, n) that the law follows, or None where it follows nothing."""
+        return None
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "Law":
+        """Return the law completed with what depends on the model and the graph; itself unless replaced.
+
+        Raises:
+            LawError: the law does not fit the model.
+        """
+        return self
+
+    def init(self) -> Memory:
+        """Return one agent's memory before the first step; none unless replaced."""
+        return None
+
+    @abc.abstractmethod
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return one agent's physical input (m,), before actuator limits, and its next memory."""
+
+
+def check_gain_fits(law: Law, model: ControlAffine, P_shape: tuple[int, ...], R_shape: tuple[int, ...]) -> None:
+    """Check that a gain was made for a model of this size.
+
+    Raises:
+        LawError: it was not.
+    """
+    n, m = len(model.state_names), len(model.input_names)
+    if P_shape != (n, n) or R_shape != (m, m):
+        raise LawError(
+            f"the gain of `{type(law).__name__}` has P {P_shape} and R {R_shape}, and `{type(model).__name__}` "
+            f"needs P {(n, n)} and R {(m, m)}."
+        )

@@ -1,0 +1,13 @@
+"""The law that does nothing: the trim input alone."""
+
+from echelon._types import Input
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.models.model import ControlAffine
+
+
+class Passive(Law):
+    """u = u* + S v_ff, with nothing asked for and so v_ff = 0: the agent's own unforced motion about the trim."""
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the trim input."""
+        return model.physical(view.feedforward), memory

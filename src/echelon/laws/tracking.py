@@ -1,0 +1,90 @@
+"""The leader's law: follow a reference by flatness feed-forward and state feedback (paper, Assumption 4)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from echelon._errors import LawError, listing
+from echelon._graph import Graph
+from echelon._types import Input, Scalar, State
+from echelon.gains.gain import Gain
+from echelon.gains.riccati import Riccati
+from echelon.laws.consensus import feedback
+from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.models.model import ControlAffine
+from echelon.references.reference import COORDINATES, Reference
+
+
+class Tracking(Law):
+    """u_L = u_r(t) - S R^-1 (g S)'P (x - x_r(t)) [- S c R^-1 (g S)'P (e_L + d_L)].
+
+    (x_r, u_r) comes from the model's flatness map. The last term is the paper's reaction of the leader to its
+    neighbours (its leader law), present when `reaction` is given.
+
+    Args:
+        reference: the path to follow.
+        gain: the tracking gain, used with coupling 1; the model's Riccati gain when left out.
+        reaction: the followers' gain, when the leader reacts to them.
+    """
+
+    reference: Reference
+    gain: Gain | None = None
+    reaction: Gain | None = None
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The reference; neighbours' states when the leader reacts."""
+        return ("the reference", *(("neighbours' states",) if self.reaction is not None else ()))
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
+        """Complete the gain, and check that the model can follow a reference."""
+        _check_flat(model)
+        gain = Riccati(coupling=1.0).solve(model, graph) if self.gain is None else self.gain
+        for each in (gain, self.reaction):
+            if each is not None:
+                check_gain_fits(self, model, each.P.shape, each.R.shape)
+        unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
+        return Tracking(self.reference, unit, self.reaction)
+
+    def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return (x_r, u_r) at time t."""
+        return model.flat(self.reference.derivatives(t, model.flat_order, model.flat_outputs))
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the reference's state at time zero."""
+        return _targets(self, model, jnp.zeros(1))[0]
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
+        """Return x_r at each of `times`, (T, n)."""
+        return _targets(self, model, times)
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the leader's input."""
+        if self.gain is None:
+            raise LawError("`Tracking` has no gain yet; call `prepared(model, graph)` first.")
+        state, u = self.target(model, view.t)
+        error = model.difference(view.x, state + view.offset)
+        v = feedback(self.gain, model, view.x, error)
+        if self.reaction is not None:
+            v = v + feedback(self.reaction, model, view.x, view.disagreement)
+        return u - model.physical(v, trim=False), memory
+
+
+def _check_flat(model: ControlAffine) -> None:
+    if not model.flat_outputs:
+        raise LawError(
+            f"the law `tracking` cannot lead `{type(model).__name__}`, which defines no `flat` map; "
+            "use `passive`, or add `flat_outputs`, `flat_order` and `flat` to the model."
+        )
+    unknown = [name for name in model.flat_outputs if name not in COORDINATES]
+    if unknown:
+        raise LawError(
+            f"`flat_outputs` of `{type(model).__name__}` names {listing(unknown)}, and a reference gives "
+            f"{listing(COORDINATES)}."
+        )
+
+
+@eqx.filter_jit
+def _targets(law: Tracking, model: ControlAffine, times: jax.Array) -> jax.Array:
+    """Return x_r at each of `times`, (T, n)."""
+    return jax.vmap(lambda t: law.target(model, t)[0])(times)

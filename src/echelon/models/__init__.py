@@ -1,0 +1,25 @@
+"""Agents: the interface `ControlAffine` and the bundled members."""
+
+from echelon.models.integrator import DoubleIntegrator, SingleIntegrator
+from echelon.models.linear import Linear
+from echelon.models.model import ControlAffine
+from echelon.models.pendulum import Pendulum
+from echelon.models.planar_quadrotor import PlanarQuadrotor
+from echelon.models.quadrotor import Quadrotor
+from echelon.models.quadrotor_printed import PrintedQuadrotor
+from echelon.models.unicycle import Unicycle, UnicyclePoint
+from echelon.models.van_der_pol import VanDerPol
+
+__all__ = [
+    "ControlAffine",
+    "DoubleIntegrator",
+    "Linear",
+    "Pendulum",
+    "PlanarQuadrotor",
+    "PrintedQuadrotor",
+    "Quadrotor",
+    "SingleIntegrator",
+    "Unicycle",
+    "UnicyclePoint",
+    "VanDerPol",
+]

@@ -1,0 +1,135 @@
+"""The checks that a model passes once, when it enters `synthesize` or `simulate`."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon._errors import ModelError, did_you_mean, listing
+from echelon.models.model import ControlAffine
+
+_TRIM_TOLERANCE = 1e-9
+
+
+def check_model(model: ControlAffine) -> tuple[str, ...]:
+    """Check shapes, finite values and Jacobians at the trim, and that the trim is an equilibrium.
+
+    Returns:
+        Warnings, one sentence each, about what is allowed but probably not meant.
+
+    Raises:
+        ModelError: the first fault found, as one sentence.
+    """
+    if not isinstance(model, ControlAffine):
+        raise ModelError(f"the model is {model!r}, and must be an instance of a `ControlAffine` class.")
+    name = type(model).__name__
+    n, m = len(model.state_names), len(model.input_names)
+    if not (n and m):
+        raise ModelError(f"`{name}` has {n} state names and {m} input names, and needs at least one of each.")
+    _check_names(model, name)
+    x, u = _trim(model, name, n, m)
+    _check_values(model, name, x, u)
+    _check_trim(model, name, x, u)
+    return _low_precision(model, name)
+
+
+def _check_names(model: ControlAffine, name: str) -> None:
+    """Check that groups, position and units speak of states that exist."""
+    known = model.state_names
+    if len(set(known)) < len(known):
+        raise ModelError(f"`state_names` of `{name}` repeats a name: {listing(known)}.")
+    named = {"position": model.position}
+    named |= {f"state_groups[{key!r}]": members for key, members in model.state_groups.items()}
+    for where, members in named.items():
+        for member in members:
+            if member not in known:
+                raise ModelError(
+                    f"`{where}` of `{name}` names `{member}`, which is no state; the states are "
+                    f"{listing(known)}{did_you_mean(member, known)}."
+                )
+    for where, units, names in (
+        ("state_units", model.state_units, known),
+        ("input_units", model.input_units, model.input_names),
+    ):
+        if len(units) != len(names):
+            raise ModelError(f"`{where}` of `{name}` has {len(units)} entries, and must have {len(names)}.")
+
+
+def _trim(model: ControlAffine, name: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the trim as arrays, after checking the sizes of all constant data."""
+    x, u = (np.atleast_1d(np.asarray(part, float)) for part in model.trim)
+    _check_shape(name, "trim[0]", x.shape, (n,))
+    _check_shape(name, "trim[1]", u.shape, (m,))
+    scale = np.asarray(model.input_scale, float)
+    _check_shape(name, "input_scale", scale.shape, (m, m))
+    if np.linalg.cond(scale) > 1e15:
+        raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")
+    for part, size, what in zip(model.weights, (n, m), ("weights[0]", "weights[1]"), strict=True):
+        _check_shape(name, what, np.shape(part), (size,))
+    return x, u
+
+
+def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
+    """Check shape, finiteness and Jacobian of f, g and h at the trim."""
+    n, m, q = len(x), len(u), len(model.output_names)
+    functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
+    for (what, function), shape in zip(functions.items(), ((n,), (n, m), (q,)), strict=True):
+        _check_shape(name, what, _shape(name, what, function, x), shape)
+    _check_shape(name, "limit", _shape(name, "limit", model.limit, u), (m,))
+    for what, (value, jacobian) in _with_jacobians(model, jnp.asarray(x)).items():
+        for which, array in ((f"`{what}`", value), (f"the Jacobian of `{what}`", jacobian)):
+            if not np.isfinite(array).all():
+                raise ModelError(f"{which} of `{name}` is not finite at the trim {x.tolist()}.")
+
+
+@eqx.filter_jit
+def _with_jacobians(model: ControlAffine, x: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Return f, g and h with their Jacobians at x, compiled together since compiling is most of the cost."""
+    functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
+    return {name: (function(x), jax.jacfwd(function)(x)) for name, function in functions.items()}
+
+
+def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ...]:
+    """Return the shape of a model's function, telling apart the errors of the model's own code."""
+    try:
+        return jax.eval_shape(lambda x: jnp.asarray(function(x)), jnp.asarray(at)).shape
+    except Exception as error:
+        told = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
+        raise ModelError(
+            f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {told}; it must be written "
+            "with `jax.numpy` and take one agent's state."
+        ) from error
+
+
+def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, ...]) -> None:
+    if got != shape:
+        raise ModelError(f"`{what}` of `{name}` has shape {got}, and must have shape {shape}.")
+
+
+def _check_trim(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
+    """Check |f(x*) + g(x*) u*| <= 1e-9 in the model's units."""
+    residual = np.asarray(model.velocity(jnp.asarray(x), jnp.asarray(u)))
+    worst = int(np.argmax(np.abs(residual)))
+    if abs(residual[worst]) > _TRIM_TOLERANCE:
+        raise ModelError(
+            f"the trim of `{name}` is no equilibrium: f(x*) + g(x*) u* is {residual[worst]:.3g} in state "
+            f"`{model.state_names[worst]}`, and must be within {_TRIM_TOLERANCE:g} of zero; replace `trim`."
+        )
+
+
+def _low_precision(model: ControlAffine, name: str) -> tuple[str, ...]:
+    """Warn of parameters that a JAX array made without float64 has already rounded."""
+    leaves = jax.tree_util.tree_leaves_with_path(model)
+    rounded = [
+        jax.tree_util.keystr(path).lstrip(".")
+        for path, leaf in leaves
+        if getattr(leaf, "dtype", None) == np.float32
+    ]
+    if not rounded:
+        return ()
+    return (
+        f"{listing(rounded)} of `{name}` is a float32 array, so its values carry only 7 digits; "
+        "keep parameters as Python numbers or float64 NumPy arrays.",
+    )

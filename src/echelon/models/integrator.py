@@ -1,0 +1,158 @@
+"""Single and double integrators in any dimension, the agents of most of the consensus literature."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from echelon._errors import ModelError
+from echelon._types import Input, InputMap, Output, State
+from echelon.models.model import ControlAffine
+
+_AXES = ("x", "y", "z")
+
+
+def _axes(dimension: int) -> tuple[str, ...]:
+    """Return x, y, z, or x1, x2, ... beyond three dimensions."""
+    return _AXES[:dimension] if dimension <= 3 else tuple(f"x{k + 1}" for k in range(dimension))
+
+
+def _check_dimension(model: eqx.Module, dimension: int) -> None:
+    if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
+        raise ModelError(
+            f"`dimension` of `{type(model).__name__}` is {dimension}, and must be a whole number of at least 1."
+        )
+
+
+class SingleIntegrator(ControlAffine):
+    """xdot = u, with x a position in `dimension` axes (m) and u a velocity (m/s)."""
+
+    dimension: int = eqx.field(default=2, static=True)
+
+    flat_order = 1
+
+    def __check_init__(self) -> None:
+        """Refuse a dimension below one."""
+        _check_dimension(self, self.dimension)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Axis names."""
+        return _axes(self.dimension)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Velocity names."""
+        return tuple(f"v{name}" for name in _axes(self.dimension))
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Metres."""
+        return ("m",) * self.dimension
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Metres per second."""
+        return ("m/s",) * self.dimension
+
+    @property
+    def state_groups(self) -> dict[str, tuple[str, ...]]:
+        """All states are `position`."""
+        return {"position": self.state_names}
+
+    @property
+    def position(self) -> tuple[str, ...]:
+        """All axes."""
+        return self.state_names
+
+    @property
+    def flat_outputs(self) -> tuple[str, ...]:
+        """The axes, up to three."""
+        return self.state_names if self.dimension <= 3 else ()
+
+    def drift(self, x: State) -> State:
+        """Return f = 0."""
+        return jnp.zeros_like(x)
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g = I."""
+        return jnp.eye(self.dimension, dtype=x.dtype)
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return (position, velocity)."""
+        return derivatives[0], derivatives[1]
+
+
+class DoubleIntegrator(ControlAffine):
+    """pdot = v, vdot = u - drag v, with p, v, u in `dimension` axes (m, m/s, m/s^2) and drag in 1/s."""
+
+    dimension: int = eqx.field(default=2, static=True)
+    drag: float = 0.0
+
+    flat_order = 2
+
+    def __check_init__(self) -> None:
+        """Refuse a dimension below one or a negative drag."""
+        _check_dimension(self, self.dimension)
+        if not 0.0 <= self.drag < float("inf"):
+            raise ModelError(f"`drag` of `DoubleIntegrator` is {self.drag}, and must be finite and not negative.")
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Axis names, then velocity names."""
+        axes = _axes(self.dimension)
+        return axes + tuple(f"v{name}" for name in axes)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Acceleration names."""
+        return tuple(f"a{name}" for name in _axes(self.dimension))
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Metres, then metres per second."""
+        return ("m",) * self.dimension + ("m/s",) * self.dimension
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Metres per second squared."""
+        return ("m/s^2",) * self.dimension
+
+    @property
+    def state_groups(self) -> dict[str, tuple[str, ...]]:
+        """`position` and `velocity`."""
+        names = self.state_names
+        return {"position": names[: self.dimension], "velocity": names[self.dimension :]}
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The axes."""
+        return _axes(self.dimension)
+
+    @property
+    def position(self) -> tuple[str, ...]:
+        """The axes."""
+        return _axes(self.dimension)
+
+    @property
+    def flat_outputs(self) -> tuple[str, ...]:
+        """The axes, up to three."""
+        return _axes(self.dimension) if self.dimension <= 3 else ()
+
+    def drift(self, x: State) -> State:
+        """Return f = (v, -drag v)."""
+        v = x[self.dimension :]
+        return jnp.concatenate([v, -self.drag * v])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g = (0; I)."""
+        identity = jnp.eye(self.dimension, dtype=x.dtype)
+        return jnp.concatenate([jnp.zeros_like(identity), identity])
+
+    def output(self, x: State) -> Output:
+        """Return the position."""
+        return x[: self.dimension]
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return (position, velocity) and the acceleration that holds against drag."""
+        position, velocity, acceleration = derivatives
+        return jnp.concatenate([position, velocity]), acceleration + self.drag * velocity

@@ -1,0 +1,83 @@
+"""A linear agent given by its matrices."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from echelon._errors import ModelError
+from echelon._types import InputMap, Matrix, Output, State
+from echelon.models.model import ControlAffine
+
+
+class Linear(ControlAffine):
+    """xdot = A x + B u, y = C x.
+
+    Args:
+        A: (n, n). B: (n, m). C: (q, n), the identity when left out.
+        names: n state names; x1, x2, ... when left out.
+
+    Raises:
+        ModelError: the matrices do not fit together or hold a non-finite number.
+    """
+
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        A: Sequence[Sequence[float]] | Matrix,
+        B: Sequence[Sequence[float]] | Matrix,
+        C: Sequence[Sequence[float]] | Matrix | None = None,
+        names: Sequence[str] = (),
+    ) -> None:
+        """Check and keep the matrices as float64."""
+        self.A, self.B = _matrix("A", A), _matrix("B", B)
+        n = len(self.A)
+        self.C = np.eye(n) if C is None else _matrix("C", C)
+        self.names = tuple(names) or tuple(f"x{k + 1}" for k in range(n))
+        if self.A.shape != (n, n) or len(self.B) != n or self.C.shape[1] != n or len(self.names) != n:
+            raise ModelError(
+                f"the shapes of `Linear` are A {self.A.shape}, B {self.B.shape}, C {self.C.shape} with "
+                f"{len(self.names)} names, and must be A (n, n), B (n, m), C (q, n) with n names."
+            )
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """The given names."""
+        return self.names
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """u1, u2, ..."""
+        return tuple(f"u{k + 1}" for k in range(self.B.shape[1]))
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """y1, y2, ..."""
+        return tuple(f"y{k + 1}" for k in range(len(self.C)))
+
+    def drift(self, x: State) -> State:
+        """Return A x."""
+        return jnp.asarray(self.A, x.dtype) @ x
+
+    def input_map(self, x: State) -> InputMap:
+        """Return B."""
+        return jnp.asarray(self.B, x.dtype)
+
+    def output(self, x: State) -> Output:
+        """Return C x."""
+        return jnp.asarray(self.C, x.dtype) @ x
+
+
+def _matrix(name: str, value: Sequence[Sequence[float]] | Matrix) -> Matrix:
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ModelError(f"`{name}` of `Linear` is {value}, and must be a list of rows of numbers.") from None
+    if matrix.ndim != 2 or not np.isfinite(matrix).all():
+        raise ModelError(f"`{name}` of `Linear` must be a matrix of finite numbers, and has shape {matrix.shape}.")
+    return matrix

@@ -1,0 +1,169 @@
+"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x) (paper, Definition 1).
+
+A model of one's own is two methods and two tuples of names; everything else has a default that may be replaced
+by a class attribute, a property or a method of the same name.
+"""
+
+import abc
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from echelon._errors import ModelError, did_you_mean, listing
+from echelon._types import Input, InputMap, Output, State
+
+
+class ControlAffine(eqx.Module):
+    """One agent, xdot = f(x) + g(x) u with output y = h(x).
+
+    Shapes are those of one agent: x (n,), u (m,), f (n,), g (n, m), h (q,). The methods must be pure and, in x,
+    differentiable by JAX.
+    """
+
+    state_names: eqx.AbstractVar[tuple[str, ...]]
+    input_names: eqx.AbstractVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+
+    @abc.abstractmethod
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x)."""
+
+    def output(self, x: State) -> Output:
+        """Return h(x); the whole state unless replaced."""
+        return x
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Names of the entries of h(x); the state names unless replaced together with `output`."""
+        return self.state_names
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """SI units of the states, as text; empty text where unknown."""
+        return ("",) * len(self.state_names)
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """SI units of the inputs, as text; empty text where unknown."""
+        return ("",) * len(self.input_names)
+
+    @property
+    def state_groups(self) -> Mapping[str, tuple[str, ...]]:
+        """Named groups of states, such as `position` or `attitude`, for spreads and start errors."""
+        return {}
+
+    @property
+    def position(self) -> tuple[str, ...]:
+        """Names of the coordinates that a picture shows, in metres; none for an abstract agent."""
+        return ()
+
+    @property
+    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Equilibrium (x*, u*) about which gains are made; the origin unless replaced."""
+        return (0.0,) * len(self.state_names), (0.0,) * len(self.input_names)
+
+    @property
+    def input_scale(self) -> tuple[tuple[float, ...], ...]:
+        """Matrix S (m, m) of the normalized input v in u = u* + S v; the identity unless replaced."""
+        return diagonal(*(1.0,) * len(self.input_names))
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Diagonals of the default Riccati weights (Q, R) on states and normalized inputs; all ones."""
+        return (1.0,) * len(self.state_names), (1.0,) * len(self.input_names)
+
+    @property
+    def flat_outputs(self) -> tuple[str, ...]:
+        """Which of a reference's coordinates (x, y, z, yaw) the model can be told to follow; none."""
+        return ()
+
+    @property
+    def flat_order(self) -> int:
+        """How many time derivatives of the reference `flat` needs."""
+        return 0
+
+    def flat(self, derivatives: jnp.ndarray) -> tuple[State, Input]:
+        """Return the state and input (x, u) that produce a flat output.
+
+        Args:
+            derivatives: (flat_order + 1, len(flat_outputs)), the output and its time derivatives.
+
+        Raises:
+            ModelError: the model does not say how.
+        """
+        raise ModelError(
+            f"model `{type(self).__name__}` cannot track a reference since it defines no `flat`; "
+            "use the law `passive` for its leader, or add `flat_outputs`, `flat_order` and `flat`."
+        )
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y; to be replaced where a coordinate is an angle that winds."""
+        return x - y
+
+    def limit(self, u: Input) -> Input:
+        """Return the input that the actuators deliver when asked for u; u itself unless replaced.
+
+        An input within the limits must be returned unchanged, to the bit: that is how saturation is counted.
+        """
+        return u
+
+    def velocity(self, x: State, u: Input) -> State:
+        """Return f(x) + g(x) u."""
+        return self.drift(x) + self.input_map(x) @ u
+
+    def normalized_drift(self, x: State) -> State:
+        """Return f(x) + g(x) u*, the drift about the trim."""
+        return self.velocity(x, jnp.asarray(self.trim[1], x.dtype))
+
+    def normalized_input_map(self, x: State) -> InputMap:
+        """Return g(x) S, the input map of the normalized input."""
+        return self.input_map(x) @ jnp.asarray(self.input_scale, x.dtype)
+
+    def physical(self, v: Input, trim: bool = True) -> Input:
+        """Return u = u* + S v, or S v without the trim."""
+        u = jnp.asarray(self.input_scale, v.dtype) @ v
+        return u + jnp.asarray(self.trim[1], v.dtype) if trim else u
+
+    def position_indices(self) -> tuple[int, ...]:
+        """Return the places of `position` in the state."""
+        return tuple(self.state_names.index(name) for name in self.position)
+
+    def states_called(self, name: str) -> tuple[int, ...]:
+        """Return the indices of the states meant by a state's or a group's name.
+
+        Raises:
+            ModelError: the model has neither a state nor a group of that name.
+        """
+        if name in self.state_groups:
+            return tuple(self.state_names.index(member) for member in self.state_groups[name])
+        if name in self.state_names:
+            return (self.state_names.index(name),)
+        allowed = [*self.state_groups, *self.state_names]
+        raise ModelError(
+            f"`{name}` is no state or group of `{type(self).__name__}`, which has {listing(allowed)}"
+            f"{did_you_mean(name, allowed)}."
+        )
+
+
+def positive(owner: object, **values: float) -> None:
+    """Check that each named parameter is a finite positive number.
+
+    Raises:
+        ModelError: one is not.
+    """
+    for name, value in values.items():
+        if not (isinstance(value, (int, float)) and 0.0 < value < float("inf")):
+            raise ModelError(
+                f"`{name}` of `{type(owner).__name__}` is {value}, and must be a positive finite number."
+            )
+
+
+
+
+def diagonal(*entries: float) -> tuple[tuple[float, ...], ...]:
+    """Return a diagonal matrix as nested tuples, the form of `input_scale`."""
+    return tuple(tuple(e if i == j else 0.0 for j in range(len(entries))) for i, e in enumerate(entries))

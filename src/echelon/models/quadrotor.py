@@ -1,0 +1,163 @@
+"""The 12-state quadrotor of the paper's example, with the gravity and the thrust rotation that it leaves out."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon._errors import ModelError, did_you_mean, listing
+from echelon._types import Input, InputMap, Output, State
+from echelon.models.model import ControlAffine, diagonal, positive
+from echelon.models.rigid_body import (
+    body_rates,
+    check_inertia,
+    euler_rates,
+    free_spin,
+    thrust_axis,
+    tilt_towards,
+)
+from echelon.models.rotors import attitude_priority
+
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "crazyflie": {"mass": 0.028, "inertia": (16.571710e-6, 16.655602e-6, 29.261652e-6)},
+    "paper": {"mass": 0.028, "inertia": (6.4893e-6, 16.4562e-6, 29.5435e-6)},
+}
+"""Named parameter sets: Foerster's identified Crazyflie 2.1, and the paper's Table I as printed."""
+
+
+def _with_rate(curve: Callable[[jax.Array], jax.Array], s: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return curve(s) and its derivative."""
+    return jax.jvp(curve, (s,), (jnp.ones_like(s),))
+
+
+# Motors at (+-l, +-l): front-left, rear-left, rear-right, front-right as signs of (x, y); the spin of each gives
+# the sign of its yaw torque.
+_FRONT = np.array([1.0, -1.0, -1.0, 1.0])
+_LEFT = np.array([1.0, 1.0, -1.0, -1.0])
+_SPIN = np.array([1.0, -1.0, 1.0, -1.0])
+
+
+class Quadrotor(ControlAffine):
+    """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles (paper, equation of the example).
+
+    pdot = v, vdot = -g e3 + R(zeta) e3 T / m, zetadot = W(zeta) omega, J omegadot = tau - omega x J omega.
+    States: position (m), velocity (m/s), attitude (rad), body rate (rad/s). Inputs: thrust T (N) and body
+    torques tau (N m). The normalized input is (T/m - g, J^-1 tau).
+
+    Raises:
+        ModelError: a parameter is not positive, or no rigid body has the inertia (unless `allow_unphysical`).
+    """
+
+    mass: float = 0.028
+    inertia: tuple[float, float, float] = (16.571710e-6, 16.655602e-6, 29.261652e-6)
+    gravity: float = 9.81
+    arm: float = 0.0325
+    motor_thrust: float = 0.15975
+    torque_per_thrust: float = 0.005964552
+    allow_unphysical: bool = eqx.field(default=False, static=True)
+
+    state_names = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
+    state_units = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
+    input_names = ("thrust", "torque_x", "torque_y", "torque_z")
+    input_units = ("N", "N m", "N m", "N m")
+    output_names = ("x", "y", "z", "yaw")
+    position = ("x", "y", "z")
+    flat_outputs = ("x", "y", "z", "yaw")
+    flat_order = 4
+    state_groups = {
+        "position": ("x", "y", "z"),
+        "velocity": ("vx", "vy", "vz"),
+        "attitude": ("roll", "pitch", "yaw"),
+        "rate": ("p", "q", "r"),
+    }
+    weights = ((1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3, (1 / 25,) + (1 / 400,) * 3)
+
+    @classmethod
+    def named(cls, name: str, **changes: Any) -> "Quadrotor":
+        """Return the quadrotor of a named parameter set (`crazyflie` or `paper`), with fields changed.
+
+        Raises:
+            ModelError: there is no such set.
+        """
+        if name not in PARAMETERS:
+            raise ModelError(
+                f"parameters `{name}` are unknown for `Quadrotor`, allowed are {listing(PARAMETERS)}"
+                f"{did_you_mean(name, PARAMETERS)}."
+            )
+        return cls(**{**PARAMETERS[name], **changes})
+
+    @classmethod
+    def crazyflie(cls) -> "Quadrotor":
+        """Return the Crazyflie 2.1 with the parameters identified by Foerster (2015)."""
+        return cls.named("crazyflie")
+
+    def __check_init__(self) -> None:
+        """Refuse parameters that no vehicle can have."""
+        names = ("mass", "gravity", "arm", "motor_thrust", "torque_per_thrust")
+        positive(self, **{name: getattr(self, name) for name in names})
+        positive(self, **{f"inertia[{k}]": moment for k, moment in enumerate(self.inertia)})
+        if not self.allow_unphysical:
+            check_inertia(self.inertia)
+
+    @property
+    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Hover at the origin: thrust m g, no torque."""
+        return (0.0,) * 12, (self.mass * self.gravity, 0.0, 0.0, 0.0)
+
+    @property
+    def input_scale(self) -> tuple[tuple[float, ...], ...]:
+        """S = diag(m, Ixx, Iyy, Izz)."""
+        return diagonal(self.mass, *self.inertia)
+
+    def drift(self, x: State) -> State:
+        """Return f(x): free fall, attitude kinematics and gyroscopic coupling."""
+        fall = jnp.array([0.0, 0.0, -self.gravity], x.dtype)
+        turning = euler_rates(x[6:9], x[9:12])
+        return jnp.concatenate([x[3:6], fall, turning, free_spin(self.inertia, x[9:12])])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x): thrust along the body z axis, torques on the body rates."""
+        nothing = jnp.zeros((3, 4), x.dtype)
+        lift = jnp.pad(thrust_axis(x[6:9])[:, None] / self.mass, ((0, 0), (0, 3)))
+        spin = jnp.pad(jnp.diag(1.0 / jnp.asarray(self.inertia, x.dtype)), ((0, 0), (1, 0)))
+        return jnp.concatenate([nothing, lift, nothing, spin])
+
+    def output(self, x: State) -> Output:
+        """Return position and yaw."""
+        return jnp.concatenate([x[:3], x[8:9]])
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return the state and input that fly a path (x, y, z, yaw) given up to its fourth derivative."""
+        position, velocity, acceleration, jerk, snap = derivatives[:, :3]
+        yaw = derivatives[:3, 3]
+        up = jnp.array([0.0, 0.0, self.gravity], derivatives.dtype)
+
+        def attitude(s: jax.Array) -> State:
+            lift = acceleration + up + s * jerk + 0.5 * s**2 * snap
+            return tilt_towards(lift, yaw[0] + s * yaw[1] + 0.5 * s**2 * yaw[2])
+
+        def rate(s: jax.Array) -> State:
+            return body_rates(*_with_rate(attitude, s))
+
+        now = jnp.zeros((), derivatives.dtype)
+        omega, omega_dot = _with_rate(rate, now)
+        torque = jnp.asarray(self.inertia, omega.dtype) * (omega_dot - free_spin(self.inertia, omega))
+        thrust = self.mass * jnp.linalg.norm(acceleration + up)
+        return (
+            jnp.concatenate([position, velocity, attitude(now), omega]),
+            jnp.concatenate([thrust[None], torque]),
+        )
+
+    def limit(self, u: Input) -> Input:
+        """Return what four motors within [0, motor_thrust] deliver, attitude before collective before yaw."""
+        tilt = (u[1] * _LEFT - u[2] * _FRONT) / (4.0 * self.arm)
+        yaw = u[3] * _SPIN / (4.0 * self.torque_per_thrust)
+        wanted = u[0] / 4.0 + tilt + yaw
+        f = attitude_priority(u[0] / 4.0, tilt, yaw, self.motor_thrust)
+        torque = [self.arm * (_LEFT @ f), -self.arm * (_FRONT @ f), self.torque_per_thrust * (_SPIN @ f)]
+        delivered = jnp.stack([jnp.sum(f), *torque])
+        fits = jnp.all((wanted >= 0.0) & (wanted <= self.motor_thrust))
+        return jnp.where(fits, u, delivered)

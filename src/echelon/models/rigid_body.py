@@ -1,0 +1,62 @@
+"""A rigid body in space: ZYX Euler angles zeta = (roll, pitch, yaw), body rates, and inertia.
+
+Body to world is Rz(yaw) Ry(pitch) Rx(roll).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from echelon._errors import ModelError
+
+
+def check_inertia(inertia: tuple[float, float, float]) -> None:
+    """Check that a rigid body can have these principal moments of inertia, kg m^2.
+
+    Raises:
+        ModelError: one exceeds the sum of the other two.
+    """
+    total = sum(inertia)
+    for axis, moment in zip("xyz", inertia, strict=True):
+        if 2.0 * moment > total:
+            raise ModelError(
+                f"`inertia` is {tuple(inertia)} kg m^2, and no rigid body has that: I{axis}{axis} = {moment:.6g} "
+                f"exceeds the sum of the other two, {total - moment:.6g}; use the identified values "
+                "`crazyflie`, or set `allow_unphysical` to keep it."
+            )
+
+
+def free_spin(inertia: tuple[float, float, float], omega: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Return -J^-1 (omega x J omega), the angular acceleration without torque."""
+    J = jnp.asarray(inertia, omega.dtype)
+    return -jnp.cross(omega, J * omega) / J
+
+
+def thrust_axis(zeta: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Return the body z axis in the world frame, R e3."""
+    (sr, sp, sy), (cr, cp, cy) = jnp.sin(zeta), jnp.cos(zeta)
+    return jnp.stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
+
+
+def euler_rates(zeta: Float[Array, " 3"], omega: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Return zetadot = W(zeta) omega from the body rate omega, rad/s; singular at pitch +-90 deg."""
+    sr, cr = jnp.sin(zeta[0]), jnp.cos(zeta[0])
+    p, q, r = omega
+    turn = (sr * q + cr * r) / jnp.cos(zeta[1])
+    return jnp.stack([p + jnp.sin(zeta[1]) * turn, cr * q - sr * r, turn])
+
+
+def body_rates(zeta: Float[Array, " 3"], zeta_dot: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """Return the body rate omega = W(zeta)^-1 zetadot, rad/s."""
+    (sr, sp), (cr, cp) = jnp.sin(zeta[:2]), jnp.cos(zeta[:2])
+    roll, pitch, yaw = zeta_dot
+    return jnp.stack([roll - sp * yaw, cr * pitch + sr * cp * yaw, cr * cp * yaw - sr * pitch])
+
+
+def tilt_towards(direction: Float[Array, " 3"], yaw: Float[Array, ""]) -> Float[Array, " 3"]:
+    """Return the angles zeta with the given yaw whose thrust axis points along `direction` (any length)."""
+    sy, cy = jnp.sin(yaw), jnp.cos(yaw)
+    forward = cy * direction[0] + sy * direction[1]
+    left = cy * direction[1] - sy * direction[0]
+    # atan2 of the two legs keeps the derivative finite where an arcsine of a unit length would not.
+    roll = jnp.arctan2(-left, jnp.hypot(forward, direction[2]))
+    return jnp.stack([roll, jnp.arctan2(forward, direction[2]), yaw])

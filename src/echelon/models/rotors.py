@@ -1,0 +1,31 @@
+"""Motors with limits: how four (or two) thrusts share a wanted collective and wanted torques.
+
+Clipping each motor by itself changes the torques and flips vehicles. Attitude-priority mixing keeps the torques:
+the collective gives way first, then yaw, and roll and pitch are scaled only when they alone do not fit.
+"""
+
+import jax.numpy as jnp
+
+from echelon._types import Input, Scalar
+
+
+def _largest_share(base: Input, extra: Input, maximum: float) -> Scalar:
+    """Return the largest s in [0, 1] for which the thrusts base + s extra span at most `maximum`."""
+    room = maximum - (base[:, None] - base[None, :])
+    growth = extra[:, None] - extra[None, :]
+    bound = jnp.where(growth > 0.0, room / jnp.where(growth > 0.0, growth, 1.0), jnp.inf)
+    return jnp.clip(jnp.min(bound), 0.0, 1.0)
+
+
+def attitude_priority(collective: Scalar, tilt: Input, yaw: Input, maximum: float) -> Input:
+    """Return the motor thrusts, each within [0, maximum].
+
+    Args:
+        collective: wanted mean thrust of a motor, N.
+        tilt: (motors,) thrust differences that make the roll and pitch torques, summing to zero, N.
+        yaw: (motors,) those that make the yaw torque, summing to zero, N.
+        maximum: largest thrust of one motor, N.
+    """
+    tilt = tilt * _largest_share(jnp.zeros_like(tilt), tilt, maximum)
+    torque = tilt + yaw * _largest_share(tilt, yaw, maximum)
+    return jnp.clip(collective, -jnp.min(torque), maximum - jnp.max(torque)) + torque

@@ -1,0 +1,104 @@
+"""The unicycle seen at its axle, and the same vehicle seen at a point ahead of it."""
+
+import jax
+import jax.numpy as jnp
+
+from echelon._types import Input, InputMap, State
+from echelon.models.model import ControlAffine, diagonal, positive
+
+
+def _wound(x: State, y: State) -> State:
+    """Return x - y with the heading (third entry) brought to (-pi, pi]."""
+    turn = x[2] - y[2]
+    return (x - y).at[2].set(turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi)))
+
+
+def _drive(derivatives: jax.Array) -> tuple[State, Input]:
+    """Return axle state (x, y, heading) and (speed, turn rate) on a path driven forward, speed > 0."""
+    (px, py), (vx, vy), (ax, ay) = derivatives
+    speed = jnp.hypot(vx, vy)
+    turn_rate = (vx * ay - vy * ax) / speed**2
+    return jnp.stack([px, py, jnp.arctan2(vy, vx)]), jnp.stack([speed, turn_rate])
+
+
+class Unicycle(ControlAffine):
+    """xdot = v cos(heading), ydot = v sin(heading), headingdot = turn rate; metres and radians.
+
+    Its linearization at rest cannot be stabilized (sideways motion), so Riccati gains do not exist for it.
+    """
+
+    state_names = ("x", "y", "heading")
+    state_units = ("m", "m", "rad")
+    input_names = ("speed", "turn_rate")
+    input_units = ("m/s", "rad/s")
+    position = ("x", "y")
+    state_groups = {"position": ("x", "y")}
+    flat_outputs = ("x", "y")
+    flat_order = 2
+
+    def drift(self, x: State) -> State:
+        """Return f = 0."""
+        return jnp.zeros_like(x)
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x)."""
+        c, s = jnp.cos(x[2]), jnp.sin(x[2])
+        zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+        return jnp.stack([jnp.stack([c, zero]), jnp.stack([s, zero]), jnp.stack([zero, one])])
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return the state and input that drive the path forward; the speed must not vanish."""
+        return _drive(derivatives)
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y with the heading wrapped."""
+        return _wound(x, y)
+
+
+class UnicyclePoint(ControlAffine):
+    """A unicycle described by the point `ahead` metres in front of its axle, and its heading.
+
+    With p the point: pdot = R(heading) (v, ahead w), headingdot = w. The normalized input (v, ahead w) is the
+    point's velocity in the body frame, so that on positions g g^T is constant.
+    """
+
+    ahead: float = 0.1
+
+    state_names = ("x", "y", "heading")
+    state_units = ("m", "m", "rad")
+    input_names = ("speed", "turn_rate")
+    input_units = ("m/s", "rad/s")
+    position = ("x", "y")
+    state_groups = {"position": ("x", "y")}
+    flat_outputs = ("x", "y")
+    flat_order = 2
+
+    def __check_init__(self) -> None:
+        """Refuse a point that is not ahead of the axle."""
+        positive(self, ahead=self.ahead)
+
+    @property
+    def input_scale(self) -> tuple[tuple[float, ...], ...]:
+        """S = diag(1, 1 / ahead)."""
+        return diagonal(1.0, 1.0 / self.ahead)
+
+    def drift(self, x: State) -> State:
+        """Return f = 0."""
+        return jnp.zeros_like(x)
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x)."""
+        c, s = jnp.cos(x[2]), jnp.sin(x[2])
+        zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+        rows = [[c, -self.ahead * s], [s, self.ahead * c], [zero, one]]
+        return jnp.stack([jnp.stack(row) for row in rows])
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return the state and input whose axle drives the path forward; the speed must not vanish."""
+        axle, u = _drive(derivatives)
+        point = axle[:2] + self.ahead * jnp.stack([jnp.cos(axle[2]), jnp.sin(axle[2])])
+        return jnp.append(point, axle[2]), u
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y with the heading wrapped."""
+        return _wound(x, y)

@@ -1,0 +1,29 @@
+"""The Van der Pol oscillator, an agent whose drift is unstable at the origin and bounded far from it."""
+
+import jax.numpy as jnp
+
+from echelon._errors import ModelError
+from echelon._types import InputMap, State
+from echelon.models.model import ControlAffine
+
+
+class VanDerPol(ControlAffine):
+    """x1dot = x2, x2dot = damping (1 - x1^2) x2 - x1 + u; dimensionless."""
+
+    damping: float = 1.0
+
+    state_names = ("position", "velocity")
+    input_names = ("force",)
+
+    def __check_init__(self) -> None:
+        """Refuse a damping that is negative or not finite."""
+        if not 0.0 <= self.damping < float("inf"):
+            raise ModelError(f"`damping` of `VanDerPol` is {self.damping}, and must be finite and not negative.")
+
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+        return jnp.stack([x[1], self.damping * (1.0 - x[0] ** 2) * x[1] - x[0]])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g = (0; 1)."""
+        return jnp.array([[0.0], [1.0]], x.dtype)

@@ -1,0 +1,40 @@
+"""References without a bend: a fixed point and a line at constant velocity."""
+
+import jax
+import jax.numpy as jnp
+
+from echelon._types import Scalar
+from echelon.references.reference import Reference, finite, in_space
+
+_Vector = tuple[float, ...]
+
+
+class Hover(Reference):
+    """One point (m) with a yaw (rad)."""
+
+    position: _Vector = (0.0, 0.0, 1.0)
+    yaw: float = 0.0
+
+    def __check_init__(self) -> None:
+        """Refuse what is not finite."""
+        finite(self, position=(self.position, 3), yaw=(self.yaw, None))
+
+    def __call__(self, t: Scalar) -> jax.Array:
+        """Return the point."""
+        return in_space(jnp.asarray(self.position, t.dtype), self.yaw)
+
+
+class Line(Reference):
+    """start + velocity t, in m and m/s, with a yaw (rad)."""
+
+    start: _Vector = (0.0, 0.0, 1.0)
+    velocity: _Vector = (1.0, 0.0, 0.0)
+    yaw: float = 0.0
+
+    def __check_init__(self) -> None:
+        """Refuse what is not finite."""
+        finite(self, start=(self.start, 3), velocity=(self.velocity, 3), yaw=(self.yaw, None))
+
+    def __call__(self, t: Scalar) -> jax.Array:
+        """Return the point at time t."""
+        return in_space(jnp.asarray(self.start, t.dtype) + t * jnp.asarray(self.velocity, t.dtype), self.yaw)

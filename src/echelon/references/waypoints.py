@@ -1,0 +1,73 @@
+"""A smooth path through timed points."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon._errors import ReferenceError
+from echelon._types import Matrix, Scalar
+from echelon.references.reference import Reference, finite, in_space
+
+
+class Waypoints(Reference):
+    """The spline of degree 7 through `points` at `times`, at rest at both ends and held outside them.
+
+    Its derivatives are continuous up to the sixth, so that a quadrotor can fly it (flatness needs four). The path
+    starts and stops with zero velocity, acceleration and jerk.
+
+    Args:
+        times: K >= 2 increasing times, s.
+        points: K points (x, y, z), m.
+        yaw: constant yaw, rad.
+
+    Raises:
+        ReferenceError: the times do not increase or the points do not match them.
+    """
+
+    knots: Matrix
+    coefficients: Matrix
+    yaw: float = eqx.field()
+
+    def __init__(
+        self, times: Sequence[float], points: Sequence[Sequence[float]], yaw: float = 0.0
+    ) -> None:
+        """Fit the spline."""
+        t, p = np.asarray(times, dtype=np.float64), np.asarray(points, dtype=np.float64)
+        _check(t, p)
+        self.yaw = yaw
+        finite(self, yaw=(yaw, None))
+        self.knots, self.coefficients = _fit(t, p)
+
+    def __call__(self, t: Scalar) -> jax.Array:
+        """Return the point at time t."""
+        knots = jnp.asarray(self.knots, t.dtype)
+        held = jnp.clip(t, knots[0], knots[-1])
+        piece = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
+        s = held - knots[piece]
+        value = jnp.zeros(3, t.dtype)
+        for coefficient in jnp.asarray(self.coefficients, t.dtype)[:, piece]:
+            value = value * s + coefficient
+        return in_space(value, self.yaw)
+
+
+def _check(times: np.ndarray, points: np.ndarray) -> None:
+    if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise ReferenceError(f"`times` of `Waypoints` is {times.tolist()}, and must be at least 2 increasing times.")
+    if points.shape != (len(times), 3) or not np.isfinite(points).all():
+        raise ReferenceError(
+            f"`points` of `Waypoints` has shape {points.shape}, and must be {len(times)} finite points (x, y, z)."
+        )
+
+
+def _fit(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the knots (K,) and the coefficients (8, K - 1, 3), highest power first."""
+    from scipy.interpolate import make_interp_spline
+
+    rest = [(order, np.zeros(3)) for order in (1, 2, 3)]
+    spline = make_interp_spline(times, points, k=7, bc_type=(rest, rest))
+    powers = [spline.derivative(k)(times[:-1]) / math.factorial(k) for k in range(7, 0, -1)]
+    return times, np.stack([*powers, points[:-1]])
