@@ -1,7 +1,9 @@
-"""What can go wrong, and how it is told: one base error, its few children, and the outcomes of a run.
+"""What can go wrong, and how it is told: one base error, its few children, and the outcomes of a
+run.
 
-Bad input raises at once; its message is one sentence that says what was got and what is allowed. A numerical
-event during a run is not an exception but an `Outcome`, kept beside the data that was computed.
+Bad input raises at once; its message is one sentence that says what was got and what is allowed. A
+numerical event during a run is not an exception but an `Outcome`, kept beside the data that was
+computed.
 """
 
 import difflib

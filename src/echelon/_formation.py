@@ -49,10 +49,12 @@ class Formation:
         Args:
             model: gives the states.
             graph: gives the agents.
-            offsets: agent number -> offset, over the position coordinates (metres) or over all n states.
+            offsets: agent number -> offset, over the position coordinates (metres) or over all n
+                states.
 
         Raises:
-            FormationError: an agent is unknown or an offset has a wrong length or a non-finite number.
+            FormationError: an agent is unknown or an offset has a wrong length or a non-finite
+                number.
         """
         full = np.zeros((graph.agents, len(model.state_names)))
         for agent, offset in offsets.items():
@@ -68,7 +70,9 @@ class Formation:
         """Return a filled triangle: agent 0 at the tip, rows of 2, 3, ... behind it (towards -first axis)."""
         rows = np.floor((np.sqrt(8.0 * np.arange(graph.agents) + 1.0) - 1.0) / 2.0)
         place = np.arange(graph.agents) - rows * (rows + 1) / 2.0
-        return cls._drawn(model, graph, np.column_stack([-rows * np.sqrt(0.75), place - rows / 2.0]), spacing)
+        return cls._drawn(
+            model, graph, np.column_stack([-rows * np.sqrt(0.75), place - rows / 2.0]), spacing
+        )
 
     @classmethod
     def line(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
@@ -91,7 +95,9 @@ class Formation:
         angle = 2.0 * np.pi * np.arange(ring) / ring
         radius = 1.0 if ring < 3 else 0.5 / np.sin(np.pi / ring)
         points = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-        return cls._drawn(model, graph, np.vstack([np.zeros((1, 2)), points])[: graph.agents], spacing)
+        return cls._drawn(
+            model, graph, np.vstack([np.zeros((1, 2)), points])[: graph.agents], spacing
+        )
 
     @classmethod
     def grid(
@@ -100,13 +106,19 @@ class Formation:
         """Return rows of `columns` agents (near a square unless told), agent 0 at a corner."""
         columns = columns or int(np.ceil(np.sqrt(graph.agents)))
         number = np.arange(graph.agents)
-        return cls._drawn(model, graph, np.column_stack([-(number // columns), number % columns]), spacing)
+        return cls._drawn(
+            model, graph, np.column_stack([-(number // columns), number % columns]), spacing
+        )
 
     @classmethod
-    def _drawn(cls, model: ControlAffine, graph: Graph, plan: np.ndarray, spacing: float) -> "Formation":
+    def _drawn(
+        cls, model: ControlAffine, graph: Graph, plan: np.ndarray, spacing: float
+    ) -> "Formation":
         """Place a plan (N, 2), in units of the spacing, on the first two position coordinates."""
         if not 0.0 < spacing < float("inf"):
-            raise FormationError(f"the spacing of a formation is {spacing}, and must be positive and finite.")
+            raise FormationError(
+                f"the spacing of a formation is {spacing}, and must be positive and finite."
+            )
         axes = model.position_indices()
         if not axes:
             raise FormationError(
@@ -141,7 +153,9 @@ class Formation:
     def is_rigid(self, model: ControlAffine, graph: Graph) -> bool:
         """Tell whether distances on the edges fix the shape to first order (infinitesimal rigidity)."""
         agents, dim = graph.agents, len(model.position)
-        motions = dim * (dim + 1) // 2 if agents >= dim else agents * dim - agents * (agents - 1) // 2
+        motions = (
+            dim * (dim + 1) // 2 if agents >= dim else agents * dim - agents * (agents - 1) // 2
+        )
         rank = np.linalg.matrix_rank(self.rigidity_matrix(model, graph))
         return bool(rank == agents * dim - motions)
 
@@ -152,10 +166,12 @@ class Formation:
         return tuple((int(first[g]), k) for k, g in enumerate(group) if first[g] != k)
 
     def broken_symmetries(self, model: ControlAffine) -> dict[int, str]:
-        """Return which agents' offsets change the dynamics, each with one reason; empty when none does.
+        """Return which agents' offsets change the dynamics, each with one reason; empty when none
+        does.
 
-        An offset d keeps the formation law exact only if f(x + d) = f(x) and g(x + d) = g(x). Both are tested at
-        random states about the trim, as differences and as Jacobian-vector products, in float64 (a sampled test).
+        An offset d keeps the formation law exact only if f(x + d) = f(x) and g(x + d) = g(x). Both
+        are tested at random states about the trim, as differences and as Jacobian-vector products,
+        in float64 (a sampled test).
         """
         offsets = self.offsets - self.offsets[0]
         worst: dict[bytes, str | None] = {}
@@ -175,7 +191,9 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
     values = np.atleast_1d(np.asarray(offset, dtype=np.float64))
     axes, n = model.position_indices(), len(model.state_names)
     if not np.isfinite(values).all():
-        raise FormationError(f"the offset of agent {agent} is {values.tolist()}, and must be finite.")
+        raise FormationError(
+            f"the offset of agent {agent} is {values.tolist()}, and must be finite."
+        )
     if values.shape == (n,):
         return values
     if axes and values.shape == (len(axes),):
@@ -183,7 +201,9 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
         full[list(axes)] = values
         return full
     lengths = f"{len(axes)} (position) or {n} (all states)" if axes else f"{n} (all states)"
-    raise FormationError(f"the offset of agent {agent} has {values.size} numbers, and must have {lengths}.")
+    raise FormationError(
+        f"the offset of agent {agent} has {values.size} numbers, and must have {lengths}."
+    )
 
 
 def _changes(model: ControlAffine, offset: np.ndarray) -> str | None:
@@ -200,7 +220,9 @@ def _changes(model: ControlAffine, offset: np.ndarray) -> str | None:
 
 
 @eqx.filter_jit
-def _moved(model: ControlAffine, states: States, offset: State) -> dict[str, tuple[jax.Array, jax.Array]]:
+def _moved(
+    model: ControlAffine, states: States, offset: State
+) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Return f and g at states (S, n), each with the larger of its difference and slope along the offset."""
 
     def change(function: Callable[[State], jax.Array], x: State) -> tuple[jax.Array, jax.Array]:

@@ -33,8 +33,8 @@ class Graph:
         followers: all other agents, sorted.
 
     Raises:
-        GraphError: an edge is a self-loop, repeated or out of range; a weight is not positive and finite; there
-            is no leader or nothing but leaders; the graph is disconnected.
+        GraphError: an edge is a self-loop, repeated or out of range; a weight is not positive and
+            finite; there is no leader or nothing but leaders; the graph is disconnected.
     """
 
     def __init__(
@@ -57,14 +57,18 @@ class Graph:
 
     @classmethod
     def from_edges(
-        cls, edges: Iterable[Sequence[float]], leaders: Iterable[int] = (0,), agents: int | None = None
+        cls,
+        edges: Iterable[Sequence[float]],
+        leaders: Iterable[int] = (0,),
+        agents: int | None = None,
     ) -> "Graph":
         """Return the graph of the given edges; `agents` defaults to the largest number named, plus one."""
         return cls(edges, leaders, agents)
 
     @classmethod
     def from_networkx(cls, graph: "nx.Graph[Any]", leaders: Iterable[int] = (0,)) -> "Graph":
-        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1; `weight` is read.
+        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1; `weight` is
+        read.
 
         Raises:
             GraphError: the graph is directed or its nodes are not 0 .. N-1.
@@ -72,7 +76,9 @@ class Graph:
         if graph.is_directed():
             raise GraphError("the networkx graph is directed, and must be undirected.")
         if set(graph.nodes) != set(range(len(graph))):
-            raise GraphError("the nodes of the networkx graph must be the whole numbers from 0 on, without a gap.")
+            raise GraphError(
+                "the nodes of the networkx graph must be the whole numbers from 0 on, without a gap."
+            )
         edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
         return cls(edges, leaders, len(graph))
 
@@ -110,17 +116,19 @@ class Graph:
         return cls(np.concatenate([across, down]).tolist(), leaders, rows * columns)
 
     @classmethod
-    def geometric(cls, agents: int, radius: float, seed: int = 0, leaders: Iterable[int] = (0,)) -> "Graph":
+    def geometric(
+        cls, agents: int, radius: float, seed: int = 0, leaders: Iterable[int] = (0,)
+    ) -> "Graph":
         """Return random points of the unit square, linked where closer than `radius`.
 
         Raises:
             GraphError: the radius is too small for the points to be connected.
         """
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         _at_least(agents, 2, "geometric")
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
-        pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+        pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
         return cls(pairs[np.lexsort(pairs.T[::-1])].tolist(), leaders, agents)
 
     def adjacency(self) -> sp.csr_array:
@@ -143,15 +151,17 @@ class Graph:
         """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
         return np.linalg.inv(self.grounded_laplacian().toarray())
 
-    def grounded_spectrum(self) -> tuple[float, float]:
-        """Return the smallest and the largest eigenvalue of the grounded Laplacian."""
+    def grounded_spectrum(self) -> Matrix:
+        """Return the eigenvalues of the grounded Laplacian, ascending.
+
+        All of them up to 400 followers, beyond that the smallest and the largest.
+        """
         L = self.grounded_laplacian()
         if len(self.followers) <= _DENSE:
-            values = np.linalg.eigvalsh(L.toarray())
-            return float(values[0]), float(values[-1])
+            return np.linalg.eigvalsh(L.toarray())
         smallest = spla.eigsh(sp.csc_array(L), k=1, sigma=0.0, return_eigenvectors=False)
         largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
-        return float(smallest[0]), float(largest[0])
+        return np.concatenate([smallest, largest])
 
     def neighbours(self, agent: int) -> tuple[int, ...]:
         """Return the agents linked to `agent`, sorted."""
@@ -178,9 +188,9 @@ class Graph:
 
     def relabelled(self, order: Sequence[int]) -> "Graph":
         """Return the same graph with agent i renamed to order[i]."""
-        order = np.asarray(order)
-        edges = np.column_stack([order[self.edges], self.weights])
-        return Graph(edges.tolist(), order[list(self.leaders)].tolist(), self.agents)
+        renamed = np.asarray(order)
+        edges = np.column_stack([renamed[self.edges], self.weights])
+        return Graph(edges.tolist(), renamed[list(self.leaders)].tolist(), self.agents)
 
     def __eq__(self, other: object) -> bool:
         """Tell whether two graphs have the same agents, leaders and edges in the same order."""
@@ -206,7 +216,9 @@ class Graph:
         reached = np.isin(label, label[list(self.leaders)])
         lost = np.flatnonzero(~reached)
         if len(lost):
-            raise GraphError(f"the graph is disconnected: {_some(lost)} no path to a leader ({_leaders(self)}).")
+            raise GraphError(
+                f"the graph is disconnected: {_some(lost)} no path to a leader ({_leaders(self)})."
+            )
         apart = np.flatnonzero(label != label[0])
         raise GraphError(f"the graph is disconnected: {_some(apart)} no path to agent 0.")
 
@@ -214,8 +226,8 @@ class Graph:
 class Exchange(eqx.Module):
     """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
 
-    The agents' own values and the values that they said are separate arguments, since on a real network the
-    second may be old or lost.
+    The agents' own values and the values that they said are separate arguments, since on a real
+    network the second may be old or lost.
     """
 
     receivers: Matrix
@@ -243,7 +255,9 @@ def _count_agents(pairs: list[tuple[float, ...]], agents: int | None) -> int:
         agents = named
     _at_least(agents, 2, "graph")
     if named > agents:
-        raise GraphError(f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}.")
+        raise GraphError(
+            f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}."
+        )
     return agents
 
 
@@ -254,13 +268,19 @@ def _checked_edges(
     for pair, weight in zip(pairs, weights, strict=True):
         i, j = sorted(int(end) for end in pair)
         if (i, j) != tuple(sorted(pair)) or i < 0:
-            raise GraphError(f"an edge is {list(pair)}, and agents are whole numbers from 0 to {agents - 1}.")
+            raise GraphError(
+                f"an edge is {list(pair)}, and agents are whole numbers from 0 to {agents - 1}."
+            )
         if i == j:
-            raise GraphError(f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents.")
+            raise GraphError(
+                f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents."
+            )
         if (i, j) in seen:
             raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
         if not 0.0 < weight < float("inf"):
-            raise GraphError(f"the weight of edge [{i}, {j}] is {weight}, and must be positive and finite.")
+            raise GraphError(
+                f"the weight of edge [{i}, {j}] is {weight}, and must be positive and finite."
+            )
         seen.add((i, j))
     array = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     return np.sort(array, axis=1), np.array(weights, dtype=np.float64)
@@ -272,7 +292,9 @@ def _checked_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
         raise GraphError("the graph has no leader; name at least one agent in `leaders`.")
     for leader in chosen:
         if not 0 <= leader < agents:
-            raise GraphError(f"leader {leader} is no agent; agents are numbered from 0 to {agents - 1}.")
+            raise GraphError(
+                f"leader {leader} is no agent; agents are numbered from 0 to {agents - 1}."
+            )
     return chosen
 
 

@@ -1,6 +1,7 @@
 """Where the agents start: leaders on their reference, followers about their goals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -11,20 +12,24 @@ from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 
 
+Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
+"""Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
+
+
 def initial_states(
     model: ControlAffine,
     graph: Graph,
     formation: Formation,
     leader: Law,
-    initial: Mapping[str, float] | np.ndarray | None,
+    initial: Initial,
     start_error: Mapping[str, float],
     seed: int,
 ) -> np.ndarray:
     """Return the states (N, n) at time zero.
 
-    A leader starts where its law says, at its own offset, plus `start_error`. A follower starts at its goal
-    relative to its nearest leader, plus a uniform random deviation within +- the spread of each state. The same
-    seed draws the same deviations whatever the spreads are.
+    A leader starts where its law says, at its own offset, plus `start_error`. A follower starts at
+    its goal relative to the leader, plus a uniform random deviation within +- the spread of each
+    state. The same seed draws the same deviations whatever the spreads are.
 
     Raises:
         SimulationError: given states have a wrong shape or are not finite; a spread is negative.
@@ -32,27 +37,42 @@ def initial_states(
     """
     shape = (graph.agents, len(model.state_names))
     if initial is not None and not isinstance(initial, Mapping):
-        return _given(initial, shape)
-    spread = _per_state(model, initial or {}, "initial spread")
+        return _checked(initial, shape, "initial states have", "(agents, states)")
+    spreads: dict[str, Any] = {key: value for key, value in (initial or {}).items() if isinstance(key, str)}
+    spread = _per_state(model, spreads, "initial spread")
     if (spread < 0.0).any():
         raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
     error = _per_state(model, start_error, "start error")
     leaders = np.asarray(leader.start(model), np.float64) + error
     deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
     deviations[list(graph.leaders)] = 0.0
-    return leaders + formation.offsets + deviations
+    states = leaders + formation.offsets + deviations
+    for agent, given in (initial or {}).items():
+        if not isinstance(agent, str):
+            _check_agent(agent, graph)
+            states[agent] = _checked(
+                given, shape[1:], f"the initial state of agent {agent} has", "(states,)"
+            )
+    return states
 
 
-def _given(states: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    array = np.array(states, dtype=np.float64)
+def _check_agent(agent: int, graph: Graph) -> None:
+    if not 0 <= agent < graph.agents:
+        raise SimulationError(
+            f"an initial state is given for agent {agent}, and agents are numbered from 0 to {graph.agents - 1}."
+        )
+
+
+def _checked(values: object, shape: tuple[int, ...], what: str, meaning: str) -> np.ndarray:
+    array = np.array(values, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise SimulationError(
-            f"initial states have shape {array.shape}, and must be finite with shape {shape} (agents, states)."
+            f"{what} shape {array.shape}, and must be finite with shape {shape} {meaning}."
         )
     return array
 
 
-def _per_state(model: ControlAffine, named: Mapping[str, float], what: str) -> np.ndarray:
+def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
     """Return one number a state from numbers by state or group; a state's own number wins over its group's."""
     values = np.zeros(len(model.state_names))
     for name in sorted(named, key=lambda name: name in model.state_names):

@@ -70,7 +70,8 @@ def symmetric_part(matrix: np.ndarray) -> np.ndarray:
 
 
 def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np.ndarray]]:
-    """Return the eigenvalues of A that input B cannot move, each with its left eigenvector (PBH test).
+    """Return the eigenvalues of A that input B cannot move, each with its left eigenvector (PBH
+    test).
 
     A mode counts as uncontrollable when the smallest singular value of [s I - A, B] is below
     1e-9 times the norm of the pair.

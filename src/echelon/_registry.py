@@ -1,7 +1,8 @@
-"""The one table of names that a scenario file may use, each with where it lives and one line on what it is.
+"""The one table of names that a scenario file may use, each with where it lives and one line on
+what it is.
 
-Only text stands here, so that names can be listed and checked without importing JAX. A new member of a family
-adds one line.
+Only text stands here, so that names can be listed and checked without importing JAX. A new member
+of a family adds one line.
 """
 
 from typing import NamedTuple
@@ -15,12 +16,18 @@ class Entry(NamedTuple):
 
 
 def _models(**entries: tuple[str, str]) -> dict[str, Entry]:
-    return {name.replace("_", "-"): Entry(f"echelon.models:{cls}", text) for name, (cls, text) in entries.items()}
+    return {
+        name.replace("_", "-"): Entry(f"echelon.models:{cls}", text)
+        for name, (cls, text) in entries.items()
+    }
 
 
 MODELS = _models(
     single_integrator=("SingleIntegrator", "position driven by velocity, in any dimension"),
-    double_integrator=("DoubleIntegrator", "position and velocity driven by acceleration, with linear drag"),
+    double_integrator=(
+        "DoubleIntegrator",
+        "position and velocity driven by acceleration, with linear drag",
+    ),
     linear=("Linear", "A, B, C given as matrices"),
     van_der_pol=("VanDerPol", "Van der Pol oscillator with a force input"),
     pendulum=("Pendulum", "damped pendulum with a torque input"),
@@ -28,11 +35,16 @@ MODELS = _models(
     unicycle_point=("UnicyclePoint", "the same vehicle, seen at a point ahead of its axle"),
     planar_quadrotor=("PlanarQuadrotor", "quadrotor in a vertical plane, 6 states"),
     quadrotor=("Quadrotor", "quadrotor in space, 12 states, ZYX Euler angles, per-motor limits"),
-    quadrotor_printed=("PrintedQuadrotor", "literal: the paper's equations, without gravity or thrust rotation"),
+    quadrotor_printed=(
+        "PrintedQuadrotor",
+        "literal: the paper's equations, without gravity or thrust rotation",
+    ),
 )
 
 REFERENCES = {
-    "lemniscate": Entry("echelon.references:Lemniscate", "the paper's loop (lemniscate of Bernoulli)"),
+    "lemniscate": Entry(
+        "echelon.references:Lemniscate", "the paper's loop (lemniscate of Bernoulli)"
+    ),
     "figure-eight": Entry("echelon.references:FigureEight", "sin and sin 2 figure eight"),
     "circle": Entry("echelon.references:Circle", "circle at constant height"),
     "hover": Entry("echelon.references:Hover", "one fixed point"),
@@ -41,18 +53,24 @@ REFERENCES = {
 }
 
 METHODS = {
-    "riccati": Entry("echelon.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"),
+    "riccati": Entry(
+        "echelon.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"
+    ),
     "given": Entry("echelon.gains:Given", "a P (and R, coupling) of your own"),
 }
 
 FOLLOWER_LAWS = {
     "consensus": Entry("echelon.laws:Consensus", "u = u_ff - c R^-1 g(x)^T P (e + d)"),
-    "agreement": Entry("echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"),
+    "agreement": Entry(
+        "echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"
+    ),
     "passive": Entry("echelon.laws:Passive", "the trim input, nothing else"),
 }
 
 LEADER_LAWS = {
-    "tracking": Entry("echelon.laws:Tracking", "flatness feed-forward and Riccati feedback on the reference"),
+    "tracking": Entry(
+        "echelon.laws:Tracking", "flatness feed-forward and Riccati feedback on the reference"
+    ),
     "agreement": FOLLOWER_LAWS["agreement"],
     "passive": FOLLOWER_LAWS["passive"],
 }

@@ -1,6 +1,5 @@
 """The closed loop in time: parts in, one `Result` out. This file sees only the interfaces of models and laws."""
 
-import functools
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -15,7 +14,7 @@ from echelon import _numerics
 from echelon._errors import Outcome, SimulationError, did_you_mean, listing
 from echelon._formation import Formation
 from echelon._graph import Exchange, Graph
-from echelon._initial import initial_states
+from echelon._initial import Initial, initial_states
 from echelon._result import Result, Settings
 from echelon._types import Inputs, Matrix, Scalar, States
 from echelon.laws.law import Law, LocalView, Memory
@@ -63,7 +62,7 @@ def simulate(
     *,
     leader: Law,
     follower: Law,
-    initial: Mapping[str, float] | np.ndarray | None = None,
+    initial: Initial = None,
     start_error: Mapping[str, float] | None = None,
     horizon: float,
     dt: float,
@@ -82,8 +81,9 @@ def simulate(
         formation: the goal offsets, (N, n).
         leader: law of the leaders.
         follower: law of all others.
-        initial: spread of the followers' starts about their goals, per state or group (uniform within +- the
-            number), or all states (N, n) given.
+        initial: spread of the followers' starts about their goals, per state or group (uniform
+            within +- the number); or states (n,) by agent, all others on their goals; or all states
+            (N, n).
         start_error: what is added to the leaders' starts, per state or group.
         horizon: length of the run, s; rounded to whole steps.
         dt: step, s.
@@ -95,8 +95,8 @@ def simulate(
         progress: called about a hundred times with (steps done, steps in all).
 
     Raises:
-        EchelonError: a part is malformed or does not fit the others. A run that diverges or is interrupted by
-            Ctrl-C is no error: the result says so and holds what was computed.
+        EchelonError: a part is malformed or does not fit the others. A run that diverges or is
+            interrupted by Ctrl-C is no error: the result says so and holds what was computed.
     """
     settings = Settings(horizon, dt, integrator, limits, store_every, precision, seed)
     check_settings(settings)
@@ -138,9 +138,13 @@ def check_settings(settings: Settings) -> None:
     horizon, dt = settings.horizon, settings.dt
     for name, value in (("horizon", horizon), ("dt", dt)):
         if not 0.0 < value < math.inf:
-            raise SimulationError(f"`{name}` is {value}, and must be a positive finite number of seconds.")
+            raise SimulationError(
+                f"`{name}` is {value}, and must be a positive finite number of seconds."
+            )
     if horizon < dt:
-        raise SimulationError(f"`horizon` is {horizon} s, and must be at least one step `dt` = {dt} s.")
+        raise SimulationError(
+            f"`horizon` is {horizon} s, and must be at least one step `dt` = {dt} s."
+        )
     if settings.integrator not in _numerics.INTEGRATORS:
         known = _numerics.INTEGRATORS
         raise SimulationError(
@@ -150,11 +154,18 @@ def check_settings(settings: Settings) -> None:
     if settings.store_every < 1:
         raise SimulationError(f"`store_every` is {settings.store_every}, and must be at least 1.")
     if settings.precision not in ("float64", "float32"):
-        raise SimulationError(f"`precision` is `{settings.precision}`, allowed are `float64` and `float32`.")
+        raise SimulationError(
+            f"`precision` is `{settings.precision}`, allowed are `float64` and `float32`."
+        )
 
 
 def _assemble(
-    model: ControlAffine, graph: Graph, formation: Formation, leader: Law, follower: Law, settings: Settings
+    model: ControlAffine,
+    graph: Graph,
+    formation: Formation,
+    leader: Law,
+    follower: Law,
+    settings: Settings,
 ) -> Loop:
     shape = (graph.agents, len(model.state_names))
     if formation.offsets.shape != shape:
@@ -218,8 +229,8 @@ def _relayed(loop: Loop, u: Inputs) -> Inputs:
 def step(loop: Loop, now: Moment) -> Moment:
     """Advance all agents by one dt with the inputs held."""
     u, limited, memory_l, memory_f = control(loop, now)
-    advance = functools.partial(_numerics.INTEGRATORS[loop.integrator], loop.model.velocity, dt=loop.dt)
-    states = jax.vmap(advance)(now.states, u)
+    integrate = _numerics.INTEGRATORS[loop.integrator]
+    states = jax.vmap(lambda x, u: integrate(loop.model.velocity, x, u, loop.dt))(now.states, u)
     return Moment(now.step + 1, states, memory_l, memory_f, now.saturated + limited)
 
 
@@ -255,7 +266,9 @@ def _frame_counts(settings: Settings) -> np.ndarray:
 
 def _start(loop: Loop, states: np.ndarray) -> Moment:
     def remember(law: Law, who: Matrix) -> Memory:
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(who), *jnp.shape(leaf))), law.init())
+        return jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (len(who), *jnp.shape(leaf))), law.init()
+        )
 
     return Moment(
         step=jnp.zeros((), jnp.int32),
@@ -287,16 +300,17 @@ def _run(loop: Loop, states: np.ndarray, counts: np.ndarray, progress: Progress 
 
 def _collect(loop: Loop, counts: np.ndarray, frames: list[Any], now: Moment) -> _Record:
     """Join the stored frames, cut at the first one that is not finite."""
+    agents, n = now.states.shape
+    nothing = (np.zeros((0, agents, n)), np.zeros((0, agents, len(loop.model.input_names))))
     states, inputs = (
-        np.concatenate([frame[k] for frame in frames])[: len(counts)] if frames else np.zeros((0,))
-        for k in (0, 1)
+        np.concatenate([frame[k] for frame in (nothing, *frames)])[: len(counts)] for k in (0, 1)
     )
     times = loop.dt * np.concatenate([[0], np.cumsum(counts[:-1])])[: len(states)]
-    lost = ~np.isfinite(states).all(axis=-1) if frames else np.zeros((0, 1), bool)
+    lost = np.array(~np.isfinite(states).all(axis=2))
     failed = None
     if lost.any():
-        cut = int(np.argmax(lost.any(axis=1)))
-        failed = (float(times[cut]), int(np.argmax(lost[cut])))
+        cut, agent = np.argwhere(lost)[0]
+        failed = (float(times[cut]), int(agent))
         times, states, inputs = times[:cut], states[:cut], inputs[:cut]
     saturated = np.asarray(now.saturated, np.float64) / max(1, int(now.step))
     return _Record(times, states, inputs, saturated, len(times) == len(counts), failed)
@@ -306,11 +320,17 @@ def _verdict(record: _Record, graph: Graph) -> tuple[Outcome, str]:
     if record.failed is not None:
         when, agent = record.failed
         role = "leader" if agent in graph.leaders else "follower"
-        return Outcome.DIVERGED, f"The state of {role} {agent} stopped being finite by t = {when:.6g} s."
+        return (
+            Outcome.DIVERGED,
+            f"The state of {role} {agent} stopped being finite by t = {when:.6g} s.",
+        )
     if record.complete:
         return Outcome.COMPLETED, Outcome.COMPLETED.value
     reached = record.times[-1] if len(record.times) else 0.0
-    return Outcome.INTERRUPTED, f"The run was interrupted at t = {reached:.6g} s; what was computed is kept."
+    return (
+        Outcome.INTERRUPTED,
+        f"The run was interrupted at t = {reached:.6g} s; what was computed is kept.",
+    )
 
 
 def _formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
@@ -322,5 +342,7 @@ def _formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str
         for agent, reason in list(broken.items())[:1]
     ]
     pairs = formation.coincident() if model.position and formation.offsets.any() else ()
-    told += [f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]]
+    told += [
+        f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
+    ]
     return tuple(told)

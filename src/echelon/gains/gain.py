@@ -17,29 +17,32 @@ Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Matrix
 
 
 class Certificate(eqx.Module):
-    """What is known of a gain on a graph, by linearization at the trim: nothing here is a global proof.
+    """What is known of a gain on a graph by linearization at the trim; no region is proved.
 
     Attributes:
-        kind: the kind of argument behind the abscissas.
+        kind: the kind of argument behind the abscissa.
         lambda_min, lambda_max: extreme eigenvalues of the grounded Laplacian.
-        abscissas: largest real part of A - c lambda B R^-1 B'P at lambda_min and at lambda_max, 1/s; all modes in
-            between are covered only where the gain's edge covers them.
-        edge: smallest coupling for which the linearization is proved stable, or None where no bound is known.
-        observable: rank of the observability matrix of (A, g'P), out of n; below n, disagreements exist that
-            never enter the input.
+        abscissa: largest real part of an eigenvalue of A - c lambda B R^-1 B'P, 1/s, over the
+            eigenvalues lambda that were looked at.
+        modes: how many eigenvalues lambda that were: all, or on large graphs the extreme two.
+        edge: smallest coupling for which the linearization is proved stable, or None where no bound
+            is known.
+        observable: rank of the observability matrix of (A, g'P), out of n; below n, disagreements
+            exist that never enter the input.
     """
 
     kind: Kind = eqx.field(static=True)
     lambda_min: float
     lambda_max: float
-    abscissas: tuple[float, float]
+    abscissa: float
+    modes: int = eqx.field(static=True)
     edge: float | None
     observable: int = eqx.field(static=True)
 
     @property
     def stable(self) -> bool:
-        """Whether the linearized disagreement decays at both ends of the spectrum."""
-        return max(self.abscissas) < 0.0
+        """Whether the linearized disagreement decays in every mode that was looked at."""
+        return self.abscissa < 0.0
 
 
 class Gain(eqx.Module):
@@ -106,7 +109,9 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
         )
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least <= 0.0:
-        raise GainError(f"`{name}` is not positive definite: its smallest eigenvalue is {least:.6g}.")
+        raise GainError(
+            f"`{name}` is not positive definite: its smallest eigenvalue is {least:.6g}."
+        )
 
 
 def as_matrix(name: str, value: Weight, size: int) -> Matrix:
@@ -118,9 +123,13 @@ def as_matrix(name: str, value: Weight, size: int) -> Matrix:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise GainError(f"`{name}` is {value}, and must be {size} numbers or {size} x {size}.") from None
+        raise GainError(
+            f"`{name}` is {value}, and must be {size} numbers or {size} x {size}."
+        ) from None
     if array.shape == (size,):
         array = np.diag(array)
     if array.shape != (size, size):
-        raise GainError(f"`{name}` has shape {array.shape}, and must be {size} numbers or {size} x {size}.")
+        raise GainError(
+            f"`{name}` has shape {array.shape}, and must be {size} numbers or {size} x {size}."
+        )
     return array

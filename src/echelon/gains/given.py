@@ -37,11 +37,15 @@ class Given(Method):
         for name, matrix in (("P", P), ("R", R)):
             check_definite(name, matrix)
         certificate = certify(linearize(model), graph, P, R, self.coupling, edge=None)
-        return Gain(P=P, R=R, coupling=float(self.coupling), method="given", certificate=certificate)
+        return Gain(
+            P=P, R=R, coupling=float(self.coupling), method="given", certificate=certificate
+        )
 
     def _matrix(self, n: int) -> np.ndarray:
         if isinstance(self.P, str):
             if self.P != "identity":
-                raise GainError(f"`P` is `{self.P}`, and must be a matrix, a diagonal or `identity`.")
+                raise GainError(
+                    f"`P` is `{self.P}`, and must be a matrix, a diagonal or `identity`."
+                )
             return np.eye(n)
         return as_matrix("P", self.P, n)

@@ -17,8 +17,8 @@ class Riccati(Method):
     Args:
         Q: state weight, n numbers or (n, n); the model's own when left out.
         R: weight of the normalized input, m numbers or (m, m); the model's own when left out.
-        coupling: c; 1/lambda_min when left out, twice the edge 1/(2 lambda_min) of the guarantee for linear
-            agents.
+        coupling: c; 1/lambda_min when left out, twice the edge 1/(2 lambda_min) of the guarantee
+            for linear agents.
     """
 
     Q: Weight | None = None
@@ -29,7 +29,8 @@ class Riccati(Method):
         """Return the gain.
 
         Raises:
-            GainError: a weight is not positive (semi)definite, or a mode cannot be stabilized (named).
+            GainError: a weight is not positive (semi)definite, or a mode cannot be stabilized
+                (named).
         """
         default_Q, default_R = model.weights
         n, m = len(model.state_names), len(model.input_names)
@@ -40,7 +41,7 @@ class Riccati(Method):
         linear = linearize(model)
         _check_stabilizable(model, linear)
         P = riccati(*linear, Q, R)
-        low, _ = graph.grounded_spectrum()
+        low = float(graph.grounded_spectrum()[0])
         coupling = 1.0 / low if self.coupling is None else float(self.coupling)
         certificate = certify(linear, graph, P, R, coupling, edge=0.5 / low)
         return Gain(P=P, R=R, coupling=coupling, method="riccati", certificate=certificate)
@@ -51,7 +52,9 @@ def _check_semidefinite(Q: np.ndarray) -> None:
         raise GainError("`Q` must be a symmetric matrix of finite numbers.")
     least = float(np.linalg.eigvalsh(Q)[0])
     if least < -1e-12 * max(1.0, float(np.abs(Q).max())):
-        raise GainError(f"`Q` is not positive semidefinite: its smallest eigenvalue is {least:.6g}.")
+        raise GainError(
+            f"`Q` is not positive semidefinite: its smallest eigenvalue is {least:.6g}."
+        )
 
 
 def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:

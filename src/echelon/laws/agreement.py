@@ -1,8 +1,10 @@
 """The formation law for single integrators of Mesbahi and Egerstedt (paper, Theorem 1)."""
 
+import numpy as np
+
 from echelon._errors import LawError
 from echelon._graph import Graph
-from echelon._types import Input
+from echelon._types import Input, Matrix
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.integrator import SingleIntegrator
 from echelon.models.model import ControlAffine
@@ -11,13 +13,18 @@ from echelon.models.model import ControlAffine
 class Agreement(Law):
     """u_i = -sum_j A_ij ((x_i - x_j) - (xi_i - xi_j)).
 
-    Run by all agents alike, it drives every x_i - xi_i to one common constant, the mean of their starts.
+    Run by all agents alike, it drives every x_i - xi_i to one common constant, the mean of their
+    starts.
     """
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Neighbours' states."""
         return ("neighbours' states",)
+
+    def metric(self, model: ControlAffine) -> Matrix:
+        """Return the identity."""
+        return np.eye(len(model.state_names))
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Agreement":
         """Refuse a model that is no single integrator."""

@@ -5,20 +5,23 @@ import jax.numpy as jnp
 
 from echelon._errors import LawError
 from echelon._graph import Graph
-from echelon._types import Input, State
+from echelon._types import Input, Matrix, State
 from echelon.gains.gain import Gain
 from echelon.laws.law import Feedforward, Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 
 
 class Consensus(Law):
-    """u_i = u* + S (v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)), the paper's law at c = 1, R = I, v_ff = 0.
+    """u_i = u* + S (v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)), the paper's law at c = 1, R = I, v_ff
+    = 0.
 
     Args:
         gain: P, R and c.
-        feedforward: `none`, or `relay`: the leader's normalized input of the same step, after its limits. The
-            paper's network does not give this to followers that are not the leader's neighbours.
-        trim: whether the trim input u* is applied; the paper's printed law has none (literal: False).
+        feedforward: `none`, or `relay`: the leader's normalized input of the same step, after its
+            limits. The paper's network does not give this to followers that are not the leader's
+            neighbours.
+        trim: whether the trim input u* is applied; the paper's printed law has none (literal:
+            False).
     """
 
     gain: Gain
@@ -28,7 +31,9 @@ class Consensus(Law):
     def __check_init__(self) -> None:
         """Refuse an unknown feed-forward."""
         if self.feedforward not in ("none", "relay"):
-            raise LawError(f"`feedforward` is `{self.feedforward}`, allowed are `none` and `relay`.")
+            raise LawError(
+                f"`feedforward` is `{self.feedforward}`, allowed are `none` and `relay`."
+            )
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -39,6 +44,10 @@ class Consensus(Law):
     def asks(self) -> Feedforward:
         """Return the chosen feed-forward."""
         return self.feedforward
+
+    def metric(self, model: ControlAffine) -> Matrix:
+        """Return the gain's P."""
+        return self.gain.P
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Consensus":
         """Check that the gain fits the model."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from echelon._errors import LawError
 from echelon._graph import Graph
-from echelon._types import Input, Scalar, State
+from echelon._types import Input, Matrix, Scalar, State
 from echelon.models.model import ControlAffine
 
 Feedforward: TypeAlias = Literal["none", "relay"]
@@ -55,8 +55,13 @@ class Law(eqx.Module):
         """Return the states (T, n) that the law follows, or None where it follows nothing."""
         return None
 
+    def metric(self, model: ControlAffine) -> Matrix | None:
+        """Return the P (n, n) of the paper's Lyapunov function for this law, or None where it has none."""
+        return None
+
     def prepared(self, model: ControlAffine, graph: Graph) -> "Law":
-        """Return the law completed with what depends on the model and the graph; itself unless replaced.
+        """Return the law completed with what depends on the model and the graph; itself unless
+        replaced.
 
         Raises:
             LawError: the law does not fit the model.
@@ -72,7 +77,9 @@ class Law(eqx.Module):
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""
 
 
-def check_gain_fits(law: Law, model: ControlAffine, P_shape: tuple[int, ...], R_shape: tuple[int, ...]) -> None:
+def check_gain_fits(
+    law: Law, model: ControlAffine, P_shape: tuple[int, ...], R_shape: tuple[int, ...]
+) -> None:
     """Check that a gain was made for a model of this size.
 
     Raises:

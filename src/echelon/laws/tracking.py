@@ -18,8 +18,8 @@ from echelon.references.reference import COORDINATES, Reference
 class Tracking(Law):
     """u_L = u_r(t) - S R^-1 (g S)'P (x - x_r(t)) [- S c R^-1 (g S)'P (e_L + d_L)].
 
-    (x_r, u_r) comes from the model's flatness map. The last term is the paper's reaction of the leader to its
-    neighbours (its leader law), present when `reaction` is given.
+    (x_r, u_r) comes from the model's flatness map. The last term is the paper's reaction of the
+    leader to its neighbours (its leader law), present when `reaction` is given.
 
     Args:
         reference: the path to follow.

@@ -23,11 +23,15 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
         ModelError: the first fault found, as one sentence.
     """
     if not isinstance(model, ControlAffine):
-        raise ModelError(f"the model is {model!r}, and must be an instance of a `ControlAffine` class.")
+        raise ModelError(
+            f"the model is {model!r}, and must be an instance of a `ControlAffine` class."
+        )
     name = type(model).__name__
     n, m = len(model.state_names), len(model.input_names)
     if not (n and m):
-        raise ModelError(f"`{name}` has {n} state names and {m} input names, and needs at least one of each.")
+        raise ModelError(
+            f"`{name}` has {n} state names and {m} input names, and needs at least one of each."
+        )
     _check_names(model, name)
     x, u = _trim(model, name, n, m)
     _check_values(model, name, x, u)
@@ -54,7 +58,9 @@ def _check_names(model: ControlAffine, name: str) -> None:
         ("input_units", model.input_units, model.input_names),
     ):
         if len(units) != len(names):
-            raise ModelError(f"`{where}` of `{name}` has {len(units)} entries, and must have {len(names)}.")
+            raise ModelError(
+                f"`{where}` of `{name}` has {len(units)} entries, and must have {len(names)}."
+            )
 
 
 def _trim(model: ControlAffine, name: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:

@@ -94,7 +94,9 @@ class DoubleIntegrator(ControlAffine):
         """Refuse a dimension below one or a negative drag."""
         _check_dimension(self, self.dimension)
         if not 0.0 <= self.drag < float("inf"):
-            raise ModelError(f"`drag` of `DoubleIntegrator` is {self.drag}, and must be finite and not negative.")
+            raise ModelError(
+                f"`drag` of `DoubleIntegrator` is {self.drag}, and must be finite and not negative."
+            )
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -39,7 +39,12 @@ class Linear(ControlAffine):
         n = len(self.A)
         self.C = np.eye(n) if C is None else _matrix("C", C)
         self.names = tuple(names) or tuple(f"x{k + 1}" for k in range(n))
-        if self.A.shape != (n, n) or len(self.B) != n or self.C.shape[1] != n or len(self.names) != n:
+        if (
+            self.A.shape != (n, n)
+            or len(self.B) != n
+            or self.C.shape[1] != n
+            or len(self.names) != n
+        ):
             raise ModelError(
                 f"the shapes of `Linear` are A {self.A.shape}, B {self.B.shape}, C {self.C.shape} with "
                 f"{len(self.names)} names, and must be A (n, n), B (n, m), C (q, n) with n names."
@@ -77,7 +82,11 @@ def _matrix(name: str, value: Sequence[Sequence[float]] | Matrix) -> Matrix:
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ModelError(f"`{name}` of `Linear` is {value}, and must be a list of rows of numbers.") from None
+        raise ModelError(
+            f"`{name}` of `Linear` is {value}, and must be a list of rows of numbers."
+        ) from None
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
-        raise ModelError(f"`{name}` of `Linear` must be a matrix of finite numbers, and has shape {matrix.shape}.")
+        raise ModelError(
+            f"`{name}` of `Linear` must be a matrix of finite numbers, and has shape {matrix.shape}."
+        )
     return matrix

@@ -1,11 +1,13 @@
-"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x) (paper, Definition 1).
+"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x) (paper,
+Definition 1).
 
-A model of one's own is two methods and two tuples of names; everything else has a default that may be replaced
-by a class attribute, a property or a method of the same name.
+A model of one's own is two methods and two tuples of names; everything else has a default that may
+be replaced by a class attribute, a property or a method of the same name.
 """
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Generic, TypeAlias, TypeVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,15 +16,84 @@ from echelon._errors import ModelError, did_you_mean, listing
 from echelon._types import Input, InputMap, Output, State
 
 
+Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
+Rows: TypeAlias = tuple[tuple[float, ...], ...]
+_T = TypeVar("_T")
+
+
+class _Default(Generic[_T]):
+    """A class attribute computed from the instance, until a subclass replaces it in any way."""
+
+    def __init__(self, make: Callable[[Any], _T]) -> None:
+        self.make = make
+
+    def __get__(self, instance: object, owner: type) -> "_T | _Default[_T]":
+        """Return the value for an instance."""
+        return self if instance is None else self.make(instance)
+
+
+def default(make: Callable[[Any], _T]) -> _T:
+    """Return a default that depends on the instance; a plain attribute or a property may replace it."""
+    return cast(_T, _Default(make))
+
+
+def _repeat(value: float, names: tuple[str, ...]) -> tuple[float, ...]:
+    return (value,) * len(names)
+
+
+def diagonal(*entries: float) -> Rows:
+    """Return a diagonal matrix as nested tuples, the form of `input_scale`."""
+    return tuple(
+        tuple(e if i == j else 0.0 for j in range(len(entries))) for i, e in enumerate(entries)
+    )
+
+
 class ControlAffine(eqx.Module):
     """One agent, xdot = f(x) + g(x) u with output y = h(x).
 
-    Shapes are those of one agent: x (n,), u (m,), f (n,), g (n, m), h (q,). The methods must be pure and, in x,
-    differentiable by JAX.
+    Shapes are those of one agent: x (n,), u (m,), f (n,), g (n, m), h (q,). The methods must be
+    pure and, in x, differentiable by JAX.
     """
 
-    state_names: eqx.AbstractVar[tuple[str, ...]]
-    input_names: eqx.AbstractVar[tuple[str, ...]]
+    state_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the n states; every model must say them."""
+
+    input_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the m inputs; every model must say them."""
+
+    output_names: ClassVar[tuple[str, ...]] = default(lambda self: self.state_names)
+    """Names of the entries of h(x); to be replaced together with `output`."""
+
+    state_units: ClassVar[tuple[str, ...]] = default(lambda self: ("",) * len(self.state_names))
+    """SI units of the states, as text; empty where unknown."""
+
+    input_units: ClassVar[tuple[str, ...]] = default(lambda self: ("",) * len(self.input_names))
+    """SI units of the inputs, as text; empty where unknown."""
+
+    state_groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Named groups of states, such as `position` or `attitude`, for spreads and start errors."""
+
+    position: ClassVar[tuple[str, ...]] = ()
+    """Names of the coordinates that a picture shows, in metres; none for an abstract agent."""
+
+    trim: ClassVar[Pair] = default(
+        lambda self: (_repeat(0.0, self.state_names), _repeat(0.0, self.input_names))
+    )
+    """Equilibrium (x*, u*) about which gains are made; the origin unless replaced."""
+
+    input_scale: ClassVar[Rows] = default(lambda self: diagonal(*_repeat(1.0, self.input_names)))
+    """Matrix S (m, m) of the normalized input v in u = u* + S v; the identity unless replaced."""
+
+    weights: ClassVar[Pair] = default(
+        lambda self: (_repeat(1.0, self.state_names), _repeat(1.0, self.input_names))
+    )
+    """Diagonals of the default Riccati weights (Q, R), R on normalized inputs; all ones."""
+
+    flat_outputs: ClassVar[tuple[str, ...]] = ()
+    """Which of a reference's coordinates (x, y, z, yaw) the model can be told to follow."""
+
+    flat_order: ClassVar[int] = 0
+    """How many time derivatives of the reference `flat` needs."""
 
     @abc.abstractmethod
     def drift(self, x: State) -> State:
@@ -35,56 +106,6 @@ class ControlAffine(eqx.Module):
     def output(self, x: State) -> Output:
         """Return h(x); the whole state unless replaced."""
         return x
-
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Names of the entries of h(x); the state names unless replaced together with `output`."""
-        return self.state_names
-
-    @property
-    def state_units(self) -> tuple[str, ...]:
-        """SI units of the states, as text; empty text where unknown."""
-        return ("",) * len(self.state_names)
-
-    @property
-    def input_units(self) -> tuple[str, ...]:
-        """SI units of the inputs, as text; empty text where unknown."""
-        return ("",) * len(self.input_names)
-
-    @property
-    def state_groups(self) -> Mapping[str, tuple[str, ...]]:
-        """Named groups of states, such as `position` or `attitude`, for spreads and start errors."""
-        return {}
-
-    @property
-    def position(self) -> tuple[str, ...]:
-        """Names of the coordinates that a picture shows, in metres; none for an abstract agent."""
-        return ()
-
-    @property
-    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Equilibrium (x*, u*) about which gains are made; the origin unless replaced."""
-        return (0.0,) * len(self.state_names), (0.0,) * len(self.input_names)
-
-    @property
-    def input_scale(self) -> tuple[tuple[float, ...], ...]:
-        """Matrix S (m, m) of the normalized input v in u = u* + S v; the identity unless replaced."""
-        return diagonal(*(1.0,) * len(self.input_names))
-
-    @property
-    def weights(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Diagonals of the default Riccati weights (Q, R) on states and normalized inputs; all ones."""
-        return (1.0,) * len(self.state_names), (1.0,) * len(self.input_names)
-
-    @property
-    def flat_outputs(self) -> tuple[str, ...]:
-        """Which of a reference's coordinates (x, y, z, yaw) the model can be told to follow; none."""
-        return ()
-
-    @property
-    def flat_order(self) -> int:
-        """How many time derivatives of the reference `flat` needs."""
-        return 0
 
     def flat(self, derivatives: jnp.ndarray) -> tuple[State, Input]:
         """Return the state and input (x, u) that produce a flat output.
@@ -107,7 +128,8 @@ class ControlAffine(eqx.Module):
     def limit(self, u: Input) -> Input:
         """Return the input that the actuators deliver when asked for u; u itself unless replaced.
 
-        An input within the limits must be returned unchanged, to the bit: that is how saturation is counted.
+        An input within the limits must be returned unchanged, to the bit: that is how saturation is
+            counted.
         """
         return u
 
@@ -160,10 +182,3 @@ def positive(owner: object, **values: float) -> None:
             raise ModelError(
                 f"`{name}` of `{type(owner).__name__}` is {value}, and must be a positive finite number."
             )
-
-
-
-
-def diagonal(*entries: float) -> tuple[tuple[float, ...], ...]:
-    """Return a diagonal matrix as nested tuples, the form of `input_scale`."""
-    return tuple(tuple(e if i == j else 0.0 for j in range(len(entries))) for i, e in enumerate(entries))

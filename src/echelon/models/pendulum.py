@@ -10,7 +10,8 @@ from echelon.models.model import ControlAffine, positive
 class Pendulum(ControlAffine):
     """angledot = rate, ratedot = -stiffness sin(angle) - damping rate + u.
 
-    `stiffness` is gravity over length, 1/s^2; `damping` is in 1/s; u is torque over inertia, rad/s^2.
+    `stiffness` is gravity over length, 1/s^2; `damping` is in 1/s; u is torque over inertia,
+    rad/s^2.
     """
 
     damping: float = 0.5
@@ -25,7 +26,9 @@ class Pendulum(ControlAffine):
         """Refuse a stiffness that is not positive or a negative damping."""
         positive(self, stiffness=self.stiffness)
         if not 0.0 <= self.damping < float("inf"):
-            raise ModelError(f"`damping` of `Pendulum` is {self.damping}, and must be finite and not negative.")
+            raise ModelError(
+                f"`damping` of `Pendulum` is {self.damping}, and must be finite and not negative."
+            )
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

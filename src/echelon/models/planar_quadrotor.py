@@ -17,8 +17,9 @@ _LEFT = np.array([1.0, -1.0])
 class PlanarQuadrotor(ControlAffine):
     """yddot = -(T/m) sin(roll), zddot = (T/m) cos(roll) - g, rollddot = tau / Ixx.
 
-    States: y, z (m), roll (rad) and their rates; inputs: thrust T (N), torque tau (N m). The normalized input is
-    (T/m - g, tau/Ixx). Each of the two motor pairs gives between 0 and `motor_thrust` newtons.
+    States: y, z (m), roll (rad) and their rates; inputs: thrust T (N), torque tau (N m). The
+    normalized input is (T/m - g, tau/Ixx). Each of the two motor pairs gives between 0 and
+    `motor_thrust` newtons.
     """
 
     mass: float = 0.028
@@ -33,7 +34,12 @@ class PlanarQuadrotor(ControlAffine):
     input_units = ("N", "N m")
     output_names = ("y", "z")
     position = ("y", "z")
-    state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz"), "attitude": ("roll",), "rate": ("roll_rate",)}
+    state_groups = {
+        "position": ("y", "z"),
+        "velocity": ("vy", "vz"),
+        "attitude": ("roll",),
+        "rate": ("roll_rate",),
+    }
     weights = ((1.0, 1.0, 2.0, 0.25, 0.25, 0.04), (1 / 25, 1 / 400))
     flat_outputs = ("y", "z")
     flat_order = 4
@@ -86,7 +92,9 @@ class PlanarQuadrotor(ControlAffine):
         now = jnp.zeros((), derivatives.dtype)
         rate, rate_dot = jax.jvp(roll_rate, (now,), (jnp.ones_like(now),))
         x = jnp.concatenate([position, roll(now)[None], velocity, rate[None]])
-        return x, jnp.stack([self.mass * jnp.linalg.norm(acceleration + up), self.inertia * rate_dot])
+        return x, jnp.stack(
+            [self.mass * jnp.linalg.norm(acceleration + up), self.inertia * rate_dot]
+        )
 
     def limit(self, u: Input) -> Input:
         """Return what two rotors within [0, motor_thrust] deliver, attitude before collective."""

@@ -28,7 +28,9 @@ PARAMETERS: dict[str, dict[str, Any]] = {
 """Named parameter sets: Foerster's identified Crazyflie 2.1, and the paper's Table I as printed."""
 
 
-def _with_rate(curve: Callable[[jax.Array], jax.Array], s: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _with_rate(
+    curve: Callable[[jax.Array], jax.Array], s: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Return curve(s) and its derivative."""
     return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
@@ -41,14 +43,16 @@ _SPIN = np.array([1.0, -1.0, 1.0, -1.0])
 
 
 class Quadrotor(ControlAffine):
-    """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles (paper, equation of the example).
+    """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles (paper, equation of the
+    example).
 
-    pdot = v, vdot = -g e3 + R(zeta) e3 T / m, zetadot = W(zeta) omega, J omegadot = tau - omega x J omega.
-    States: position (m), velocity (m/s), attitude (rad), body rate (rad/s). Inputs: thrust T (N) and body
-    torques tau (N m). The normalized input is (T/m - g, J^-1 tau).
+    pdot = v, vdot = -g e3 + R(zeta) e3 T / m, zetadot = W(zeta) omega, J omegadot = tau - omega x J
+    omega. States: position (m), velocity (m/s), attitude (rad), body rate (rad/s). Inputs: thrust T
+    (N) and body torques tau (N m). The normalized input is (T/m - g, J^-1 tau).
 
     Raises:
-        ModelError: a parameter is not positive, or no rigid body has the inertia (unless `allow_unphysical`).
+        ModelError: a parameter is not positive, or no rigid body has the inertia (unless
+            `allow_unphysical`).
     """
 
     mass: float = 0.028
@@ -77,7 +81,8 @@ class Quadrotor(ControlAffine):
 
     @classmethod
     def named(cls, name: str, **changes: Any) -> "Quadrotor":
-        """Return the quadrotor of a named parameter set (`crazyflie` or `paper`), with fields changed.
+        """Return the quadrotor of a named parameter set (`crazyflie` or `paper`), with fields
+        changed.
 
         Raises:
             ModelError: there is no such set.
@@ -144,7 +149,9 @@ class Quadrotor(ControlAffine):
 
         now = jnp.zeros((), derivatives.dtype)
         omega, omega_dot = _with_rate(rate, now)
-        torque = jnp.asarray(self.inertia, omega.dtype) * (omega_dot - free_spin(self.inertia, omega))
+        torque = jnp.asarray(self.inertia, omega.dtype) * (
+            omega_dot - free_spin(self.inertia, omega)
+        )
         thrust = self.mass * jnp.linalg.norm(acceleration + up)
         return (
             jnp.concatenate([position, velocity, attitude(now), omega]),
@@ -157,7 +164,11 @@ class Quadrotor(ControlAffine):
         yaw = u[3] * _SPIN / (4.0 * self.torque_per_thrust)
         wanted = u[0] / 4.0 + tilt + yaw
         f = attitude_priority(u[0] / 4.0, tilt, yaw, self.motor_thrust)
-        torque = [self.arm * (_LEFT @ f), -self.arm * (_FRONT @ f), self.torque_per_thrust * (_SPIN @ f)]
+        torque = [
+            self.arm * (_LEFT @ f),
+            -self.arm * (_FRONT @ f),
+            self.torque_per_thrust * (_SPIN @ f),
+        ]
         delivered = jnp.stack([jnp.sum(f), *torque])
         fits = jnp.all((wanted >= 0.0) & (wanted <= self.motor_thrust))
         return jnp.where(fits, u, delivered)

@@ -8,11 +8,13 @@ from echelon.models.rigid_body import euler_rates, free_spin
 
 
 class PrintedQuadrotor(ControlAffine):
-    """Literal: pdot = v, vdot = (T, T, T) / m, zetadot = W(zeta) omega, J omegadot = tau - omega x J omega.
+    """Literal: pdot = v, vdot = (T, T, T) / m, zetadot = W(zeta) omega, J omegadot = tau - omega x
+    J omega.
 
-    Gravity and the rotation of the thrust into the world frame are missing, as printed; the thrust pushes along
-    (1, 1, 1). Its drift is nilpotent at the origin, so no P > 0 satisfies the paper's Assumption 5. States and
-    inputs are those of `Quadrotor`; the normalized input is (T/m, J^-1 tau).
+    Gravity and the rotation of the thrust into the world frame are missing, as printed; the thrust
+    pushes along (1, 1, 1). Its drift is nilpotent at the origin, so no P > 0 satisfies the paper's
+    Assumption 5. States and inputs are those of `Quadrotor`; the normalized input is (T/m, J^-1
+    tau).
     """
 
     mass: float = 0.028

@@ -1,7 +1,8 @@
 """Motors with limits: how four (or two) thrusts share a wanted collective and wanted torques.
 
-Clipping each motor by itself changes the torques and flips vehicles. Attitude-priority mixing keeps the torques:
-the collective gives way first, then yaw, and roll and pitch are scaled only when they alone do not fit.
+Clipping each motor by itself changes the torques and flips vehicles. Attitude-priority mixing keeps
+the torques: the collective gives way first, then yaw, and roll and pitch are scaled only when they
+alone do not fit.
 """
 
 import jax.numpy as jnp

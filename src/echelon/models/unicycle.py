@@ -24,7 +24,8 @@ def _drive(derivatives: jax.Array) -> tuple[State, Input]:
 class Unicycle(ControlAffine):
     """xdot = v cos(heading), ydot = v sin(heading), headingdot = turn rate; metres and radians.
 
-    Its linearization at rest cannot be stabilized (sideways motion), so Riccati gains do not exist for it.
+    Its linearization at rest cannot be stabilized (sideways motion), so Riccati gains do not exist
+    for it.
     """
 
     state_names = ("x", "y", "heading")
@@ -58,8 +59,8 @@ class Unicycle(ControlAffine):
 class UnicyclePoint(ControlAffine):
     """A unicycle described by the point `ahead` metres in front of its axle, and its heading.
 
-    With p the point: pdot = R(heading) (v, ahead w), headingdot = w. The normalized input (v, ahead w) is the
-    point's velocity in the body frame, so that on positions g g^T is constant.
+    With p the point: pdot = R(heading) (v, ahead w), headingdot = w. The normalized input (v, ahead
+    w) is the point's velocity in the body frame, so that on positions g g^T is constant.
     """
 
     ahead: float = 0.1

@@ -18,7 +18,9 @@ class VanDerPol(ControlAffine):
     def __check_init__(self) -> None:
         """Refuse a damping that is negative or not finite."""
         if not 0.0 <= self.damping < float("inf"):
-            raise ModelError(f"`damping` of `VanDerPol` is {self.damping}, and must be finite and not negative.")
+            raise ModelError(
+                f"`damping` of `VanDerPol` is {self.damping}, and must be finite and not negative."
+            )
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

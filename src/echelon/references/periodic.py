@@ -17,9 +17,11 @@ def _at(center: _Vector, across: jax.Array, along: jax.Array, yaw: float) -> jax
 
 
 class Lemniscate(Reference):
-    """The paper's loop: center + (ax cos th / (1 + sin^2 th), ay sin th cos th / (1 + sin^2 th)), th = rate t + phase.
+    """The paper's loop: center + (ax cos th / (1 + sin^2 th), ay sin th cos th / (1 + sin^2 th)),
+    th = rate t + phase.
 
-    The defaults are the fit of the drawn curve; center and amplitude in m, rate in rad/s, phase and yaw in rad.
+    The defaults are the fit of the drawn curve; center and amplitude in m, rate in rad/s, phase and
+    yaw in rad.
     """
 
     center: _Vector = (0.25, 0.25, 1.0)
@@ -78,7 +80,9 @@ class Circle(Reference):
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""
         angle = self.rate * t + self.phase
-        return _at(self.center, self.radius * jnp.cos(angle), self.radius * jnp.sin(angle), self.yaw)
+        return _at(
+            self.center, self.radius * jnp.cos(angle), self.radius * jnp.sin(angle), self.yaw
+        )
 
 
 def _check_periodic(reference: Lemniscate | FigureEight | Circle) -> None:

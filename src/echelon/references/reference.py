@@ -44,7 +44,9 @@ def finite(owner: Reference, **values: object) -> None:
         wanted = () if length is None else (length,)
         if array.shape != wanted or not np.isfinite(array).all():
             shape = "a finite number" if length is None else f"{length} finite numbers"
-            raise ReferenceError(f"`{name}` of `{type(owner).__name__}` is {value}, and must be {shape}.")
+            raise ReferenceError(
+                f"`{name}` of `{type(owner).__name__}` is {value}, and must be {shape}."
+            )
 
 
 def in_space(point: jax.Array, yaw: float) -> jax.Array:

@@ -37,4 +37,6 @@ class Line(Reference):
 
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""
-        return in_space(jnp.asarray(self.start, t.dtype) + t * jnp.asarray(self.velocity, t.dtype), self.yaw)
+        return in_space(
+            jnp.asarray(self.start, t.dtype) + t * jnp.asarray(self.velocity, t.dtype), self.yaw
+        )

@@ -14,10 +14,11 @@ from echelon.references.reference import Reference, finite, in_space
 
 
 class Waypoints(Reference):
-    """The spline of degree 7 through `points` at `times`, at rest at both ends and held outside them.
+    """The spline of degree 7 through `points` at `times`, at rest at both ends and held outside
+    them.
 
-    Its derivatives are continuous up to the sixth, so that a quadrotor can fly it (flatness needs four). The path
-    starts and stops with zero velocity, acceleration and jerk.
+    Its derivatives are continuous up to the sixth, so that a quadrotor can fly it (flatness needs
+    four). The path starts and stops with zero velocity, acceleration and jerk.
 
     Args:
         times: K >= 2 increasing times, s.
@@ -55,8 +56,15 @@ class Waypoints(Reference):
 
 
 def _check(times: np.ndarray, points: np.ndarray) -> None:
-    if times.ndim != 1 or len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ReferenceError(f"`times` of `Waypoints` is {times.tolist()}, and must be at least 2 increasing times.")
+    if (
+        times.ndim != 1
+        or len(times) < 2
+        or not np.isfinite(times).all()
+        or (np.diff(times) <= 0).any()
+    ):
+        raise ReferenceError(
+            f"`times` of `Waypoints` is {times.tolist()}, and must be at least 2 increasing times."
+        )
     if points.shape != (len(times), 3) or not np.isfinite(points).all():
         raise ReferenceError(
             f"`points` of `Waypoints` has shape {points.shape}, and must be {len(times)} finite points (x, y, z)."

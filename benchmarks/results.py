@@ -1,0 +1,190 @@
+"""Measure what echelon claims of the paper's experiment and write `docs/results.md`.
+
+Run `python benchmarks/results.py` (about three minutes on two cores); `--seeds 10` is quicker. Every
+number on the page is made here, by the same commands that a user has.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import echelon as ech
+from echelon._metrics import formation_errors
+from echelon._provenance import versions
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
+OFFSETS = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
+
+
+def runs(scenario: str, seeds: Sequence[int], *changes: str) -> list[ech.Result]:
+    """Return the runs of a bundled scenario, one a seed."""
+    return [ech.run(ech.load_scenario(scenario, [f"seed={seed}", *changes])) for seed in seeds]
+
+
+def steady(result: ech.Result, begin: float, end: float) -> np.ndarray:
+    """Return each follower's root-mean-square error over begin <= t <= end, in m."""
+    inside = (result.times >= begin - 1e-9) & (result.times <= end + 1e-9)
+    errors = formation_errors(result)[np.ix_(inside, list(result.graph.followers))]
+    return np.sqrt((errors**2).mean(axis=0))
+
+
+def settling(results: Sequence[ech.Result]) -> np.ndarray:
+    """Return the time from which every follower stays within 1 cm, one a run."""
+    numbers = [ech.metrics(result) for result in results]
+    return np.array(
+        [max(f.settling_time if f.settling_time is not None else np.inf for f in m.followers) for m in numbers]
+    )
+
+
+def leader_rmse(result: ech.Result, until: float) -> float:
+    """Return the leader's root-mean-square distance from its reference over t <= until, in m."""
+    assert result.reference is not None
+    inside = result.times <= until + 1e-9
+    off = (result.states[inside, 0] - result.reference[inside])[:, :3]
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+Row = tuple[str, str, str]
+
+
+def experiment(seeds: Sequence[int]) -> list[Row]:
+    """Measure the paper's experiment over all seeds."""
+    rows: list[Row] = []
+    for scenario in ("paper", "paper-line"):
+        results = runs(scenario, seeds)
+        whole = np.array([steady(result, 50.0, 60.0) for result in results])
+        early = np.array([steady(result, 8.0, 10.0) for result in results])
+        within = settling(results)
+        done = sum(result.outcome is ech.Outcome.COMPLETED for result in results)
+        converged = int(((whole.max(axis=1) < 1e-2) & np.isfinite(within)).sum())
+        limited = max(float(result.saturated.max()) for result in results)
+        rows += [
+            (f"`{scenario}`: seeds that converge with motor limits on", f"{converged} of {len(seeds)} ({done} completed)", "all"),
+            (f"`{scenario}`: steady RMSE, last 10 of 60 s, worst follower and seed", f"{whole.max():.2e} m", "1e-13 m"),
+            (f"`{scenario}`: RMSE over 8..10 s, median / worst", f"{np.median(early):.1e} / {early.max():.1e} m", "3e-5 / 1e-4 m" if scenario == "paper" else "-"),
+            (f"`{scenario}`: time to 1 cm for good, median / worst seed", f"{np.median(within):.2f} / {within.max():.2f} s", "-"),
+            (f"`{scenario}`: largest fraction of steps at a motor limit", f"{100 * limited:.2f} %", "-"),
+        ]
+        if scenario == "paper":
+            rows.append(("`paper`: leader RMSE over 10 s from the 1.44 m start (paper: 0.186)", f"{leader_rmse(results[0], 10.0):.3f} m", "-"))
+    fast = runs("paper-fast", seeds)
+    last = np.array([steady(result, 8.0, 10.0) for result in fast])
+    rows += [
+        ("`paper-fast`: RMSE over 8..10 s, median / worst follower and seed", f"{np.median(last):.1e} / {last.max():.1e} m", "1e-8 m, every seed"),
+        ("`paper-fast`: leader RMSE over 10 s", f"{leader_rmse(fast[0], 10.0):.3f} m", "-"),
+    ]
+    return rows
+
+
+def what_fails(seeds: Sequence[int]) -> list[Row]:
+    """Measure what the printed law and a missing feed-forward do."""
+    lag = np.array([steady(r, 50.0, 60.0) for r in runs("paper", seeds[:10], "follower.feedforward=none")])
+    literal = runs("paper-literal", seeds[:10])
+    ends = np.array([np.sqrt((formation_errors(r)[-1, 1:] ** 2).mean()) for r in literal])
+    rank = literal[0].follower.gain.certificate.observable  # type: ignore[attr-defined]
+    return [
+        ("`paper` without feed-forward: steady lag of followers 1, 2, 3", ", ".join(f"{v:.4f}" for v in lag.mean(axis=0)) + " m", "reported"),
+        ("`paper-literal`: formation RMSE at 10 s, smallest / largest of 10 seeds", f"{ends.min():.0f} / {ends.max():.0f} m", "tens to hundreds"),
+        ("`paper-literal`: rank of observability of (A, g^T P)", f"{rank} of 12", "4 of 12"),
+    ]
+
+
+def chain_lag() -> Row:
+    """Single integrators on the chain L-1-2-3 behind a leader at 1 m/s."""
+    model, graph = ech.SingleIntegrator(1), ech.Graph.path(4)
+    result = ech.simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {}),
+        leader=ech.Tracking(ech.Line(start=(0.0, 0.0, 0.0), velocity=(1.0, 0.0, 0.0))),
+        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        horizon=200.0,
+        dt=0.01,
+        store_every=100,
+    )
+    lags = -result.errors[-1, 1:, 0]
+    off = np.abs(lags - np.array([3.0, 5.0, 6.0])).max()
+    return ("chain of single integrators behind a leader at 1 m/s: lags off 3, 5, 6 m by", f"{off:.1e} m", "1e-9 m")
+
+
+def offset_drift() -> Row:
+    """The counterexample to the theorem: xdot = -x + u, P = 1, one follower with offset d."""
+    model, graph = ech.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
+    result = ech.simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
+        leader=ech.Passive(),
+        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        horizon=40.0,
+        dt=0.01,
+        store_every=100,
+    )
+    return ("f = -x, g = P = 1, goal at -d: settles at", f"{result.states[-1, 1, 0]:.12f} d", "-d/2")
+
+
+def algorithm_one() -> Row:
+    """The growth a step of Algorithm 1 as printed, on the chain of single integrators."""
+    model, graph = ech.SingleIntegrator(1), ech.Graph.path(4)
+    result = ech.simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {}),
+        leader=ech.Passive(),
+        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        initial={"position": 1.0},
+        horizon=100.0,
+        dt=1.0,
+        integrator="printed",
+    )
+    size = np.linalg.norm(result.states[:, 1:, 0], axis=1)
+    return ("Algorithm 1 as printed: growth of the error in a step", f"{size[-1] / size[-2]:.3f}", "3.247")
+
+
+def spectra() -> list[Row]:
+    """The grounded spectra of the paper's two graphs."""
+    tree = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)]).grounded_spectrum()
+    line = ech.Graph.path(4).grounded_spectrum()
+    told: Callable[[np.ndarray], str] = lambda values: ", ".join(f"{v:.3f}" for v in values)  # noqa: E731
+    return [
+        ("grounded spectrum of the tree", told(tree), "0.268, 1, 3.732"),
+        ("grounded spectrum of the line", told(line), "0.198, 1.555, 3.247"),
+    ]
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return rows as a Markdown table."""
+    lines = ["| what | measured | asked or known |", "|---|---|---|"]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def main() -> None:
+    """Measure everything and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=100, help="how many random starts")
+    seeds = range(parser.parse_args().seeds)
+    told = ", ".join(f"{name} {text}" for name, text in versions().items() if name != "git")
+    page = [
+        "# Results",
+        "Made by `python benchmarks/results.py`; rerun it to check. Random starts are seeds "
+        f"0 to {len(seeds) - 1} unless said; float64, Runge-Kutta with held input, the Crazyflie's motor limits "
+        f"with attitude-priority mixing. Versions: {told}.",
+        "## The paper's experiment",
+        table(experiment(seeds)),
+        "The paper prints 9.3e-17, 7.7e-17 and 5.2e-17 m for its followers. Those are the rounding of constant "
+        "offsets, present from the first sample although the text says random starts, and not the error of a "
+        "closed loop. The steady RMSE above is that of a closed loop from random starts; it too is rounding, of "
+        "states of a few metres in float64.",
+        "## What fails, and by how much",
+        table(what_fails(seeds)),
+        "## Closed forms",
+        table([chain_lag(), offset_drift(), algorithm_one(), *spectra()]),
+    ]
+    PAGE.write_text("\n\n".join(page) + "\n", "utf-8")
+    print(PAGE.read_text("utf-8"))
+
+
+if __name__ == "__main__":
+    main()

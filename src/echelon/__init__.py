@@ -1,0 +1,160 @@
+"""echelon: leader-follower formation tracking by consensus, for any agent xdot = f(x) + g(x) u.
+
+Parts in, one verb, one result out: `synthesize` a gain for a model on a graph, `simulate` the
+closed loop, `report` what happened. Nothing heavy is imported until it is used, and importing
+changes no global setting.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from echelon._archive import dataset, save_dataset, summary
+    from echelon._build import build, run
+    from echelon._errors import EchelonError, Outcome
+    from echelon._formation import Formation
+    from echelon._graph import Graph
+    from echelon._lyapunov import Lyapunov, lyapunov
+    from echelon._metrics import Metrics, metrics
+    from echelon._plots import figures, save_figures
+    from echelon._report import report
+    from echelon._result import Result
+    from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
+    from echelon._simulate import simulate
+    from echelon._synthesize import synthesize
+    from echelon.gains import Certificate, Gain, Given, Method, Riccati
+    from echelon.laws import Agreement, Consensus, Law, LocalView, Passive, Tracking
+    from echelon.models import (
+        ControlAffine,
+        DoubleIntegrator,
+        Linear,
+        Pendulum,
+        PlanarQuadrotor,
+        PrintedQuadrotor,
+        Quadrotor,
+        SingleIntegrator,
+        Unicycle,
+        UnicyclePoint,
+        VanDerPol,
+    )
+    from echelon.references import (
+        Circle,
+        FigureEight,
+        Hover,
+        Lemniscate,
+        Line,
+        Reference,
+        Waypoints,
+    )
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "_archive": ("dataset", "save_dataset", "summary"),
+    "_build": ("build", "run"),
+    "_errors": ("EchelonError", "Outcome"),
+    "_formation": ("Formation",),
+    "_graph": ("Graph",),
+    "_lyapunov": ("Lyapunov", "lyapunov"),
+    "_metrics": ("Metrics", "metrics"),
+    "_plots": ("figures", "save_figures"),
+    "_report": ("report",),
+    "_result": ("Result",),
+    "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
+    "_simulate": ("simulate",),
+    "_synthesize": ("synthesize",),
+    "gains": ("Certificate", "Gain", "Given", "Method", "Riccati"),
+    "laws": ("Agreement", "Consensus", "Law", "LocalView", "Passive", "Tracking"),
+    "models": (
+        "ControlAffine",
+        "DoubleIntegrator",
+        "Linear",
+        "Pendulum",
+        "PlanarQuadrotor",
+        "PrintedQuadrotor",
+        "Quadrotor",
+        "SingleIntegrator",
+        "Unicycle",
+        "UnicyclePoint",
+        "VanDerPol",
+    ),
+    "references": (
+        "Circle",
+        "FigureEight",
+        "Hover",
+        "Lemniscate",
+        "Line",
+        "Reference",
+        "Waypoints",
+    ),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Agreement",
+    "Certificate",
+    "Circle",
+    "Consensus",
+    "ControlAffine",
+    "DoubleIntegrator",
+    "EchelonError",
+    "FigureEight",
+    "Formation",
+    "Gain",
+    "Given",
+    "Graph",
+    "Hover",
+    "Law",
+    "Lemniscate",
+    "Line",
+    "Linear",
+    "LocalView",
+    "Lyapunov",
+    "Method",
+    "Metrics",
+    "Outcome",
+    "Passive",
+    "Pendulum",
+    "PlanarQuadrotor",
+    "PrintedQuadrotor",
+    "Quadrotor",
+    "Reference",
+    "Result",
+    "Riccati",
+    "Scenario",
+    "SingleIntegrator",
+    "Tracking",
+    "Unicycle",
+    "UnicyclePoint",
+    "VanDerPol",
+    "Waypoints",
+    "build",
+    "bundled_scenarios",
+    "dataset",
+    "figures",
+    "load_scenario",
+    "lyapunov",
+    "metrics",
+    "report",
+    "run",
+    "save_dataset",
+    "save_figures",
+    "scenario_from_mapping",
+    "simulate",
+    "summary",
+    "synthesize",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its home when it is first used (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module `echelon` has no attribute `{name}`")
+    value = getattr(importlib.import_module(f"echelon.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return __all__

@@ -1,0 +1,119 @@
+"""What a run shows and why, in sentences made from its numbers."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from echelon._archive import gain_of
+from echelon._errors import Outcome
+from echelon._lyapunov import Lyapunov, lyapunov
+from echelon._metrics import Metrics, formation_errors
+from echelon._result import Result
+
+_LAG = 1e-6
+"""A steady error above this, in the result's unit, is told as a lag."""
+
+
+def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
+    """Return what happened, why, and what to be wary of, a sentence each."""
+    return (*_story(result, numbers), *_promises(result), *_lyapunov_story(result))
+
+
+def _story(result: Result, numbers: Metrics) -> Iterator[str]:
+    """Tell the outcome and how the formation did."""
+    yield result.message
+    if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
+        return
+    error = formation_errors(result)[:, list(result.graph.followers)]
+    with np.errstate(over="ignore"):
+        first, last = (float(np.sqrt((row**2).mean())) for row in (error[0], error[-1]))
+    unit = "" if result.unit == "state" else f" {result.unit}"
+    if last > 2.0 * first + 1e-9:
+        yield f"The formation error grows: {first:.3g}{unit} at the start, {last:.4g}{unit} at {result.times[-1]:g} s."
+        yield from _why_growth(result)
+        return
+    settled = [each.settling_time for each in numbers.followers]
+    if all(time is not None for time in settled):
+        latest = max(time for time in settled if time is not None)
+        yield f"All {len(settled)} followers stay within 0.01{unit} of their goals from {latest:.3g} s on."
+    else:
+        missing = sum(time is None for time in settled)
+        yield f"{missing} of {len(settled)} followers have not settled to 0.01{unit} by {result.times[-1]:g} s."
+    yield from _lag(result, numbers, unit)
+
+
+def _why_growth(result: Result) -> Iterator[str]:
+    """Name the structural cause of growth where the linearization shows one."""
+    gain = gain_of(result)
+    if gain is None:
+        return
+    n = len(result.model.state_names)
+    rank = gain.certificate.observable
+    if rank < n:
+        yield (
+            f"Cause: observability of (A, g^T P) has rank {rank} of {n}, so {n - rank} directions of disagreement "
+            "never enter any input and the law cannot reduce them."
+        )
+    if not getattr(result.follower, "trim", True) and np.any(np.asarray(result.model.trim[1])):
+        yield "The law has no trim input either, so nothing holds the followers against gravity."
+    if gain.certificate.edge is not None and gain.coupling < gain.certificate.edge:
+        yield (
+            f"Cause: coupling {gain.coupling:.4g} is below the edge {gain.certificate.edge:.4g} = 1/(2 lambda_min) "
+            "of what this gain guarantees."
+        )
+
+
+def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
+    worst = numbers.worst_steady
+    if worst is None or worst <= _LAG or result.follower.asks() != "none":
+        return
+    if result.reference is not None and np.ptp(result.reference, axis=0).max() > 0.0:
+        yield (
+            f"Without feed-forward the followers do not know the leader's motion and lag: {worst:.3g}{unit} RMS over "
+            f"the last {numbers.steady_window:g} s for the worst. `feedforward: relay` removes the lag, and asks "
+            "for the leader's input at every follower."
+        )
+
+
+def _promises(result: Result) -> Iterator[str]:
+    """Say what the gain promises, and what the law needs to be told."""
+    gain = gain_of(result)
+    if gain is not None:
+        certificate = gain.certificate
+        verdict = "stable" if certificate.stable else "not stable"
+        edge = (
+            ""
+            if certificate.edge is None
+            else f" (guaranteed for linear agents from {certificate.edge:.4g} on)"
+        )
+        yield (
+            f"Promise of the gain, by linearization at the trim: the disagreement is {verdict}, slowest mode "
+            f"{certificate.abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; no region is proved."
+        )
+    needs = ", ".join(result.follower.needs) or "nothing from others"
+    yield f"Each follower is told: {needs}."
+
+
+def _lyapunov_story(result: Result) -> Iterator[str]:
+    """Tell whether V fell, and warn where it rose although theory says that it may not."""
+    v = lyapunov(result)
+    if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
+        return
+    rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
+    if forbidden:
+        when = result.times[int(np.argmax(v.forbidden()))]
+        yield (
+            f"Warning: V rises at {forbidden} of {len(v.value) - 1} frames (first at {when:.4g} s) although V' <= 0 "
+            "there; the step `dt` is too long for this gain."
+        )
+    elif rises:
+        yield f"V rises at {rises} of {len(v.value) - 1} frames; {_excuse(v)}."
+    else:
+        yield f"V never rises: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."
+
+
+def _excuse(v: Lyapunov) -> str:
+    broken = float(np.mean(v.drift > 1e-9 * np.abs(v.rate).max()))
+    if broken:
+        return f"theory allows it, since Assumption 5 fails on {100.0 * broken:.0f} % of the frames"
+    return "theory allows it, since the leader's input is not matched or a limit acts"

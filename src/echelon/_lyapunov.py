@@ -1,0 +1,95 @@
+"""The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and why it falls or rises."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from echelon._graph import Graph
+from echelon._numerics import precision
+from echelon._result import Result
+from echelon._types import Matrix
+from echelon.models.model import ControlAffine
+
+# Below this fraction of its largest value V is made of rounding and its rises mean nothing.
+_ROUNDING = 1e-20
+
+
+class Lyapunov(NamedTuple):
+    """V, its derivative, and the derivative's part that the drift makes, at each frame: (T,) each.
+
+    `rate` is exact along the closed loop at the frame, leader's motion included. `drift` is the sum
+    over edges of A_ij (y_i - y_j)'P (f(x_i) - f(x_j)) about the trim: the paper's Assumption 5, as
+    met on this run, says that it is not positive.
+    """
+
+    value: Matrix
+    rate: Matrix
+    drift: Matrix
+
+    def rises(self) -> Matrix:
+        """Return (T - 1,) booleans: where V rises to the next frame by more than rounding."""
+        return np.diff(self.value) > 1e-9 * self.value[:-1] + _ROUNDING * self.value.max(
+            initial=0.0
+        )
+
+    def forbidden(self) -> Matrix:
+        """Return (T - 1,) booleans: where V rises although theory says that it may not.
+
+        Where drift and input both push V down at two successive frames, a rise in between is the
+        work of the step, not of the law.
+        """
+        slack = 1e-9 * np.abs(self.rate).max(initial=0.0)
+        falls = (self.drift <= slack) & (self.rate - self.drift <= slack)
+        return self.rises() & falls[:-1] & falls[1:]
+
+
+def lyapunov(result: Result) -> Lyapunov | None:
+    """Return V along a run, in float64; None where the followers' law has no P or nothing was stored."""
+    P = result.follower.metric(result.model)
+    if P is None or not len(result.times):
+        return None
+    with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
+        f, xdot = (np.asarray(part) for part in _fields(result.model, jnp.asarray(result.states), jnp.asarray(result.inputs)))
+        y = result.states - result.formation.offsets
+        z, zdot = (_disagreement(result.graph, part) for part in (y, xdot))
+        delta = _grounded_inverse(result.graph, z)
+        i, j = result.graph.edges.T
+        drift = np.einsum(
+            "e,tea,ab,teb->t", result.graph.weights, y[:, i] - y[:, j], P, f[:, i] - f[:, j]
+        )
+        value = 0.5 * np.einsum("tia,ab,tib->t", delta, P, z)
+        return Lyapunov(value, np.einsum("tia,ab,tib->t", delta, P, zdot), drift)
+
+
+@eqx.filter_jit
+def _fields(model: ControlAffine, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the drift about the trim and xdot for x (T, N, n), u (T, N, m)."""
+    over = jax.vmap(jax.vmap(lambda x, u: (model.normalized_drift(x), model.velocity(x, u))))
+    return over(x, u)
+
+
+def _disagreement(graph: Graph, values: Matrix) -> Matrix:
+    """Return the followers' z (T, N_f, n) of values (T, N, n)."""
+    frames, agents, n = values.shape
+    i, j = graph.edges.T
+    edge = np.arange(len(i))
+    signs = np.concatenate([graph.weights, -graph.weights])
+    places = (np.concatenate([i, j]), np.concatenate([edge, edge]))
+    gather = sp.csr_array(sp.coo_array((signs, places), shape=(agents, len(i))))
+    # Differences first, as in the closed loop: at consensus they vanish exactly.
+    differences = np.moveaxis(values[:, i] - values[:, j], 1, 0).reshape(len(i), -1)
+    z = np.moveaxis((gather @ differences).reshape(agents, frames, n), 0, 1)
+    return z[:, list(graph.followers)]
+
+
+def _grounded_inverse(graph: Graph, z: Matrix) -> Matrix:
+    """Return delta with (L_g kron I) delta = z, for z (T, N_f, n)."""
+    frames, followers, n = z.shape
+    columns = np.moveaxis(z, 1, 0).reshape(followers, -1)
+    solved = spla.splu(sp.csc_array(graph.grounded_laplacian())).solve(columns)
+    return np.moveaxis(solved.reshape(followers, frames, n), 0, 1)

@@ -1,0 +1,93 @@
+"""Where a run's files go: a folder that is new or empty, checked before the run so that nothing is lost."""
+
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+from echelon._archive import save_dataset, summary
+from echelon._errors import OutputError
+from echelon._lyapunov import lyapunov
+from echelon._metrics import Metrics
+from echelon._result import Result
+
+_OURS = ("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures")
+"""What a run writes, and all that `--force` may remove."""
+
+
+def claim_folder(name: str, out: Path | None, force: bool) -> Path:
+    """Return the folder for a run, made and empty of earlier runs.
+
+    Without `out` it is `runs/<name>-<time>`, numbered where two runs start in the same second.
+
+    Raises:
+        OutputError: `out` holds something and `force` was not given, or it cannot be written.
+    """
+    try:
+        return _named_folder(out, force) if out is not None else _new_folder(Path("runs"), name)
+    except OSError as error:
+        where = out if out is not None else Path("runs")
+        raise OutputError(
+            f"the folder `{where}` cannot be written: {error.strerror or error}."
+        ) from error
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    parent.mkdir(parents=True, exist_ok=True)
+    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for attempt in range(1, 1000):
+        folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise OutputError(f"a thousand runs of `{name}` started in the same second; wait a second.")
+
+
+def _named_folder(out: Path, force: bool) -> Path:
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"`{out}` is a file, and the output must be a folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    present = sorted(path.name for path in out.iterdir())
+    if present and not force:
+        raise OutputError(
+            f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, or `--force` to replace "
+            "an earlier run."
+        )
+    probe = out / ".writable"
+    probe.touch()
+    probe.unlink()
+    for name in _OURS:
+        path = out / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return out
+
+
+def write_run(
+    result: Result, numbers: Metrics, text: str, folder: Path, figures: bool = True
+) -> dict[str, Any]:
+    """Write a run's summary, dataset, scenario, report and figures; return the summary.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    told = summary(result, numbers)
+    try:
+        content = json.dumps(told, indent=2, allow_nan=False)
+        (folder / "summary.json").write_text(content + "\n", "utf-8")
+        (folder / "report.txt").write_text(text + "\n", "utf-8")
+        if "scenario_text" in result.provenance:
+            (folder / "scenario.yaml").write_text(result.provenance["scenario_text"], "utf-8")
+        save_dataset(result, folder / "run.nc")
+        if figures and len(result.times):
+            from echelon._plots import save_figures
+
+            v = lyapunov(result)
+            save_figures(result, folder, None if v is None else (v.value, v.rate))
+    except OSError as error:
+        raise OutputError(
+            f"the folder `{folder}` cannot be written: {error.strerror or error}."
+        ) from error
+    return told

@@ -1,0 +1,210 @@
+"""The command line. Heavy modules are imported inside each command, so that `--help` is quick."""
+
+import contextlib
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+
+from echelon._errors import EchelonError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from echelon._simulate import Progress
+
+_EPILOG = (
+    "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, 4 an optional part is not "
+    "installed, 130 interrupted."
+)
+_INTERRUPTED: Final = 130
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    epilog=_EPILOG,
+    help="Formation tracking by consensus: synthesize gains, simulate swarms, say what is promised.",
+)
+
+_Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+
+
+def main() -> None:
+    """Run the command line; an echelon error becomes one sentence and its exit code."""
+    try:
+        app()
+    except EchelonError as error:
+        print(f"echelon: {error}", file=sys.stderr)
+        raise SystemExit(error.exit_code) from None
+    except KeyboardInterrupt:
+        print("echelon: interrupted before anything was computed.", file=sys.stderr)
+        raise SystemExit(_INTERRUPTED) from None
+
+
+@app.callback(invoke_without_command=True)
+def _about(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and leave.")
+    ] = False,
+) -> None:
+    if version:
+        from echelon import __version__
+
+        print(f"echelon {__version__}")
+        raise typer.Exit()
+
+
+@app.command()
+def run(
+    scenario: Annotated[str, typer.Argument(help="A bundled scenario's name, or a YAML file.")],
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change a value, as in simulation.horizon=10."
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-TIME.")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace an earlier run in --out.")
+    ] = False,
+    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    as_json: _Json = False,
+) -> None:
+    """Simulate a scenario; write its table, figures and dataset."""
+    from echelon._scenario import load_scenario
+
+    checked = load_scenario(scenario, set_ or [])
+    from echelon import _build, _metrics, _output, _report
+
+    # Parts before the folder: a bad scenario must leave no empty folder behind.
+    parts = _build.build(checked)
+    folder = _output.claim_folder(checked.name, out, force)
+    console = _console()
+    with _progress(quiet=as_json) as progress:
+        result = _build.run(checked, progress, parts)
+    numbers = _metrics.metrics(result, checked.report.steady_window)
+    text = _report.report(result, checked.report.steady_window)
+    told = _output.write_run(result, numbers, text, folder, figures)
+    if as_json:
+        print(json.dumps(told, indent=2))
+    else:
+        _report.print_report(console, result, numbers)
+        _report.say(console, f"Written to {folder}: {_written(folder)}.")
+    raise typer.Exit(result.outcome.exit_code)
+
+
+@app.command("list")
+def list_(as_json: _Json = False) -> None:
+    """List bundled scenarios, models, references, laws, gain methods, graphs, formations and integrators."""
+    from echelon import _registry
+    from echelon._scenario import bundled_scenarios
+
+    families: dict[str, dict[str, str]] = {"scenarios": bundled_scenarios()}
+    for title, entries in (
+        ("models", _registry.MODELS),
+        ("references", _registry.REFERENCES),
+        ("leader laws", _registry.LEADER_LAWS),
+        ("follower laws", _registry.FOLLOWER_LAWS),
+        ("gain methods", _registry.METHODS),
+    ):
+        families[title] = {name: entry.summary for name, entry in entries.items()}
+    families |= {
+        "graphs": _registry.GRAPHS,
+        "formations": _registry.FORMATIONS,
+        "integrators": _registry.INTEGRATORS,
+    }
+    if as_json:
+        print(json.dumps(families, indent=2))
+        return
+    width = max(len(name) for entries in families.values() for name in entries)
+    for title, entries in families.items():
+        print(f"{title}:")
+        for name, text in entries.items():
+            print(f"  {name:<{width}}  {text}")
+
+
+@app.command()
+def doctor(as_json: _Json = False) -> None:
+    """Print versions and devices, and run the physics' self-checks."""
+    from echelon import _doctor
+
+    facts, checks = _doctor.facts(), list(_doctor.checks())
+    if as_json:
+        print(
+            json.dumps({"facts": facts, "checks": [check._asdict() for check in checks]}, indent=2)
+        )
+    else:
+        console = _console()
+        console.print(_pairs(facts))
+        for check in checks:
+            verdict = "[green]pass[/]" if check.holds else "[red]FAIL[/]"
+            console.print(f"{verdict}  {check.claim} ({check.found})", highlight=False)
+    if not all(check.holds for check in checks):
+        raise typer.Exit(1)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of the scenario file, for editors."""
+    from echelon._scenario import json_schema
+
+    print(json.dumps(json_schema(), indent=2))
+
+
+def _console() -> "Console":
+    """Return a console that keeps tables whole where the output is no terminal."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=200)
+
+
+def _pairs(facts: dict[str, str]) -> "Table":
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+    for name, text in facts.items():
+        table.add_row(name, text)
+    return table
+
+
+@contextlib.contextmanager
+def _progress(quiet: bool) -> "Iterator[Progress | None]":
+    """Show steps and time left on standard error while a run lasts, where someone watches."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns: tuple[Any, ...] = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("steps, left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("simulating", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _written(folder: Path) -> str:
+    names = sorted(path.name + ("/" if path.is_dir() else "") for path in folder.iterdir())
+    return ", ".join(names)
+
+
+if __name__ == "__main__":
+    main()
