@@ -11,7 +11,6 @@ from echelon._graph import Graph
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 
-
 Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
 """Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
 
@@ -38,7 +37,9 @@ def initial_states(
     shape = (graph.agents, len(model.state_names))
     if initial is not None and not isinstance(initial, Mapping):
         return _checked(initial, shape, "initial states have", "(agents, states)")
-    spreads: dict[str, Any] = {key: value for key, value in (initial or {}).items() if isinstance(key, str)}
+    spreads: dict[str, Any] = {
+        key: value for key, value in (initial or {}).items() if isinstance(key, str)
+    }
     spread = _per_state(model, spreads, "initial spread")
     if (spread < 0.0).any():
         raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")

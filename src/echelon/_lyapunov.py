@@ -54,7 +54,12 @@ def lyapunov(result: Result) -> Lyapunov | None:
     if P is None or not len(result.times):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
-        f, xdot = (np.asarray(part) for part in _fields(result.model, jnp.asarray(result.states), jnp.asarray(result.inputs)))
+        f, xdot = (
+            np.asarray(part)
+            for part in _fields(
+                result.model, jnp.asarray(result.states), jnp.asarray(result.inputs)
+            )
+        )
         y = result.states - result.formation.offsets
         z, zdot = (_disagreement(result.graph, part) for part in (y, xdot))
         delta = _grounded_inverse(result.graph, z)

@@ -104,7 +104,9 @@ def output_errors(result: Result) -> Matrix | None:
     leader = result.graph.leaders[0]
     wanted = result.reference + result.formation.offsets[leader]
     with precision("float64"):
-        return np.asarray(_output_errors(result.model, jnp.asarray(result.states[:, leader]), jnp.asarray(wanted)))
+        return np.asarray(
+            _output_errors(result.model, jnp.asarray(result.states[:, leader]), jnp.asarray(wanted))
+        )
 
 
 @eqx.filter_jit

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from echelon._graph import Graph
 from echelon._types import Matrix
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 
 class Settings(NamedTuple):
@@ -82,12 +79,6 @@ class Result:
     def with_provenance(self, **texts: str) -> "Result":
         """Return the same run with more provenance."""
         return dataclasses.replace(self, provenance={**self.provenance, **texts})
-
-    def as_xarray(self) -> "xr.Dataset":
-        """Return the run as a labelled dataset (see `echelon.dataset`)."""
-        from echelon._archive import dataset
-
-        return dataset(self)
 
 
 def finite_or_none(value: Any) -> float | None:

@@ -16,7 +16,7 @@ from echelon._formation import Formation
 from echelon._graph import Exchange, Graph
 from echelon._initial import Initial, initial_states
 from echelon._result import Result, Settings
-from echelon._types import Inputs, Matrix, Scalar, States
+from echelon._types import Inputs, Matrix, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
@@ -217,12 +217,12 @@ def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]
     return u, limited, memory_l, memory_f
 
 
-def _relayed(loop: Loop, u: Inputs) -> Inputs:
+def _relayed(loop: Loop, u: Inputs) -> jax.Array:
     """Return the normalized input that each follower is told, (followers, m)."""
     if loop.follower.asks() == "none":
         return jnp.zeros((len(loop.followers), u.shape[1]), u.dtype)
     trim = jnp.asarray(loop.model.trim[1], u.dtype)
-    v = (u - trim) @ jnp.asarray(loop.normalizer, u.dtype).T
+    v = (u - trim[None]) @ jnp.asarray(loop.normalizer, u.dtype).T
     return v[loop.sender]
 
 
@@ -235,10 +235,12 @@ def step(loop: Loop, now: Moment) -> Moment:
 
 
 @eqx.filter_jit
-def advance(loop: Loop, now: Moment, counts: jax.Array) -> tuple[Moment, tuple[States, Inputs]]:
+def advance(
+    loop: Loop, now: Moment, counts: jax.Array
+) -> tuple[Moment, tuple[jax.Array, jax.Array]]:
     """Store a frame and take counts[k] steps, for each k; return the last moment and the stored frames."""
 
-    def frame(now: Moment, count: Scalar) -> tuple[Moment, tuple[States, Inputs]]:
+    def frame(now: Moment, count: jax.Array) -> tuple[Moment, tuple[jax.Array, jax.Array]]:
         stored = (now.states, control(loop, now)[0])
         return jax.lax.fori_loop(0, count, lambda _, moment: step(loop, moment), now), stored
 
@@ -341,8 +343,10 @@ def _formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str
         "off their goals."
         for agent, reason in list(broken.items())[:1]
     ]
-    pairs = formation.coincident() if model.position and formation.offsets.any() else ()
+    pairs = formation.coincident() if model.position else ()
     told += [
         f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
     ]
+    if len(pairs) > 3:
+        told.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
     return tuple(told)

@@ -55,9 +55,9 @@ def _about(
     ] = False,
 ) -> None:
     if version:
-        from echelon import __version__
+        from importlib.metadata import version as installed
 
-        print(f"echelon {__version__}")
+        print(f"echelon {installed('echelon')}")
         raise typer.Exit()
 
 

@@ -1,6 +1,7 @@
 """Gains: what a synthesis returns, the interface `Method`, and the bundled methods."""
 
-from echelon.gains.gain import Certificate, Gain, Method
+from echelon._certificates import Certificate
+from echelon.gains.gain import Gain, Method
 from echelon.gains.given import Given
 from echelon.gains.riccati import Riccati
 

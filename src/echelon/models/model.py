@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from echelon._errors import ModelError, did_you_mean, listing
 from echelon._types import Input, InputMap, Output, State
 
-
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 _T = TypeVar("_T")

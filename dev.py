@@ -1,0 +1,209 @@
+"""Set up the working environment in `.venv` and run things in it: `python3 dev.py demo`, for one.
+
+Needs Python 3.11 or later and nothing else. Uses uv when it is on the PATH, else venv and pip. The
+versions come from constraints.txt. What stands after the verb goes on to the program that it runs.
+"""
+
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+if sys.version_info < (3, 11):  # noqa: UP036 - the one file that an older Python may be handed
+    sys.exit(
+        "dev.py needs Python 3.11 or later, and this one is {}.{}; run it with a newer one, such as"
+        " `python3.11 dev.py`.".format(*sys.version_info)
+    )
+
+ROOT = Path(__file__).resolve().parent
+VENV = ROOT / ".venv"
+BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
+SUFFIX = ".exe" if os.name == "nt" else ""
+PYTHON = BIN / f"python{SUFFIX}"
+STAMP = VENV / "echelon-setup.txt"
+WHAT = ["--editable", ".[all,dev]", "--constraint", "constraints.txt"]
+HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
+
+  setup   set up .venv with all extras; does nothing when nothing changed
+  demo    run the paper's experiment: echelon run paper [ARGUMENT ...]
+  test    run the tests: pytest [ARGUMENT ...], on all cores
+  lint    check style and layout: ruff
+  types   check types: pyright
+  docs    build the documentation into site/: mkdocs"""
+NO_PIP = (
+    "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
+    " 22.3 or later; install one of them (on Debian or Ubuntu: `apt install python3-venv`), or uv,"
+    " and run this again."
+)
+
+
+class SetupError(Exception):
+    """The environment cannot be set up; the message is what a person reads."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run the verb and return the exit code of what it ran."""
+    verb, rest = (arguments[0], arguments[1:]) if arguments else ("help", [])
+    if verb in ("help", "-h", "--help"):
+        print(HELP)
+        return 0
+    if verb not in VERBS:
+        print(f"dev.py: `{verb}` is no verb.\n\n{HELP}", file=sys.stderr)
+        return 2
+    try:
+        setup()
+        folder = Path.cwd() if verb == "demo" else ROOT  # a demo's `--out` is the caller's
+        return max((run(command, folder) for command in VERBS[verb](rest)), default=0)
+    except (SetupError, OSError) as error:
+        print(f"dev.py: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+
+
+def tool(name: str, *arguments: str) -> list[str]:
+    """Return the command that runs a program of .venv as a module, wherever .venv was made."""
+    return [str(PYTHON), "-m", name, *arguments]
+
+
+def tests(rest: list[str]) -> list[list[str]]:
+    """Return the command that runs the tests, spread over the cores where there are several."""
+    spread = ["-n", "auto", "--dist", "worksteal"] if cores() > 1 else []
+    return [tool("pytest", *spread, *rest)]
+
+
+def cores() -> int:
+    """Return how many cores this process may use, which can be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+VERBS = {
+    "setup": lambda rest: [],
+    "demo": lambda rest: [[str(BIN / f"echelon{SUFFIX}"), "run", "paper", *rest]],
+    "test": tests,
+    "lint": lambda rest: [tool("ruff", "check", *rest), tool("ruff", "format", "--check", *rest)],
+    "types": lambda rest: [tool("pyright", *rest)],
+    "docs": lambda rest: [tool("mkdocs", "build", "--strict", *rest)],
+}
+
+
+def run(command: list[str], folder: Path = ROOT) -> int:
+    """Run a command in the foreground and return its exit code, 128 + n for one ended by signal n.
+
+    Ctrl-C reaches the command as well. It is left to end in its own way, and only then, unless it
+    ended well, is the interruption passed on.
+    """
+    process = subprocess.Popen(command, cwd=folder)
+    interrupted = False
+    while True:
+        try:
+            code = process.wait()
+        except KeyboardInterrupt:
+            interrupted = True
+            continue
+        if interrupted and code != 0:
+            raise KeyboardInterrupt
+        return code if code >= 0 else 128 - code
+
+
+def setup() -> None:
+    """Make .venv what pyproject.toml and constraints.txt ask for, unless it is so already."""
+    wanted = fingerprint()
+    if PYTHON.exists() and STAMP.is_file() and STAMP.read_text("utf-8") == wanted:
+        return
+    print(f"Setting up {VENV}; the first time, this takes a few minutes.", flush=True)
+    STAMP.unlink(missing_ok=True)
+    install = with_uv() if shutil.which("uv") else with_pip()
+    step(install, "The packages could not be installed; what stands above says why.")
+    STAMP.write_text(wanted, "utf-8")
+
+
+def fingerprint() -> str:
+    """Return what .venv depends on: a hash of the two files, the Python version, this folder."""
+    files = b"".join((ROOT / name).read_bytes() for name in ("pyproject.toml", "constraints.txt"))
+    return "\n".join([hashlib.sha256(files).hexdigest(), version(), str(ROOT), ""])
+
+
+def version() -> str:
+    """Return the version of the Python that runs this file, such as `3.11`."""
+    return "{}.{}".format(*sys.version_info)
+
+
+def with_uv() -> list[str]:
+    """Make sure that .venv exists and return the command that installs into it by uv."""
+    if not fits():
+        clear()
+        step(["uv", "venv", "--python", sys.executable, str(VENV)], "uv could not make .venv.")
+    return ["uv", "pip", "install", "--python", str(PYTHON), *WHAT]
+
+
+def with_pip() -> list[str]:
+    """Make sure that .venv exists and return the command that installs into it by pip."""
+    if not (fits() and pip()):
+        clear()
+        make = [sys.executable, "-m", "venv", str(VENV)]
+        if not (importlib.util.find_spec("ensurepip") and works(make)):
+            clear()
+            works([*make, "--without-pip"])
+    if not pip():
+        raise SetupError(NO_PIP)
+    return [*pip(), "install", *quiet(), "--disable-pip-version-check", *WHAT]
+
+
+def pip() -> list[str]:
+    """Return a pip that installs into .venv, or nothing where there is none.
+
+    Debian takes `ensurepip` out of its Python, and then an environment is born without pip; a pip
+    outside the environment can install into it all the same (from pip 22.3 on).
+    """
+    inner = [str(PYTHON), "-m", "pip"]
+    outer = [sys.executable, "-m", "pip", "--python", str(PYTHON)]
+    return next((one for one in (inner, outer) if works([*one, "--version"])), [])
+
+
+def quiet() -> list[str]:
+    """Return pip's option for few lines where nobody watches its progress bars."""
+    return [] if sys.stdout.isatty() else ["--quiet"]
+
+
+def fits() -> bool:
+    """Tell whether .venv exists and is for this version of Python, whoever made it."""
+    config = VENV / "pyvenv.cfg"
+    if not (PYTHON.exists() and config.is_file()):
+        return False
+    pairs = (line.partition("=") for line in config.read_text().splitlines())
+    settings = {key.strip(): value.strip() for key, _, value in pairs}
+    made_for = settings.get("version") or settings.get("version_info") or ""
+    return made_for.startswith(f"{version()}.")
+
+
+def clear() -> None:
+    """Remove what stands where .venv will be made: one that does not fit, or is half made."""
+    if VENV.is_symlink():
+        VENV.unlink()
+    elif VENV.exists():
+        shutil.rmtree(VENV)
+
+
+def works(command: list[str]) -> bool:
+    """Tell whether a command exists and ends well; what it says is not shown."""
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    try:
+        return subprocess.run(command, check=False, **silent).returncode == 0
+    except OSError:
+        return False
+
+
+def step(command: list[str], sentence: str) -> None:
+    """Run one step of the set-up, and raise `SetupError` with the sentence when it fails."""
+    if run(command) != 0:
+        raise SetupError(sentence)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,24 @@
+"""What every test runs under: no silent broadcasting, checked shapes, repeatable examples."""
+
+import os
+
+import jax
+from beartype import beartype
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def check_shapes(function):
+    """Check what is declared with a shape; a wrong type is for echelon to refuse, as for a user."""
+    hints = function.__annotations__.items()
+    function.__annotations__ = {name: hint for name, hint in hints if "jaxtyping" in repr(hint)}
+    return beartype(function)
+
+
+install_import_hook("echelon", "conftest.check_shapes")
+
+# The first example compiles, so none has a deadline.
+settings.register_profile("echelon", deadline=None, derandomize="CI" in os.environ)
+settings.load_profile("echelon")

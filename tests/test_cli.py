@@ -1,0 +1,298 @@
+"""The command line: what a user types, sees, and finds in the output folder."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import echelon as ech
+from echelon import cli
+
+QUICK = ["--set", "simulation.horizon=0.5", "--no-figures"]
+PENDULUM = """
+import jax.numpy as jnp
+import echelon as ech
+
+class Pendulum(ech.ControlAffine):
+    damping: float = 0.5
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
+    def drift(self, x):
+        return jnp.stack([x[1], -9.81 * jnp.sin(x[0]) - self.damping * x[1]])
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]])
+
+class Wrong(Pendulum):
+    def drift(self, x):
+        return x[:1]
+
+class NotAModel:
+    pass
+"""
+SCENARIO = """
+name: mine
+model: {python: "pendulum.py:Pendulum", parameters: {damping: 0.5}}
+graph: {name: path, agents: 4, leaders: [0]}
+leader: {law: passive}
+initial: {spread: {angle: 0.5}}
+simulation: {horizon: 1.0, dt: 0.01}
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pendulum.py").write_text(PENDULUM)
+    (tmp_path / "mine.yaml").write_text(SCENARIO)
+    return tmp_path
+
+
+@pytest.fixture
+def echelon(monkeypatch, capsys):
+    """Run the command line in this process: exit code, standard output, standard error."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        told = capsys.readouterr()
+        return left.value.code or 0, told.out, told.err
+
+    return call
+
+
+def test_run_writes_what_it_says(here, echelon):
+    code, out, err = echelon("run", "paper", *QUICK, "--out", "o")
+    assert (code, err) == (0, "")
+    assert "paper, 0.5 s, seed 0" in out and "9.289e-17" in out
+    assert "rounding" in out and "Written to o" in out
+    names = {"summary.json", "run.nc", "scenario.yaml", "report.txt"}
+    assert {path.name for path in (here / "o").iterdir()} == names
+    again = ech.load_scenario(here / "o" / "scenario.yaml")
+    assert again.simulation.horizon == 0.5
+
+
+def test_summary_has_the_promised_keys_and_no_nan(here, echelon):
+    echelon("run", "paper", *QUICK, "--out", "o")
+    told = json.loads((here / "o" / "summary.json").read_text(), parse_constant=pytest.fail)
+    promised = (
+        "scenario outcome agents unit horizon_s dt_s seed leader followers edges gain lambda_min "
+        "lambda_max minimum_distance saturation_fraction wall_time_s versions"
+    )
+    assert set(promised.split()) <= set(told)
+    assert told["outcome"]["name"] == "completed" and told["unit"] == "m"
+    assert {"rmse", "steady_rmse", "rmse_by_output"} <= set(told["leader"])
+    assert list(told["leader"]["rmse_by_output"]) == ["x", "y", "z", "yaw"]
+    assert [each["agent"] for each in told["followers"]] == [1, 2, 3]
+    assert {"rmse", "steady_rmse", "settling_time_s"} <= set(told["followers"][0])
+    assert told["edges"][0]["edge"] == [0, 1]
+    assert np.array(told["gain"]["P"]).shape == (12, 12)
+    assert told["lambda_min"] == pytest.approx(2 - np.sqrt(3), abs=1e-12)
+
+
+def test_dataset_is_labelled_and_knows_where_it_comes_from(here, echelon):
+    echelon("run", "paper", *QUICK, "--out", "o")
+    with xr.open_dataset(here / "o" / "run.nc", engine="h5netcdf") as data:
+        assert dict(data.sizes) == {
+            "time": 11, "agent": 4, "state": 12, "input": 4, "edge": 3, "end": 2
+        }  # fmt: skip
+        assert data.time.attrs["units"] == "s"
+        assert str(data.state_unit.sel(state="vx").values) == "m/s"
+        assert {"lyapunov", "lyapunov_rate", "reference", "error"} <= set(data)
+        assert data.attrs["scenario"] == "paper" and "version_jax" in data.attrs
+        assert data.states.dtype == np.float64
+
+
+def test_json_is_all_that_is_printed(here, echelon):
+    code, out, err = echelon("run", "paper", *QUICK, "--out", "o", "--json")
+    assert code == 0 and err == ""
+    assert json.loads(out) == json.loads((here / "o" / "summary.json").read_text())
+
+
+def test_a_users_own_agent_runs_as_from_python(here, echelon):
+    code, out, _ = echelon("run", "mine.yaml", "--no-figures", "--out", "o", "--json")
+    assert code == 0
+    told = json.loads(out)
+    assert told["unit"] == "state" and told["leader"]["rmse"] is None
+    assert told["minimum_distance"] is None
+    agent = ech.Pendulum(damping=0.5)
+    graph = ech.Graph.path(4)
+    result = ech.simulate(
+        agent,
+        graph,
+        ech.Formation.from_offsets(agent, graph, {}),
+        leader=ech.Passive(),
+        follower=ech.Consensus(ech.synthesize(agent, graph, ech.Riccati()), feedforward="relay"),
+        initial={"angle": 0.5},
+        horizon=1.0,
+        dt=0.01,
+    )
+    expected = [each.rmse for each in ech.Metrics(*_metrics(result)).followers]
+    assert [each["rmse"] for each in told["followers"]] == pytest.approx(expected, rel=1e-12)
+
+
+def _metrics(result):
+    from echelon._metrics import metrics
+
+    return metrics(result)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("pendulum.py:Pendulum", "pendulum.py:Pendulun"), "did you mean `Pendulum`?"),
+        (("pendulum.py:Pendulum", "pendulum.py:NotAModel"), "is no `ControlAffine` class"),
+        (("pendulum.py:Pendulum", "missing.py:Pendulum"), "does not exist"),
+        (("pendulum.py:Pendulum", "pendulum.py:Wrong"), "has shape (1,), and must have shape (2,)"),
+        (("damping: 0.5", "dampin: 0.5"), "did you mean `damping`?"),
+        (("angle: 0.5", "angel: 0.5"), "did you mean `angle`?"),
+        (("agents: 4", "agents: 1"), "needs at least 2 agents"),
+    ],
+)
+def test_faults_that_only_building_finds_name_file_and_line(here, echelon, change, sentence):
+    (here / "mine.yaml").write_text(SCENARIO.replace(*change))
+    code, out, err = echelon("run", "mine.yaml", "--out", "o")
+    assert code == 2 and out == ""
+    line = 1 + SCENARIO[: SCENARIO.index(change[0])].count("\n")
+    assert err.startswith(f"echelon: mine.yaml:{line}: ") and sentence in err
+    assert not (here / "o").exists()
+
+
+def test_a_file_that_does_not_import_is_told(here, echelon):
+    (here / "pendulum.py").write_text("import nothing_of_that_name\n")
+    code, _, err = echelon("run", "mine.yaml")
+    assert code == 2
+    assert "does not import: ModuleNotFoundError: No module named 'nothing_of_that_name'." in err
+    assert not (here / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("edges", "sentence"),
+    [
+        ("[[0, 1], [2, 3]]", "agents 2, 3 have no path to a leader (leader 0)."),
+        ("[[0, 1]], agents: 3", "agent 2 has no path to a leader (leader 0)."),
+    ],
+)
+def test_a_disconnected_graph_names_the_lost(here, echelon, edges, sentence):
+    text = SCENARIO.replace("name: path, agents: 4", f"edges: {edges}")
+    (here / "mine.yaml").write_text(text)
+    code, _, err = echelon("run", "mine.yaml")
+    assert code == 2
+    assert err == f"echelon: mine.yaml:4: graph: the graph is disconnected: {sentence}\n"
+
+
+def test_several_faults_of_parts_come_at_once(here, echelon):
+    (here / "mine.yaml").write_text(
+        SCENARIO.replace("angle: 0.5", "angel: 0.5")
+        + "formation: {offsets: {2: [1, 2, 3]}}\nfollower: {gain: {method: given, P: [1, -1]}}\n"
+    )
+    code, _, err = echelon("run", "mine.yaml")
+    assert code == 2 and len(err.splitlines()) == 3
+    assert "the offset of agent 2 has 3 numbers, and must have 2 (all states)." in err
+    assert "`P` is not positive definite: its smallest eigenvalue is -1." in err
+
+
+def test_the_tables_inertia_is_refused_with_its_reason(here, echelon):
+    code, _, err = echelon("run", "paper", "--set", "model.parameters=paper")
+    assert code == 2 and "no rigid body has that: Izz = 2.95435e-05 exceeds" in err
+    allowed = ["--set", "model.parameters=paper", "--set", "model.allow_unphysical=true"]
+    code, _, err = echelon("run", "paper", *allowed, *QUICK, "--out", "o")
+    assert (code, err) == (0, "")
+
+
+def test_a_folder_that_holds_something_is_kept(here, echelon):
+    (here / "o").mkdir()
+    (here / "o" / "thesis.txt").write_text("years of work")
+    code, _, err = echelon("run", "mine.yaml", "--out", "o", "--no-figures")
+    assert code == 2
+    assert err.startswith("echelon: the folder `o` is not empty (it holds `thesis.txt`)")
+    code, _, _ = echelon("run", "mine.yaml", "--out", "o", "--no-figures", "--force")
+    assert code == 0 and (here / "o" / "thesis.txt").read_text() == "years of work"
+    code, _, _ = echelon("run", "mine.yaml", "--out", "o", "--no-figures", "--force")
+    assert code == 0 and (here / "o" / "summary.json").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_run(here, echelon):
+    (here / "file").write_text("")
+    for out in ("file", "file/inside"):
+        code, _, err = echelon("run", "mine.yaml", "--out", out)
+        assert code == 2 and err.count("\n") == 1 and "`file" in err
+
+
+def test_two_runs_of_one_second_do_not_collide(here, echelon, monkeypatch):
+    monkeypatch.setattr(time, "strftime", lambda form: "20260101-000000")
+    for _ in range(2):
+        assert echelon("run", "mine.yaml", "--no-figures")[0] == 0
+    names = sorted(path.name for path in (here / "runs").iterdir())
+    assert names == ["mine-20260101-000000", "mine-20260101-000000-2"]
+
+
+def test_a_diverging_run_is_a_result(here, echelon):
+    (here / "mine.yaml").write_text(
+        "name: blowup\n"
+        "model: {name: linear, parameters: {A: [[50.0]], B: [[1.0]]}}\n"
+        "graph: {name: path, agents: 3}\n"
+        "leader: {law: passive}\n"
+        "follower: {law: consensus, gain: {method: given, P: identity}}\n"
+        "initial: {spread: {x1: 1.0}}\n"
+        "simulation: {horizon: 100.0, dt: 0.01, store_every: 10}\n"
+    )
+    code, out, _ = echelon("run", "mine.yaml", "--out", "o")
+    assert code == 3 and "stopped being finite by t = " in out
+    told = json.loads((here / "o" / "summary.json").read_text(), parse_constant=pytest.fail)
+    assert told["outcome"]["name"] == "diverged" and "follower" in told["outcome"]["message"]
+    assert told["followers"][0]["rmse"] is None and told["followers"][0]["steady_rmse"] is None
+    with xr.open_dataset(here / "o" / "run.nc", engine="h5netcdf") as data:
+        assert len(data.time) > 10 and bool(np.isfinite(data.states).all())
+
+
+def test_interrupting_keeps_what_was_computed(here):
+    (here / "mine.yaml").write_text(
+        SCENARIO.replace("horizon: 1.0, dt: 0.01", "horizon: 1.0e+6, dt: 0.01, store_every: 1000")
+    )
+    command = [sys.executable, "-m", "echelon.cli", "run", "mine.yaml", "--no-figures"]
+    process = subprocess.Popen(
+        [*command, "--out", "o"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.time() + 120
+    while not (here / "o").exists() and time.time() < deadline:
+        time.sleep(0.2)
+    time.sleep(8)
+    os.kill(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    told = json.loads((here / "o" / "summary.json").read_text())
+    assert told["outcome"]["name"] == "interrupted"
+    assert "was interrupted at t = " in out
+    assert (here / "o" / "run.nc").exists()
+
+
+def test_list_names_everything_in_one_line_each(echelon):
+    code, out, _ = echelon("list")
+    assert code == 0
+    for name in ("paper-literal", "van-der-pol", "quadrotor", "lemniscate", "consensus", "riccati"):
+        assert any(line.split()[:1] == [name] for line in out.splitlines())
+    code, out, _ = echelon("list", "--json")
+    assert set(json.loads(out)) >= {"scenarios", "models", "follower laws"}
+
+
+def test_doctor_passes_on_this_machine(echelon):
+    code, out, _ = echelon("doctor", "--json")
+    told = json.loads(out)
+    assert code == 0 and {"jax", "devices"} <= set(told["facts"])
+    assert len(told["checks"]) >= 7 and all(check["holds"] for check in told["checks"])
+
+
+def test_unknown_scenario_and_command_are_bad_input(here, echelon):
+    code, _, err = echelon("run", "papr")
+    assert code == 2 and "did you mean `paper`?" in err
+    code, _, err = echelon("fly")
+    assert code == 2 and "fly" in err
+    code, _, err = echelon("run", "paper", "--set", "simulation.dt=0")
+    assert code == 2 and "--set simulation.dt=0" in err
