@@ -1,7 +1,7 @@
 """Measure what echelon claims of the paper's experiment and write `docs/results.md`.
 
-Run `python benchmarks/results.py` (about three minutes on two cores); `--seeds 10` is quicker. Every
-number on the page is made here, by the same commands that a user has.
+Run `python benchmarks/results.py` (about three minutes on two cores); `--seeds 10` is quicker.
+Every number on the page is made here, by the same commands that a user has.
 """
 
 import argparse
@@ -34,7 +34,10 @@ def settling(results: Sequence[ech.Result]) -> np.ndarray:
     """Return the time from which every follower stays within 1 cm, one a run."""
     numbers = [ech.metrics(result) for result in results]
     return np.array(
-        [max(f.settling_time if f.settling_time is not None else np.inf for f in m.followers) for m in numbers]
+        [
+            max(f.settling_time if f.settling_time is not None else np.inf for f in m.followers)
+            for m in numbers
+        ]
     )
 
 
@@ -61,18 +64,48 @@ def experiment(seeds: Sequence[int]) -> list[Row]:
         converged = int(((whole.max(axis=1) < 1e-2) & np.isfinite(within)).sum())
         limited = max(float(result.saturated.max()) for result in results)
         rows += [
-            (f"`{scenario}`: seeds that converge with motor limits on", f"{converged} of {len(seeds)} ({done} completed)", "all"),
-            (f"`{scenario}`: steady RMSE, last 10 of 60 s, worst follower and seed", f"{whole.max():.2e} m", "1e-13 m"),
-            (f"`{scenario}`: RMSE over 8..10 s, median / worst", f"{np.median(early):.1e} / {early.max():.1e} m", "3e-5 / 1e-4 m" if scenario == "paper" else "-"),
-            (f"`{scenario}`: time to 1 cm for good, median / worst seed", f"{np.median(within):.2f} / {within.max():.2f} s", "-"),
-            (f"`{scenario}`: largest fraction of steps at a motor limit", f"{100 * limited:.2f} %", "-"),
+            (
+                f"`{scenario}`: seeds that converge with motor limits on",
+                f"{converged} of {len(seeds)} ({done} completed)",
+                "all",
+            ),
+            (
+                f"`{scenario}`: steady RMSE, last 10 of 60 s, worst follower and seed",
+                f"{whole.max():.2e} m",
+                "1e-13 m",
+            ),
+            (
+                f"`{scenario}`: RMSE over 8..10 s, median / worst",
+                f"{np.median(early):.1e} / {early.max():.1e} m",
+                "3e-5 / 1e-4 m" if scenario == "paper" else "-",
+            ),
+            (
+                f"`{scenario}`: time to 1 cm for good, median / worst seed",
+                f"{np.median(within):.2f} / {within.max():.2f} s",
+                "-",
+            ),
+            (
+                f"`{scenario}`: largest fraction of steps at a motor limit",
+                f"{100 * limited:.2f} %",
+                "-",
+            ),
         ]
         if scenario == "paper":
-            rows.append(("`paper`: leader RMSE over 10 s from the 1.44 m start (paper: 0.186)", f"{leader_rmse(results[0], 10.0):.3f} m", "-"))
+            rows.append(
+                (
+                    "`paper`: leader RMSE over 10 s from the 1.44 m start (paper: 0.186)",
+                    f"{leader_rmse(results[0], 10.0):.3f} m",
+                    "-",
+                )
+            )
     fast = runs("paper-fast", seeds)
     last = np.array([steady(result, 8.0, 10.0) for result in fast])
     rows += [
-        ("`paper-fast`: RMSE over 8..10 s, median / worst follower and seed", f"{np.median(last):.1e} / {last.max():.1e} m", "1e-8 m, every seed"),
+        (
+            "`paper-fast`: RMSE over 8..10 s, median / worst follower and seed",
+            f"{np.median(last):.1e} / {last.max():.1e} m",
+            "1e-8 m, every seed",
+        ),
         ("`paper-fast`: leader RMSE over 10 s", f"{leader_rmse(fast[0], 10.0):.3f} m", "-"),
     ]
     return rows
@@ -80,13 +113,23 @@ def experiment(seeds: Sequence[int]) -> list[Row]:
 
 def what_fails(seeds: Sequence[int]) -> list[Row]:
     """Measure what the printed law and a missing feed-forward do."""
-    lag = np.array([steady(r, 50.0, 60.0) for r in runs("paper", seeds[:10], "follower.feedforward=none")])
+    lag = np.array(
+        [steady(r, 50.0, 60.0) for r in runs("paper", seeds[:10], "follower.feedforward=none")]
+    )
     literal = runs("paper-literal", seeds[:10])
     ends = np.array([np.sqrt((formation_errors(r)[-1, 1:] ** 2).mean()) for r in literal])
     rank = literal[0].follower.gain.certificate.observable  # type: ignore[attr-defined]
     return [
-        ("`paper` without feed-forward: steady lag of followers 1, 2, 3", ", ".join(f"{v:.4f}" for v in lag.mean(axis=0)) + " m", "reported"),
-        ("`paper-literal`: formation RMSE at 10 s, smallest / largest of 10 seeds", f"{ends.min():.0f} / {ends.max():.0f} m", "tens to hundreds"),
+        (
+            "`paper` without feed-forward: steady lag of followers 1, 2, 3",
+            ", ".join(f"{v:.4f}" for v in lag.mean(axis=0)) + " m",
+            "reported",
+        ),
+        (
+            "`paper-literal`: formation RMSE at 10 s, smallest / largest of 10 seeds",
+            f"{ends.min():.0f} / {ends.max():.0f} m",
+            "tens to hundreds",
+        ),
         ("`paper-literal`: rank of observability of (A, g^T P)", f"{rank} of 12", "4 of 12"),
     ]
 
@@ -106,7 +149,11 @@ def chain_lag() -> Row:
     )
     lags = -result.errors[-1, 1:, 0]
     off = np.abs(lags - np.array([3.0, 5.0, 6.0])).max()
-    return ("chain of single integrators behind a leader at 1 m/s: lags off 3, 5, 6 m by", f"{off:.1e} m", "1e-9 m")
+    return (
+        "chain of single integrators behind a leader at 1 m/s: lags off 3, 5, 6 m by",
+        f"{off:.1e} m",
+        "1e-9 m",
+    )
 
 
 def offset_drift() -> Row:
@@ -122,7 +169,11 @@ def offset_drift() -> Row:
         dt=0.01,
         store_every=100,
     )
-    return ("f = -x, g = P = 1, goal at -d: settles at", f"{result.states[-1, 1, 0]:.12f} d", "-d/2")
+    return (
+        "f = -x, g = P = 1, goal at -d: settles at",
+        f"{result.states[-1, 1, 0]:.12f} d",
+        "-d/2",
+    )
 
 
 def algorithm_one() -> Row:
@@ -140,7 +191,11 @@ def algorithm_one() -> Row:
         integrator="printed",
     )
     size = np.linalg.norm(result.states[:, 1:, 0], axis=1)
-    return ("Algorithm 1 as printed: growth of the error in a step", f"{size[-1] / size[-2]:.3f}", "3.247")
+    return (
+        "Algorithm 1 as printed: growth of the error in a step",
+        f"{size[-1] / size[-2]:.3f}",
+        "3.247",
+    )
 
 
 def spectra() -> list[Row]:
@@ -169,14 +224,14 @@ def main() -> None:
     page = [
         "# Results",
         "Made by `python benchmarks/results.py`; rerun it to check. Random starts are seeds "
-        f"0 to {len(seeds) - 1} unless said; float64, Runge-Kutta with held input, the Crazyflie's motor limits "
-        f"with attitude-priority mixing. Versions: {told}.",
+        f"0 to {len(seeds) - 1} unless said; float64, Runge-Kutta with held input, "
+        f"the Crazyflie's motor limits with attitude-priority mixing. Versions: {told}.",
         "## The paper's experiment",
         table(experiment(seeds)),
-        "The paper prints 9.3e-17, 7.7e-17 and 5.2e-17 m for its followers. Those are the rounding of constant "
-        "offsets, present from the first sample although the text says random starts, and not the error of a "
-        "closed loop. The steady RMSE above is that of a closed loop from random starts; it too is rounding, of "
-        "states of a few metres in float64.",
+        "The paper prints 9.3e-17, 7.7e-17 and 5.2e-17 m for its followers. Those are the rounding "
+        "of constant offsets, present from the first sample although the text says random starts, "
+        "and not the error of a closed loop. The steady RMSE above is that of a closed loop from "
+        "random starts; it too is rounding, of states of a few metres in float64.",
         "## What fails, and by how much",
         table(what_fails(seeds)),
         "## Closed forms",

@@ -1,4 +1,7 @@
-"""The dataset of a run: labelled, with units and provenance, in one netCDF file; and its summary in JSON."""
+"""The dataset of a run, labelled, with units and provenance, and its summary.
+
+The dataset is one netCDF file, the summary is JSON.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,7 @@
-"""From a checked scenario to parts, and from parts to a run. Names are looked up in the registry alone."""
+"""From a checked scenario to parts, and from parts to a run.
+
+Names are looked up in the registry alone.
+"""
 
 import contextlib
 import importlib
@@ -131,7 +134,7 @@ def run(scenario: Scenario, progress: Progress | None = None, parts: Parts | Non
     return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
 
 
-# ---- parts ----------------------------------------------------------------------------------------------------
+# ---- parts --------------------------------------------------------------------------------------
 
 
 def resolve(entry: _registry.Entry) -> Any:
@@ -180,7 +183,8 @@ def _model(scenario: Scenario) -> ControlAffine:
         named = getattr(cls, "named", None)
         if named is None:
             raise ModelError(
-                f"`{what}` has no named parameter sets, and got `{spec.parameters}`; give a mapping."
+                f"`{what}` has no named parameter sets, and got `{spec.parameters}`; "
+                "give a mapping."
             )
         return named(spec.parameters, **extra)
     try:

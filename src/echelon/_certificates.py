@@ -1,4 +1,4 @@
-"""What can be said of a gain on a graph: spectrum, modal abscissas and observability at the trim."""
+"""What can be said of a gain on a graph: spectrum, abscissa and observability at the trim."""
 
 from typing import Literal, TypeAlias
 

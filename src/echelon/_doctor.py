@@ -1,4 +1,4 @@
-"""Self-checks of an installation: versions, devices, and whether the physics holds on this machine."""
+"""Self-checks of an installation: versions, devices, and whether the physics holds here."""
 
 import importlib
 from collections.abc import Callable, Iterator

@@ -1,5 +1,4 @@
-"""What can go wrong, and how it is told: one base error, its few children, and the outcomes of a
-run.
+"""What can go wrong, and how it is told: errors for bad input, outcomes for runs.
 
 Bad input raises at once; its message is one sentence that says what was got and what is allowed. A
 numerical event during a run is not an exception but an `Outcome`, kept beside the data that was
@@ -12,13 +11,19 @@ from collections.abc import Iterable
 
 
 class EchelonError(Exception):
-    """Base of every error that echelon raises on purpose; `exit_code` is what the command line returns."""
+    """Base of every error that echelon raises on purpose.
+
+    `exit_code` is what the command line returns.
+    """
 
     exit_code = 2
 
 
 class ModelError(EchelonError):
-    """An agent's model has a wrong shape, a non-finite value, a false trim or an impossible parameter."""
+    """An agent's model is malformed.
+
+    It has a wrong shape, a non-finite value, a false trim or an impossible parameter.
+    """
 
 
 class GraphError(EchelonError):
@@ -73,7 +78,7 @@ class Outcome(enum.Enum):
 
 
 def did_you_mean(got: object, allowed: Iterable[str]) -> str:
-    """Return `` (did you mean `name`?)`` when `got` is close to an allowed name, else an empty string."""
+    """Return `` (did you mean `name`?)`` where an allowed name is close to `got`, else nothing."""
     close = difflib.get_close_matches(str(got), list(allowed), n=1, cutoff=0.6)
     return f" (did you mean `{close[0]}`?)" if close else ""
 

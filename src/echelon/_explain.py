@@ -29,16 +29,25 @@ def _story(result: Result, numbers: Metrics) -> Iterator[str]:
         first, last = (float(np.sqrt((row**2).mean())) for row in (error[0], error[-1]))
     unit = "" if result.unit == "state" else f" {result.unit}"
     if last > 2.0 * first + 1e-9:
-        yield f"The formation error grows: {first:.3g}{unit} at the start, {last:.4g}{unit} at {result.times[-1]:g} s."
+        yield (
+            f"The formation error grows: {first:.3g}{unit} at the start, "
+            f"{last:.4g}{unit} at {result.times[-1]:g} s."
+        )
         yield from _why_growth(result)
         return
     settled = [each.settling_time for each in numbers.followers]
     if all(time is not None for time in settled):
         latest = max(time for time in settled if time is not None)
-        yield f"All {len(settled)} followers stay within 0.01{unit} of their goals from {latest:.3g} s on."
+        yield (
+            f"All {len(settled)} followers stay within 0.01{unit} of their goals "
+            f"from {latest:.3g} s on."
+        )
     else:
         missing = sum(time is None for time in settled)
-        yield f"{missing} of {len(settled)} followers have not settled to 0.01{unit} by {result.times[-1]:g} s."
+        yield (
+            f"{missing} of {len(settled)} followers have not settled to 0.01{unit} "
+            f"by {result.times[-1]:g} s."
+        )
     yield from _lag(result, numbers, unit)
 
 
@@ -51,15 +60,15 @@ def _why_growth(result: Result) -> Iterator[str]:
     rank = gain.certificate.observable
     if rank < n:
         yield (
-            f"Cause: observability of (A, g^T P) has rank {rank} of {n}, so {n - rank} directions of disagreement "
-            "never enter any input and the law cannot reduce them."
+            f"Cause: observability of (A, g^T P) has rank {rank} of {n}, so {n - rank} directions "
+            "of disagreement never enter any input and the law cannot reduce them."
         )
     if not getattr(result.follower, "trim", True) and np.any(np.asarray(result.model.trim[1])):
         yield "The law has no trim input either, so nothing holds the followers against gravity."
     if gain.certificate.edge is not None and gain.coupling < gain.certificate.edge:
         yield (
-            f"Cause: coupling {gain.coupling:.4g} is below the edge {gain.certificate.edge:.4g} = 1/(2 lambda_min) "
-            "of what this gain guarantees."
+            f"Cause: coupling {gain.coupling:.4g} is below the edge {gain.certificate.edge:.4g} "
+            "= 1/(2 lambda_min) of what this gain guarantees."
         )
 
 
@@ -69,9 +78,10 @@ def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
         return
     if result.reference is not None and np.ptp(result.reference, axis=0).max() > 0.0:
         yield (
-            f"Without feed-forward the followers do not know the leader's motion and lag: {worst:.3g}{unit} RMS over "
-            f"the last {numbers.steady_window:g} s for the worst. `feedforward: relay` removes the lag, and asks "
-            "for the leader's input at every follower."
+            "Without feed-forward the followers do not know the leader's motion and lag: "
+            f"{worst:.3g}{unit} RMS over the last {numbers.steady_window:g} s for the worst. "
+            "`feedforward: relay` removes the lag, and asks for the leader's input "
+            "at every follower."
         )
 
 
@@ -87,8 +97,9 @@ def _promises(result: Result) -> Iterator[str]:
             else f" (guaranteed for linear agents from {certificate.edge:.4g} on)"
         )
         yield (
-            f"Promise of the gain, by linearization at the trim: the disagreement is {verdict}, slowest mode "
-            f"{certificate.abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; no region is proved."
+            f"Promise of the gain, by linearization at the trim: the disagreement is {verdict}, "
+            f"slowest mode {certificate.abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
+            "no region is proved."
         )
     needs = ", ".join(result.follower.needs) or "nothing from others"
     yield f"Each follower is told: {needs}."
@@ -103,8 +114,8 @@ def _lyapunov_story(result: Result) -> Iterator[str]:
     if forbidden:
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
-            f"Warning: V rises at {forbidden} of {len(v.value) - 1} frames (first at {when:.4g} s) although V' <= 0 "
-            "there; the step `dt` is too long for this gain."
+            f"Warning: V rises at {forbidden} of {len(v.value) - 1} frames (first at {when:.4g} s) "
+            "although V' <= 0 there; the step `dt` is too long for this gain."
         )
     elif rises:
         yield f"V rises at {rises} of {len(v.value) - 1} frames; {_excuse(v)}."

@@ -1,4 +1,7 @@
-"""The formation: each agent's goal offset xi_i from the leader, and what the graph and the model make of it."""
+"""The formation: each agent's goal offset xi_i from the leader.
+
+With it stands what the graph and the model make of the offsets: rigidity and symmetry.
+"""
 
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -61,14 +64,18 @@ class Formation:
         for agent, offset in offsets.items():
             if not 0 <= agent < graph.agents:
                 raise FormationError(
-                    f"an offset is given for agent {agent}, and agents are numbered from 0 to {graph.agents - 1}."
+                    f"an offset is given for agent {agent}, "
+                    f"and agents are numbered from 0 to {graph.agents - 1}."
                 )
             full[agent] = _whole_state(model, agent, offset)
         return cls(full)
 
     @classmethod
     def triangle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
-        """Return a filled triangle: agent 0 at the tip, rows of 2, 3, ... behind it (towards -first axis)."""
+        """Return a filled triangle with agent 0 at the tip.
+
+        Rows of 2, 3, ... agents stand behind it, towards minus the first axis.
+        """
         rows = np.floor((np.sqrt(8.0 * np.arange(graph.agents) + 1.0) - 1.0) / 2.0)
         place = np.arange(graph.agents) - rows * (rows + 1) / 2.0
         return cls._drawn(
@@ -123,7 +130,8 @@ class Formation:
         axes = model.position_indices()
         if not axes:
             raise FormationError(
-                f"`{type(model).__name__}` has no position, so a drawn formation has no meaning; give `offsets`."
+                f"`{type(model).__name__}` has no position, "
+                "so a drawn formation has no meaning; give `offsets`."
             )
         used = min(2, len(axes))
         full = np.zeros((graph.agents, len(model.state_names)))
@@ -144,7 +152,10 @@ class Formation:
         return -(graph.laplacian() @ self.offsets)
 
     def rigidity_matrix(self, model: ControlAffine, graph: Graph) -> Matrix:
-        """Return the rigidity matrix (E, N dim): (p_i - p_j)^T in block i and its negative in block j."""
+        """Return the rigidity matrix (E, N dim).
+
+        The row of edge (i, j) has (p_i - p_j)^T in block i and its negative in block j.
+        """
         p = self.offsets[:, model.position_indices()]
         matrix = np.zeros((len(graph.edges), *p.shape))
         for row, (i, j) in enumerate(graph.edges):
@@ -152,7 +163,7 @@ class Formation:
         return matrix.reshape(len(graph.edges), -1)
 
     def is_rigid(self, model: ControlAffine, graph: Graph) -> bool:
-        """Tell whether distances on the edges fix the shape to first order (infinitesimal rigidity)."""
+        """Tell whether the edges' lengths fix the shape to first order (infinitesimal rigidity)."""
         agents, dim = graph.agents, len(model.position)
         motions = (
             dim * (dim + 1) // 2 if agents >= dim else agents * dim - agents * (agents - 1) // 2
@@ -223,7 +234,10 @@ def _changes(model: ControlAffine, offset: np.ndarray) -> str | None:
 def _moved(
     model: ControlAffine, states: States, offset: State
 ) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return f and g at states (S, n), each with the larger of its difference and slope along the offset."""
+    """Return f and g at states (S, n), each with its change along the offset.
+
+    The change is the larger, entry by entry, of the absolute difference and the absolute slope.
+    """
 
     def change(function: Callable[[State], jax.Array], x: State) -> tuple[jax.Array, jax.Array]:
         here, slope = jax.jvp(function, (x,), (offset,))

@@ -1,4 +1,7 @@
-"""The communication graph: undirected, weighted or not, with one or more leaders (paper, Definition 2)."""
+"""The communication graph (paper, Definition 2).
+
+It is undirected, weighted or not, with one or more leaders.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
@@ -62,13 +65,17 @@ class Graph:
         leaders: Iterable[int] = (0,),
         agents: int | None = None,
     ) -> "Graph":
-        """Return the graph of the given edges; `agents` defaults to the largest number named, plus one."""
+        """Return the graph of the given edges.
+
+        `agents` is the largest number named, plus one, when left out.
+        """
         return cls(edges, leaders, agents)
 
     @classmethod
     def from_networkx(cls, graph: "nx.Graph[Any]", leaders: Iterable[int] = (0,)) -> "Graph":
-        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1; `weight` is
-        read.
+        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1.
+
+        The edge attribute `weight` is read, and is 1 where it is missing.
 
         Raises:
             GraphError: the graph is directed or its nodes are not 0 .. N-1.
@@ -77,7 +84,8 @@ class Graph:
             raise GraphError("the networkx graph is directed, and must be undirected.")
         if set(graph.nodes) != set(range(len(graph))):
             raise GraphError(
-                "the nodes of the networkx graph must be the whole numbers from 0 on, without a gap."
+                "the nodes of the networkx graph must be the whole numbers from 0 on, "
+                "without a gap."
             )
         edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
         return cls(edges, leaders, len(graph))
@@ -143,7 +151,10 @@ class Graph:
         return sp.csr_array(csgraph.laplacian(self.adjacency()))
 
     def grounded_laplacian(self) -> sp.csr_array:
-        """Return the follower block of the Laplacian, sparse: the paper's L of Lemma 1, positive definite."""
+        """Return the follower block of the Laplacian, sparse and positive definite.
+
+        It is the paper's L of Lemma 1.
+        """
         rows = np.asarray(self.followers)
         return sp.csr_array(self.laplacian()[rows][:, rows])
 
@@ -237,7 +248,8 @@ class Exchange(eqx.Module):
     def __call__(self, own: States, said: States) -> States:
         """Return z (N, n), z_i = sum_j A_ij (own_i - said_j)."""
         weights = jnp.asarray(self.weights, own.dtype)[:, None]
-        # Differences before sums: at consensus they vanish exactly, sums of positions would leave rounding.
+        # Differences before sums: at consensus they vanish exactly, while sums of positions would
+        # leave rounding.
         differences = weights * (own[self.receivers] - said[self.senders])
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
 

@@ -60,7 +60,8 @@ def initial_states(
 def _check_agent(agent: int, graph: Graph) -> None:
     if not 0 <= agent < graph.agents:
         raise SimulationError(
-            f"an initial state is given for agent {agent}, and agents are numbered from 0 to {graph.agents - 1}."
+            f"an initial state is given for agent {agent}, "
+            f"and agents are numbered from 0 to {graph.agents - 1}."
         )
 
 
@@ -74,7 +75,10 @@ def _checked(values: object, shape: tuple[int, ...], what: str, meaning: str) ->
 
 
 def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
-    """Return one number a state from numbers by state or group; a state's own number wins over its group's."""
+    """Return one number a state, (n,), from numbers by state or group.
+
+    A state's own number wins over its group's.
+    """
     values = np.zeros(len(model.state_names))
     for name in sorted(named, key=lambda name: name in model.state_names):
         if not np.isfinite(named[name]):

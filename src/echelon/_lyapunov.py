@@ -49,7 +49,10 @@ class Lyapunov(NamedTuple):
 
 
 def lyapunov(result: Result) -> Lyapunov | None:
-    """Return V along a run, in float64; None where the followers' law has no P or nothing was stored."""
+    """Return V along a run, in float64.
+
+    None where the followers' law has no P or nothing was stored.
+    """
     P = result.follower.metric(result.model)
     if P is None or not len(result.times):
         return None

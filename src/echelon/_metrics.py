@@ -19,7 +19,7 @@ SETTLED = 0.01
 
 
 class LeaderMetrics(NamedTuple):
-    """Root-mean-square deviation of the leader from its reference; None where there is no reference."""
+    """Root-mean-square deviation of the leader from its reference; None without a reference."""
 
     rmse: float | None
     steady_rmse: float | None
@@ -98,7 +98,7 @@ def formation_errors(result: Result) -> Matrix:
 
 
 def output_errors(result: Result) -> Matrix | None:
-    """Return the first leader's output minus the reference's, (T, q), or None without a reference."""
+    """Return the first leader's output minus the reference's, (T, q); None without a reference."""
     if result.reference is None or not len(result.times):
         return None
     leader = result.graph.leaders[0]
@@ -178,7 +178,7 @@ def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:
 
 
 def _minimum_distance(result: Result) -> float | None:
-    """Return the smallest distance between two agents over all frames, or None without a position."""
+    """Return the smallest distance between two agents over all frames; None without a position."""
     axes = result.model.position_indices()
     if not axes or not len(result.times):
         return None

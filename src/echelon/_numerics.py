@@ -1,4 +1,7 @@
-"""Numerical building blocks that know nothing of agents: precision, integrators, linear systems theory."""
+"""Numerical building blocks that know nothing of agents.
+
+Precision, integrators and linear systems theory.
+"""
 
 import contextlib
 from collections.abc import Callable
@@ -70,11 +73,10 @@ def symmetric_part(matrix: np.ndarray) -> np.ndarray:
 
 
 def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np.ndarray]]:
-    """Return the eigenvalues of A that input B cannot move, each with its left eigenvector (PBH
-    test).
+    """Return the eigenvalues of A that input B cannot move, each with its left eigenvector.
 
-    A mode counts as uncontrollable when the smallest singular value of [s I - A, B] is below
-    1e-9 times the norm of the pair.
+    This is the PBH test: a mode counts as uncontrollable when the smallest singular value of
+    [s I - A, B] is below 1e-9 times the norm of the pair.
     """
     scale = max(1.0, float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)))
     found = []

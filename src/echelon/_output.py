@@ -1,4 +1,7 @@
-"""Where a run's files go: a folder that is new or empty, checked before the run so that nothing is lost."""
+"""Where a run's files go: a folder that is new or empty.
+
+It is checked before the run, so that nothing is lost.
+"""
 
 import json
 import shutil
@@ -53,8 +56,8 @@ def _named_folder(out: Path, force: bool) -> Path:
     present = sorted(path.name for path in out.iterdir())
     if present and not force:
         raise OutputError(
-            f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, or `--force` to replace "
-            "an earlier run."
+            f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, "
+            "or `--force` to replace an earlier run."
         )
     probe = out / ".writable"
     probe.touch()

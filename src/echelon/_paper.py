@@ -9,11 +9,12 @@ PRINTED: Mapping[str, tuple[float, ...]] = {
 """RMSE in m of leader and followers 1, 2, 3, per method, over 10 s."""
 
 ROUNDING = (
-    "The paper's 1e-17 m of its followers is the rounding of constant offsets (all its samples are multiples of 2^-53, "
-    "and start there), not the error of a closed loop; compare it with the steady RMSE from random starts above."
+    "Printed is the paper's Table II (10 s). Its followers' 1e-17 m is the rounding "
+    "of constant offsets (all its samples are multiples of 2^-53, and start there), not the error "
+    "of a closed loop; compare it with the steady RMSE from random starts above."
 )
 
 
 def is_papers_experiment(scenario: str, agents: int) -> bool:
-    """Tell whether the printed values belong beside a scenario: `paper` and its variants, 4 agents."""
+    """Tell whether the printed values belong beside a scenario: `paper`, its variants, 4 agents."""
     return agents == 4 and (scenario == "paper" or scenario.startswith("paper-"))

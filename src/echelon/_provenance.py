@@ -9,7 +9,10 @@ _PACKAGES = ("echelon", "jax", "jaxlib", "equinox", "numpy", "scipy")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that compute; `git` where run from a checkout."""
+    """Return the versions of Python and of the packages that compute.
+
+    In a checkout there is `git` too, the commit.
+    """
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -21,7 +24,7 @@ def versions() -> dict[str, str]:
 
 
 def _commit() -> str | None:
-    """Return the commit of echelon's own checkout, with `+` when it has been changed; None elsewhere."""
+    """Return the commit of echelon's own checkout, with `+` when changed; None elsewhere."""
     home = Path(__file__).resolve().parents[2]
     if not (home / ".git").exists():
         return None

@@ -1,8 +1,7 @@
-"""The one table of names that a scenario file may use, each with where it lives and one line on
-what it is.
+"""The one table of names that a scenario file may use.
 
-Only text stands here, so that names can be listed and checked without importing JAX. A new member
-of a family adds one line.
+Each stands with where it lives and one line on what it is. Only text stands here, so that names can
+be listed and checked without importing JAX. A new member of a family adds one line.
 """
 
 from typing import NamedTuple

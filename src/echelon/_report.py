@@ -1,4 +1,7 @@
-"""The report of a run on the screen: a table like the paper's Table II, and what it shows, in sentences."""
+"""The report of a run on the screen.
+
+A table like the paper's Table II, and what it shows, in sentences.
+"""
 
 import io
 from collections.abc import Sequence
@@ -53,20 +56,13 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     from rich.table import Table
 
     unit = "" if result.unit == "state" else f", {result.unit}"
-    steady = f"steady\n(last {numbers.steady_window:g} s)"
+    steady = f"steady{unit}\n(last {numbers.steady_window:g} s)"
     settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
-    columns = [
-        "agent",
-        f"RMSE{unit}\n(whole run)",
-        steady,
-        settled,
-        "effort",
-        "limited,\n% of steps",
-    ]
+    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
     if printed:
-        columns += ["paper, 10 s,\nconsensus", "paper, 10 s,\noptimization"]
+        columns += ["printed,\nconsensus", "printed,\noptimiz."]
     title = f"{_title(result)}, {result.settings.horizon:g} s, seed {result.settings.seed}"
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
     for row in _rows(result, numbers, printed):

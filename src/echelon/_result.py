@@ -62,13 +62,16 @@ class Result:
 
     @property
     def errors(self) -> Matrix:
-        """Deviation of each agent from its goal relative to its leader, (T, N, n); zero rows for leaders."""
+        """Deviation of each agent from its goal relative to its leader, (T, N, n).
+
+        The leaders' rows are zero.
+        """
         y = self.states - self.formation.offsets
         return y - y[:, list(self.graph.nearest_leader())]
 
     @property
     def measured(self) -> tuple[int, ...]:
-        """Indices of the states that errors are measured on: the position where there is one, else all."""
+        """Indices of the states that errors are measured on: the position if any, else all."""
         return self.model.position_indices() or tuple(range(len(self.model.state_names)))
 
     @property

@@ -1,4 +1,7 @@
-"""The closed loop in time: parts in, one `Result` out. This file sees only the interfaces of models and laws."""
+"""The closed loop in time: parts in, one `Result` out.
+
+This file sees only the interfaces of models and laws.
+"""
 
 import math
 import time
@@ -28,7 +31,10 @@ _CHUNKS = 100
 
 
 class Loop(eqx.Module):
-    """All that never changes during a run. Agents are kept in their own order; leaders act first in a step."""
+    """All that never changes during a run.
+
+    Agents are kept in their own order; leaders act first in a step.
+    """
 
     model: ControlAffine
     leader: Law
@@ -46,7 +52,11 @@ class Loop(eqx.Module):
 
 
 class Moment(NamedTuple):
-    """All that changes: step number, states (N, n), memories of leaders and followers, saturated steps (N,)."""
+    """All that changes during a run.
+
+    The step number, the states (N, n), the memories of leaders and followers, and the number of
+    saturated steps (N,).
+    """
 
     step: jax.Array
     states: States
@@ -170,8 +180,8 @@ def _assemble(
     shape = (graph.agents, len(model.state_names))
     if formation.offsets.shape != shape:
         raise SimulationError(
-            f"the formation has offsets {formation.offsets.shape}, and {graph.agents} agents with {shape[1]} "
-            f"states need {shape}."
+            f"the formation has offsets {formation.offsets.shape}, and {graph.agents} agents "
+            f"with {shape[1]} states need {shape}."
         )
     leaders, followers = np.array(graph.leaders), np.array(graph.followers)
     nearest = np.array(graph.nearest_leader())
@@ -192,11 +202,14 @@ def _assemble(
     )
 
 
-# ---- one step -------------------------------------------------------------------------------------------------
+# ---- one step ------------------------------------------------------------------------------------
 
 
 def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]:
-    """Return delivered inputs (N, m), who saturated (N,), and the next memories of leaders and followers."""
+    """Return delivered inputs (N, m), who saturated (N,), and the next memories.
+
+    The memories are those of the leaders, then those of the followers.
+    """
     x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
     y = x - offsets
     z = loop.exchange(y, y)
@@ -238,7 +251,10 @@ def step(loop: Loop, now: Moment) -> Moment:
 def advance(
     loop: Loop, now: Moment, counts: jax.Array
 ) -> tuple[Moment, tuple[jax.Array, jax.Array]]:
-    """Store a frame and take counts[k] steps, for each k; return the last moment and the stored frames."""
+    """Store a frame and take counts[k] steps, for each k.
+
+    Return the last moment and the stored frames.
+    """
 
     def frame(now: Moment, count: jax.Array) -> tuple[Moment, tuple[jax.Array, jax.Array]]:
         stored = (now.states, control(loop, now)[0])
@@ -247,7 +263,7 @@ def advance(
     return jax.lax.scan(frame, now, counts)
 
 
-# ---- the whole run --------------------------------------------------------------------------------------------
+# ---- the whole run -------------------------------------------------------------------------------
 
 
 class _Record(NamedTuple):
@@ -282,7 +298,10 @@ def _start(loop: Loop, states: np.ndarray) -> Moment:
 
 
 def _run(loop: Loop, states: np.ndarray, counts: np.ndarray, progress: Progress | None) -> _Record:
-    """Advance chunk by chunk, so that progress shows and Ctrl-C or a divergence keeps what was computed."""
+    """Advance chunk by chunk.
+
+    So progress shows, and Ctrl-C or a divergence keeps what was computed.
+    """
     size = math.ceil(len(counts) / _CHUNKS)
     padded = np.concatenate([counts, np.zeros(-len(counts) % size, np.int32)])
     now, frames, done = _start(loop, states), [], 0
@@ -339,8 +358,8 @@ def _formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str
     """Tell of offsets that the dynamics do not respect, and of goals that coincide."""
     broken = formation.broken_symmetries(model)
     told = [
-        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, so the agents settle "
-        "off their goals."
+        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
+        "so the agents settle off their goals."
         for agent, reason in list(broken.items())[:1]
     ]
     pairs = formation.coincident() if model.position else ()

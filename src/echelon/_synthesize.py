@@ -8,8 +8,9 @@ from echelon.models.model import ControlAffine
 
 
 def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
-    """Return the gain of the consensus law for agents `model` on `graph`, with its certificate; in
-    float64.
+    """Return the gain of the consensus law for agents `model` on `graph`, with its certificate.
+
+    The computation is in float64.
 
     Raises:
         ModelError: the model is malformed.

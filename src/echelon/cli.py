@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from echelon._simulate import Progress
 
 _EPILOG = (
-    "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, 4 an optional part is not "
-    "installed, 130 interrupted."
+    "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, "
+    "4 an optional part is not installed, 130 interrupted."
 )
 _INTERRUPTED: Final = 130
 
@@ -29,7 +29,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     epilog=_EPILOG,
-    help="Formation tracking by consensus: synthesize gains, simulate swarms, say what is promised.",
+    help="Formation tracking by consensus: synthesize gains, simulate swarms, "
+    "say what is promised.",
 )
 
 _Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -102,7 +103,7 @@ def run(
 
 @app.command("list")
 def list_(as_json: _Json = False) -> None:
-    """List bundled scenarios, models, references, laws, gain methods, graphs, formations and integrators."""
+    """List scenarios, models, references, laws, gain methods, graphs, formations, integrators."""
     from echelon import _registry
     from echelon._scenario import bundled_scenarios
 

@@ -1,4 +1,7 @@
-"""What a synthesis returns: the gain that the law runs with, and the certificate that says what it promises."""
+"""What a synthesis returns: the gain that the law runs with.
+
+It carries the certificate that says what it promises.
+"""
 
 import abc
 from collections.abc import Sequence
@@ -40,7 +43,7 @@ class Gain(eqx.Module):
     def __init__(
         self, P: Matrix, R: Matrix, coupling: float, method: str, certificate: Certificate
     ) -> None:
-        """Refuse matrices that are not symmetric positive definite and a coupling that is not positive."""
+        """Refuse P or R not symmetric positive definite, and a coupling that is not positive."""
         check_definite("P", P)
         check_definite("R", R)
         if not 0.0 < coupling < float("inf"):
@@ -75,8 +78,8 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
     if gap.max() > 1e-9 * np.abs(matrix).max():
         i, j = np.unravel_index(np.argmax(gap), gap.shape)
         raise GainError(
-            f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} and entry [{j}, {i}] is "
-            f"{matrix[j, i]:.6g}."
+            f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} "
+            f"and entry [{j}, {i}] is {matrix[j, i]:.6g}."
         )
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least <= 0.0:

@@ -66,7 +66,7 @@ def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
                 f"`{name}`" for name, used in zip(model.state_names, largest, strict=True) if used
             )
             raise GainError(
-                f"the linearization of `{type(model).__name__}` at its trim cannot be stabilized: no input moves "
-                f"the mode at {eigenvalue:.3g} 1/s, which lies along {states}; "
+                f"the linearization of `{type(model).__name__}` at its trim cannot be stabilized: "
+                f"no input moves the mode at {eigenvalue:.3g} 1/s, which lies along {states}; "
                 "give the gain yourself (method `given`) or choose another model of the vehicle."
             )

@@ -30,8 +30,8 @@ class Agreement(Law):
         """Refuse a model that is no single integrator."""
         if not isinstance(model, SingleIntegrator):
             raise LawError(
-                f"the law `agreement` is made for `SingleIntegrator`, and the model is `{type(model).__name__}`; "
-                "use `consensus`."
+                f"the law `agreement` is made for `SingleIntegrator`, and the model is "
+                f"`{type(model).__name__}`; use `consensus`."
             )
         return self
 

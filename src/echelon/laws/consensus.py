@@ -12,8 +12,9 @@ from echelon.models.model import ControlAffine
 
 
 class Consensus(Law):
-    """u_i = u* + S (v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)), the paper's law at c = 1, R = I, v_ff
-    = 0.
+    """u_i = u* + S (v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)).
+
+    It is the paper's law at c = 1, R = I, v_ff = 0.
 
     Args:
         gain: P, R and c.

@@ -36,7 +36,10 @@ class LocalView(NamedTuple):
 
 
 class Law(eqx.Module):
-    """A control law, the same pure function for one agent in its own process and for a million in a batch."""
+    """A control law: a pure function of what one agent knows.
+
+    It is the same for one agent in its own process and for a million in a batch.
+    """
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -44,11 +47,14 @@ class Law(eqx.Module):
         return ()
 
     def asks(self) -> Feedforward:
-        """Return which feed-forward the law asks for: `none`, or `relay`, its leader's input of the same step."""
+        """Return which feed-forward the law asks for.
+
+        `none`, or `relay`: its leader's input of the same step.
+        """
         return "none"
 
     def start(self, model: ControlAffine) -> State:
-        """Return the state (n,) in which a leader under this law begins; the trim unless replaced."""
+        """Return the state (n,) in which a leader under this law begins, the trim by default."""
         return jnp.asarray(np.asarray(model.trim[0], float))
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
@@ -56,12 +62,13 @@ class Law(eqx.Module):
         return None
 
     def metric(self, model: ControlAffine) -> Matrix | None:
-        """Return the P (n, n) of the paper's Lyapunov function for this law, or None where it has none."""
+        """Return P (n, n) of the paper's Lyapunov function for this law; None if it has none."""
         return None
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Law":
-        """Return the law completed with what depends on the model and the graph; itself unless
-        replaced.
+        """Return the law completed with what depends on the model and the graph.
+
+        Unless replaced, it returns the law itself.
 
         Raises:
             LawError: the law does not fit the model.
@@ -88,6 +95,6 @@ def check_gain_fits(
     n, m = len(model.state_names), len(model.input_names)
     if P_shape != (n, n) or R_shape != (m, m):
         raise LawError(
-            f"the gain of `{type(law).__name__}` has P {P_shape} and R {R_shape}, and `{type(model).__name__}` "
-            f"needs P {(n, n)} and R {(m, m)}."
+            f"the gain of `{type(law).__name__}` has P {P_shape} and R {R_shape}, "
+            f"and `{type(model).__name__}` needs P {(n, n)} and R {(m, m)}."
         )

@@ -6,7 +6,10 @@ from echelon.models.model import ControlAffine
 
 
 class Passive(Law):
-    """u = u* + S v_ff, with nothing asked for and so v_ff = 0: the agent's own unforced motion about the trim."""
+    """u = u* + S v_ff, with nothing asked for and so v_ff = 0.
+
+    It leaves the agent to its own unforced motion about the trim.
+    """
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the trim input."""

@@ -1,4 +1,7 @@
-"""The leader's law: follow a reference by flatness feed-forward and state feedback (paper, Assumption 4)."""
+"""The leader's law: follow a reference by flatness feed-forward and state feedback.
+
+It serves the paper's Assumption 4.
+"""
 
 import equinox as eqx
 import jax
@@ -73,14 +76,15 @@ class Tracking(Law):
 def _check_flat(model: ControlAffine) -> None:
     if not model.flat_outputs:
         raise LawError(
-            f"the law `tracking` cannot lead `{type(model).__name__}`, which defines no `flat` map; "
+            f"the law `tracking` cannot lead `{type(model).__name__}`, "
+            "which defines no `flat` map; "
             "use `passive`, or add `flat_outputs`, `flat_order` and `flat` to the model."
         )
     unknown = [name for name in model.flat_outputs if name not in COORDINATES]
     if unknown:
         raise LawError(
-            f"`flat_outputs` of `{type(model).__name__}` names {listing(unknown)}, and a reference gives "
-            f"{listing(COORDINATES)}."
+            f"`flat_outputs` of `{type(model).__name__}` names {listing(unknown)}, "
+            f"and a reference gives {listing(COORDINATES)}."
         )
 
 

@@ -92,7 +92,10 @@ def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray)
 
 @eqx.filter_jit
 def _with_jacobians(model: ControlAffine, x: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return f, g and h with their Jacobians at x, compiled together since compiling is most of the cost."""
+    """Return f, g and h with their Jacobians at x.
+
+    They are compiled together, since compiling is most of the cost.
+    """
     functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
     return {name: (function(x), jax.jacfwd(function)(x)) for name, function in functions.items()}
 
@@ -104,8 +107,8 @@ def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ..
     except Exception as error:
         told = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
         raise ModelError(
-            f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {told}; it must be written "
-            "with `jax.numpy` and take one agent's state."
+            f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {told}; "
+            "it must be written with `jax.numpy` and take one agent's state."
         ) from error
 
 
@@ -120,8 +123,9 @@ def _check_trim(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -
     worst = int(np.argmax(np.abs(residual)))
     if abs(residual[worst]) > _TRIM_TOLERANCE:
         raise ModelError(
-            f"the trim of `{name}` is no equilibrium: f(x*) + g(x*) u* is {residual[worst]:.3g} in state "
-            f"`{model.state_names[worst]}`, and must be within {_TRIM_TOLERANCE:g} of zero; replace `trim`."
+            f"the trim of `{name}` is no equilibrium: f(x*) + g(x*) u* is {residual[worst]:.3g} "
+            f"in state `{model.state_names[worst]}`, and must be within {_TRIM_TOLERANCE:g} "
+            "of zero; replace `trim`."
         )
 
 

@@ -1,4 +1,4 @@
-"""Single and double integrators in any dimension, the agents of most of the consensus literature."""
+"""Single and double integrators in any dimension, the agents of most consensus literature."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,8 @@ def _axes(dimension: int) -> tuple[str, ...]:
 def _check_dimension(model: eqx.Module, dimension: int) -> None:
     if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
         raise ModelError(
-            f"`dimension` of `{type(model).__name__}` is {dimension}, and must be a whole number of at least 1."
+            f"`dimension` of `{type(model).__name__}` is {dimension}, "
+            "and must be a whole number of at least 1."
         )
 
 
@@ -83,7 +84,10 @@ class SingleIntegrator(ControlAffine):
 
 
 class DoubleIntegrator(ControlAffine):
-    """pdot = v, vdot = u - drag v, with p, v, u in `dimension` axes (m, m/s, m/s^2) and drag in 1/s."""
+    """pdot = v, vdot = u - drag v, in `dimension` axes.
+
+    Position p is in m, velocity v in m/s, input u in m/s^2 and `drag` in 1/s.
+    """
 
     dimension: int = eqx.field(default=2, static=True)
     drag: float = 0.0

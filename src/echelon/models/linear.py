@@ -15,7 +15,9 @@ class Linear(ControlAffine):
     """xdot = A x + B u, y = C x.
 
     Args:
-        A: (n, n). B: (n, m). C: (q, n), the identity when left out.
+        A: (n, n).
+        B: (n, m).
+        C: (q, n), the identity when left out.
         names: n state names; x1, x2, ... when left out.
 
     Raises:
@@ -46,8 +48,9 @@ class Linear(ControlAffine):
             or len(self.names) != n
         ):
             raise ModelError(
-                f"the shapes of `Linear` are A {self.A.shape}, B {self.B.shape}, C {self.C.shape} with "
-                f"{len(self.names)} names, and must be A (n, n), B (n, m), C (q, n) with n names."
+                f"the shapes of `Linear` are A {self.A.shape}, B {self.B.shape}, C {self.C.shape} "
+                f"with {len(self.names)} names, "
+                "and must be A (n, n), B (n, m), C (q, n) with n names."
             )
 
     @property
@@ -87,6 +90,7 @@ def _matrix(name: str, value: Sequence[Sequence[float]] | Matrix) -> Matrix:
         ) from None
     if matrix.ndim != 2 or not np.isfinite(matrix).all():
         raise ModelError(
-            f"`{name}` of `Linear` must be a matrix of finite numbers, and has shape {matrix.shape}."
+            f"`{name}` of `Linear` must be a matrix of finite numbers, "
+            f"and has shape {matrix.shape}."
         )
     return matrix

@@ -1,8 +1,8 @@
-"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x) (paper,
-Definition 1).
+"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x).
 
-A model of one's own is two methods and two tuples of names; everything else has a default that may
-be replaced by a class attribute, a property or a method of the same name.
+It is the agent of the paper's Definition 1. A model of one's own is two methods and two tuples
+of names; everything else has a default that may be replaced by a class attribute, a property or a
+method of the same name.
 """
 
 import abc
@@ -32,7 +32,7 @@ class _Default(Generic[_T]):
 
 
 def default(make: Callable[[Any], _T]) -> _T:
-    """Return a default that depends on the instance; a plain attribute or a property may replace it."""
+    """Return a default that depends on the instance; an attribute or a property may replace it."""
     return cast(_T, _Default(make))
 
 
@@ -128,7 +128,7 @@ class ControlAffine(eqx.Module):
         """Return the input that the actuators deliver when asked for u; u itself unless replaced.
 
         An input within the limits must be returned unchanged, to the bit: that is how saturation is
-            counted.
+        counted.
         """
         return u
 
@@ -165,8 +165,8 @@ class ControlAffine(eqx.Module):
             return (self.state_names.index(name),)
         allowed = [*self.state_groups, *self.state_names]
         raise ModelError(
-            f"`{name}` is no state or group of `{type(self).__name__}`, which has {listing(allowed)}"
-            f"{did_you_mean(name, allowed)}."
+            f"`{name}` is no state or group of `{type(self).__name__}`, "
+            f"which has {listing(allowed)}{did_you_mean(name, allowed)}."
         )
 
 
@@ -179,5 +179,6 @@ def positive(owner: object, **values: float) -> None:
     for name, value in values.items():
         if not (isinstance(value, (int, float)) and 0.0 < value < float("inf")):
             raise ModelError(
-                f"`{name}` of `{type(owner).__name__}` is {value}, and must be a positive finite number."
+                f"`{name}` of `{type(owner).__name__}` is {value}, "
+                "and must be a positive finite number."
             )

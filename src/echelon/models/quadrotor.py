@@ -1,4 +1,7 @@
-"""The 12-state quadrotor of the paper's example, with the gravity and the thrust rotation that it leaves out."""
+"""The 12-state quadrotor of the paper's example.
+
+It has the gravity and the thrust rotation that the paper's equations leave out.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -35,20 +38,22 @@ def _with_rate(
     return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
 
-# Motors at (+-l, +-l): front-left, rear-left, rear-right, front-right as signs of (x, y); the spin of each gives
-# the sign of its yaw torque.
+# Motors at (+-l, +-l): front-left, rear-left, rear-right, front-right as signs of (x, y); the spin
+# of each gives the sign of its yaw torque.
 _FRONT = np.array([1.0, -1.0, -1.0, 1.0])
 _LEFT = np.array([1.0, 1.0, -1.0, -1.0])
 _SPIN = np.array([1.0, -1.0, 1.0, -1.0])
 
 
 class Quadrotor(ControlAffine):
-    """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles (paper, equation of the
-    example).
+    """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles.
 
-    pdot = v, vdot = -g e3 + R(zeta) e3 T / m, zetadot = W(zeta) omega, J omegadot = tau - omega x J
-    omega. States: position (m), velocity (m/s), attitude (rad), body rate (rad/s). Inputs: thrust T
-    (N) and body torques tau (N m). The normalized input is (T/m - g, J^-1 tau).
+    pdot = v, vdot = -g e3 + R(zeta) e3 T / m,
+    zetadot = W(zeta) omega, J omegadot = tau - omega x J omega
+    (paper, equation of the example).
+
+    States: position (m), velocity (m/s), attitude (rad), body rate (rad/s). Inputs: thrust T (N)
+    and body torques tau (N m). The normalized input is (T/m - g, J^-1 tau).
 
     Raises:
         ModelError: a parameter is not positive, or no rigid body has the inertia (unless
@@ -81,16 +86,17 @@ class Quadrotor(ControlAffine):
 
     @classmethod
     def named(cls, name: str, **changes: Any) -> "Quadrotor":
-        """Return the quadrotor of a named parameter set (`crazyflie` or `paper`), with fields
-        changed.
+        """Return the quadrotor of a named parameter set, `crazyflie` or `paper`.
+
+        `changes` replace fields of the set.
 
         Raises:
             ModelError: there is no such set.
         """
         if name not in PARAMETERS:
             raise ModelError(
-                f"parameters `{name}` are unknown for `Quadrotor`, allowed are {listing(PARAMETERS)}"
-                f"{did_you_mean(name, PARAMETERS)}."
+                f"parameters `{name}` are unknown for `Quadrotor`, "
+                f"allowed are {listing(PARAMETERS)}{did_you_mean(name, PARAMETERS)}."
             )
         return cls(**{**PARAMETERS[name], **changes})
 
@@ -135,7 +141,10 @@ class Quadrotor(ControlAffine):
         return jnp.concatenate([x[:3], x[8:9]])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input that fly a path (x, y, z, yaw) given up to its fourth derivative."""
+        """Return the state and input that fly a path (x, y, z, yaw).
+
+        The path is given with its first four derivatives, (5, 4).
+        """
         position, velocity, acceleration, jerk, snap = derivatives[:, :3]
         yaw = derivatives[:3, 3]
         up = jnp.array([0.0, 0.0, self.gravity], derivatives.dtype)
@@ -159,7 +168,10 @@ class Quadrotor(ControlAffine):
         )
 
     def limit(self, u: Input) -> Input:
-        """Return what four motors within [0, motor_thrust] deliver, attitude before collective before yaw."""
+        """Return what four motors within [0, motor_thrust] deliver.
+
+        Attitude comes before the collective, and the collective before yaw.
+        """
         tilt = (u[1] * _LEFT - u[2] * _FRONT) / (4.0 * self.arm)
         yaw = u[3] * _SPIN / (4.0 * self.torque_per_thrust)
         wanted = u[0] / 4.0 + tilt + yaw

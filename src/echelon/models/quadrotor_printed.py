@@ -8,13 +8,15 @@ from echelon.models.rigid_body import euler_rates, free_spin
 
 
 class PrintedQuadrotor(ControlAffine):
-    """Literal: pdot = v, vdot = (T, T, T) / m, zetadot = W(zeta) omega, J omegadot = tau - omega x
-    J omega.
+    """The quadrotor as printed in the paper (literal).
+
+    pdot = v, vdot = (T, T, T) / m,
+    zetadot = W(zeta) omega, J omegadot = tau - omega x J omega.
 
     Gravity and the rotation of the thrust into the world frame are missing, as printed; the thrust
     pushes along (1, 1, 1). Its drift is nilpotent at the origin, so no P > 0 satisfies the paper's
-    Assumption 5. States and inputs are those of `Quadrotor`; the normalized input is (T/m, J^-1
-    tau).
+    Assumption 5. States and inputs are those of `Quadrotor`; the normalized input is
+    (T/m, J^-1 tau).
     """
 
     mass: float = 0.028
@@ -34,7 +36,10 @@ class PrintedQuadrotor(ControlAffine):
     }
 
     def __check_init__(self) -> None:
-        """Refuse a mass or inertia that is not positive; the printed inertia itself is kept on purpose."""
+        """Refuse a mass or inertia that is not positive.
+
+        The printed inertia itself is kept on purpose.
+        """
         positive(self, mass=self.mass)
         positive(self, **{f"inertia[{k}]": moment for k, moment in enumerate(self.inertia)})
 

@@ -19,9 +19,10 @@ def check_inertia(inertia: tuple[float, float, float]) -> None:
     for axis, moment in zip("xyz", inertia, strict=True):
         if 2.0 * moment > total:
             raise ModelError(
-                f"`inertia` is {tuple(inertia)} kg m^2, and no rigid body has that: I{axis}{axis} = {moment:.6g} "
-                f"exceeds the sum of the other two, {total - moment:.6g}; use the identified values "
-                "`crazyflie`, or set `allow_unphysical` to keep it."
+                f"`inertia` is {tuple(inertia)} kg m^2, and no rigid body has that: "
+                f"I{axis}{axis} = {moment:.6g} exceeds the sum of the other two, "
+                f"{total - moment:.6g}; use the identified values `crazyflie`, "
+                "or set `allow_unphysical` to keep it."
             )
 
 
@@ -38,7 +39,7 @@ def thrust_axis(zeta: Float[Array, " 3"]) -> Float[Array, " 3"]:
 
 
 def euler_rates(zeta: Float[Array, " 3"], omega: Float[Array, " 3"]) -> Float[Array, " 3"]:
-    """Return zetadot = W(zeta) omega from the body rate omega, rad/s; singular at pitch +-90 deg."""
+    """Return zetadot = W(zeta) omega (rad/s) from the body rate; singular at pitch +-90 deg."""
     sr, cr = jnp.sin(zeta[0]), jnp.cos(zeta[0])
     p, q, r = omega
     turn = (sr * q + cr * r) / jnp.cos(zeta[1])
@@ -53,7 +54,10 @@ def body_rates(zeta: Float[Array, " 3"], zeta_dot: Float[Array, " 3"]) -> Float[
 
 
 def tilt_towards(direction: Float[Array, " 3"], yaw: Float[Array, ""]) -> Float[Array, " 3"]:
-    """Return the angles zeta with the given yaw whose thrust axis points along `direction` (any length)."""
+    """Return the angles zeta with the given yaw whose thrust axis points along `direction`.
+
+    The length of `direction` does not matter.
+    """
     sy, cy = jnp.sin(yaw), jnp.cos(yaw)
     forward = cy * direction[0] + sy * direction[1]
     left = cy * direction[1] - sy * direction[0]

@@ -11,7 +11,7 @@ from echelon._types import Input, Scalar
 
 
 def _largest_share(base: Input, extra: Input, maximum: float) -> Scalar:
-    """Return the largest s in [0, 1] for which the thrusts base + s extra span at most `maximum`."""
+    """Return the largest s in [0, 1] for which thrusts base + s extra span at most `maximum`."""
     room = maximum - (base[:, None] - base[None, :])
     growth = extra[:, None] - extra[None, :]
     bound = jnp.where(growth > 0.0, room / jnp.where(growth > 0.0, growth, 1.0), jnp.inf)

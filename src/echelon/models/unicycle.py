@@ -14,7 +14,7 @@ def _wound(x: State, y: State) -> State:
 
 
 def _drive(derivatives: jax.Array) -> tuple[State, Input]:
-    """Return axle state (x, y, heading) and (speed, turn rate) on a path driven forward, speed > 0."""
+    """Return axle state (x, y, heading) and input (speed, turn rate) on a path, speed > 0."""
     (px, py), (vx, vy), (ax, ay) = derivatives
     speed = jnp.hypot(vx, vy)
     turn_rate = (vx * ay - vy * ax) / speed**2
@@ -59,8 +59,8 @@ class Unicycle(ControlAffine):
 class UnicyclePoint(ControlAffine):
     """A unicycle described by the point `ahead` metres in front of its axle, and its heading.
 
-    With p the point: pdot = R(heading) (v, ahead w), headingdot = w. The normalized input (v, ahead
-    w) is the point's velocity in the body frame, so that on positions g g^T is constant.
+    With p the point: pdot = R(heading) (v, ahead w), headingdot = w. The normalized input
+    (v, ahead w) is the point's velocity in the body frame, so that on positions g g^T is constant.
     """
 
     ahead: float = 0.1
@@ -95,7 +95,10 @@ class UnicyclePoint(ControlAffine):
         return jnp.stack([jnp.stack(row) for row in rows])
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
-        """Return the state and input whose axle drives the path forward; the speed must not vanish."""
+        """Return the state and input whose axle drives the path forward.
+
+        The speed must not vanish.
+        """
         axle, u = _drive(derivatives)
         point = axle[:2] + self.ahead * jnp.stack([jnp.cos(axle[2]), jnp.sin(axle[2])])
         return jnp.append(point, axle[2]), u

@@ -1,4 +1,4 @@
-"""The Van der Pol oscillator, an agent whose drift is unstable at the origin and bounded far from it."""
+"""The Van der Pol oscillator, an agent unstable at the origin and bounded far from it."""
 
 import jax.numpy as jnp
 

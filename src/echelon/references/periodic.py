@@ -17,8 +17,9 @@ def _at(center: _Vector, across: jax.Array, along: jax.Array, yaw: float) -> jax
 
 
 class Lemniscate(Reference):
-    """The paper's loop: center + (ax cos th / (1 + sin^2 th), ay sin th cos th / (1 + sin^2 th)),
-    th = rate t + phase.
+    """The loop of the paper, a lemniscate.
+
+    center + (ax cos th / (1 + sin^2 th), ay sin th cos th / (1 + sin^2 th)), th = rate t + phase.
 
     The defaults are the fit of the drawn curve; center and amplitude in m, rate in rad/s, phase and
     yaw in rad.
@@ -43,7 +44,10 @@ class Lemniscate(Reference):
 
 
 class FigureEight(Reference):
-    """center + (ax sin th, ay sin 2 th), th = rate t + phase; center and amplitude in m, rate in rad/s."""
+    """center + (ax sin th, ay sin 2 th), th = rate t + phase.
+
+    Center and amplitude are in m, rate in rad/s, phase and yaw in rad.
+    """
 
     center: _Vector = (0.0, 0.0, 1.0)
     amplitude: _Vector = (1.0, 0.5)
@@ -64,7 +68,10 @@ class FigureEight(Reference):
 
 
 class Circle(Reference):
-    """center + radius (cos th, sin th), th = rate t + phase; center and radius in m, rate in rad/s."""
+    """center + radius (cos th, sin th), th = rate t + phase.
+
+    Center and radius are in m, rate in rad/s, phase and yaw in rad.
+    """
 
     center: _Vector = (0.0, 0.0, 1.0)
     radius: float = 1.0

@@ -23,7 +23,10 @@ class Reference(eqx.Module):
         """Return (x, y, z, yaw) at time t, smooth in t."""
 
     def derivatives(self, t: Scalar, order: int, coordinates: Sequence[str]) -> jax.Array:
-        """Return the named coordinates and their first `order` derivatives, (order + 1, len(coordinates))."""
+        """Return the named coordinates and their first `order` derivatives.
+
+        Their shape is (order + 1, len(coordinates)).
+        """
         picked = np.array([COORDINATES.index(name) for name in coordinates])
         return derivatives(lambda s: self(s)[picked], t, order)
 

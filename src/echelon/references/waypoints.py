@@ -14,11 +14,11 @@ from echelon.references.reference import Reference, finite, in_space
 
 
 class Waypoints(Reference):
-    """The spline of degree 7 through `points` at `times`, at rest at both ends and held outside
-    them.
+    """The spline of degree 7 through `points` at `times`, at rest at both ends.
 
-    Its derivatives are continuous up to the sixth, so that a quadrotor can fly it (flatness needs
-    four). The path starts and stops with zero velocity, acceleration and jerk.
+    Before the first time and after the last the ends are held. Its derivatives are continuous up
+    to the sixth, so that a quadrotor can fly it (flatness needs four). The path starts and stops
+    with zero velocity, acceleration and jerk.
 
     Args:
         times: K >= 2 increasing times, s.
@@ -67,7 +67,8 @@ def _check(times: np.ndarray, points: np.ndarray) -> None:
         )
     if points.shape != (len(times), 3) or not np.isfinite(points).all():
         raise ReferenceError(
-            f"`points` of `Waypoints` has shape {points.shape}, and must be {len(times)} finite points (x, y, z)."
+            f"`points` of `Waypoints` has shape {points.shape}, "
+            f"and must be {len(times)} finite points (x, y, z)."
         )
 
 

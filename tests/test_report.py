@@ -1,0 +1,104 @@
+"""The report: its table, and the sentences that say what happened and why."""
+
+import pytest
+
+import echelon as ech
+
+
+def run(scenario, *changes):
+    return ech.run(ech.load_scenario(scenario, list(changes)))
+
+
+@pytest.fixture(scope="module")
+def literal():
+    return run("paper-literal")
+
+
+def test_the_table_stands_beside_the_papers():
+    text = ech.report(run("paper", "simulation.horizon=6"), steady_window=1.0)
+    for printed in ("0.186", "9.289e-17", "7.692e-17", "5.207e-17", "0.0302", "0.018"):
+        assert printed in text
+    assert "multiples of 2^-53" in text
+    assert text.count("follower ") >= 3 and "within 1 cm" in text
+
+
+def test_the_literal_law_names_its_cause(literal):
+    text = " ".join(ech.report(literal).split())
+    assert "The formation error grows: 1.16 m at the start, " in text
+    assert "observability of (A, g^T P) has rank 4 of 12, so 8 directions" in text
+    assert (
+        "The law has no trim input either, so nothing holds the followers against gravity." in text
+    )
+    assert "Warning" not in text and "Assumption 5 fails" in text
+
+
+def test_the_lag_without_feed_forward_is_told():
+    text = " ".join(
+        ech.report(run("paper", "follower.feedforward=none", "simulation.horizon=20")).split()
+    )
+    assert "do not know the leader's motion and lag: 0.0" in text
+    assert "`feedforward: relay` removes the lag" in text
+    assert "Each follower is told: neighbours' states." in text
+
+
+def test_a_broken_symmetry_warns_and_names_the_agent():
+    model, graph = ech.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
+    result = ech.simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
+        leader=ech.Passive(),
+        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        horizon=20.0,
+        dt=0.01,
+    )
+    text = " ".join(ech.report(result).split())
+    assert (
+        "Warning: the offset of agent 1 is no symmetry of `Linear`: it changes the drift of `x1` by up to 1, "
+        "so the agents settle off their goals." in text
+    )
+
+
+def test_coincident_goals_warn():
+    model, graph = ech.SingleIntegrator(2), ech.Graph.path(3)
+    result = ech.simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {1: (1.0, 0.0), 2: (1.0, 0.0)}),
+        leader=ech.Agreement(),
+        follower=ech.Agreement(),
+        horizon=1.0,
+        dt=0.1,
+    )
+    assert result.warnings == ("agents 1 and 2 have the same goal, and would collide there.",)
+
+
+def test_a_weak_coupling_is_named_as_the_cause_of_growth():
+    result = run("paper-line", "follower.gain.coupling=0.5", "simulation.horizon=30")
+    text = " ".join(ech.report(result).split())
+    assert (
+        "Cause: coupling 0.5 is below the edge 2.524 = 1/(2 lambda_min)" in text
+        or "diverged" in text
+    )
+
+
+def test_a_swarm_shows_best_median_and_worst():
+    model, graph = ech.SingleIntegrator(2), ech.Graph.star(30)
+    result = ech.simulate(
+        model,
+        graph,
+        ech.Formation.grid(model, graph),
+        leader=ech.Passive(),
+        follower=ech.Agreement(),
+        initial={"position": 1.0},
+        horizon=2.0,
+        dt=0.1,
+    )
+    text = ech.report(result)
+    for kind in ("best (follower", "median (follower", "worst (follower"):
+        assert kind in text
+
+
+def test_the_unicycles_relay_is_told_to_the_reader():
+    text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
+    assert "Each follower is told: neighbours' states, the leader's input of the same step." in text
