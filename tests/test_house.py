@@ -25,13 +25,13 @@ PACKAGE = ROOT / "src" / "echelon"
 # `__init__`, which loads lazily and so stands on top.
 FLOORS = [
     ["_types", "_errors", "_registry", "_paper", "_provenance"],
-    ["_yaml", "_numerics"],
+    ["_yaml", "_numerics", "_drawing"],
     ["_scenario_values", "models.model", "references.reference", "_graph"],
     ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors"],
     ["_scenario", "models.*", "references.*", "_formation", "_linearization"],
-    ["_certificates"],
+    ["_certificates", "_domain", "models.quadrotor_euler"],
     ["gains.gain", "laws.law"],
-    ["_initial", "_result", "laws.consensus"],
+    ["_initial", "_result", "laws.consensus", "gains.riccati"],
     ["gains.*"],
     ["laws.*", "_simulate", "_synthesize"],
     ["_build", "_metrics", "_lyapunov"],

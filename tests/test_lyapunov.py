@@ -40,7 +40,7 @@ def test_the_rate_is_the_derivative_of_v(leaders):
     result = double_integrators(leaders)
     v = lyapunov(result)
     dt = result.settings.dt
-    # The input is held over a step, so the slope from the right is one-sided: V(t + dt) - V(t) = dt V' + O(dt^2).
+    # The input is held over a step, so the slope is one-sided: V(t + dt) - V(t) = dt V' + O(dt^2).
     slope = np.diff(v.value) / dt
     assert np.abs(slope - v.rate[:-1]).max() < 0.05 * np.abs(v.rate).max()
     finer = double_integrators(leaders, dt=0.0025, store_every=2)

@@ -54,8 +54,8 @@ def test_a_broken_symmetry_warns_and_names_the_agent():
     )
     text = " ".join(ech.report(result).split())
     assert (
-        "Warning: the offset of agent 1 is no symmetry of `Linear`: it changes the drift of `x1` by up to 1, "
-        "so the agents settle off their goals." in text
+        "Warning: the offset of agent 1 is no symmetry of `Linear`: it changes the drift of `x1` "
+        "by up to 1, so the agents settle off their goals." in text
     )
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
     from echelon._simulate import simulate
     from echelon._synthesize import synthesize
-    from echelon.gains import Certificate, Gain, Given, Method, Riccati
+    from echelon.gains import Certificate, Gain, Given, InnerLoop, Method, Riccati
     from echelon.laws import Agreement, Consensus, Law, LocalView, Passive, Tracking
     from echelon.models import (
         ControlAffine,
@@ -63,7 +63,7 @@ _HOMES = {
     "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
     "_simulate": ("simulate",),
     "_synthesize": ("synthesize",),
-    "gains": ("Certificate", "Gain", "Given", "Method", "Riccati"),
+    "gains": ("Certificate", "Gain", "Given", "InnerLoop", "Method", "Riccati"),
     "laws": ("Agreement", "Consensus", "Law", "LocalView", "Passive", "Tracking"),
     "models": (
         "ControlAffine",
@@ -104,6 +104,7 @@ __all__ = [
     "Given",
     "Graph",
     "Hover",
+    "InnerLoop",
     "Law",
     "Lemniscate",
     "Line",

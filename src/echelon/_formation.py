@@ -62,7 +62,7 @@ class Formation:
         """
         full = np.zeros((graph.agents, len(model.state_names)))
         for agent, offset in offsets.items():
-            if not 0 <= agent < graph.agents:
+            if not isinstance(agent, (int, np.integer)) or not 0 <= agent < graph.agents:
                 raise FormationError(
                     f"an offset is given for agent {agent}, "
                     f"and agents are numbered from 0 to {graph.agents - 1}."
@@ -112,7 +112,9 @@ class Formation:
         cls, model: ControlAffine, graph: Graph, spacing: float = 1.0, columns: int | None = None
     ) -> "Formation":
         """Return rows of `columns` agents (near a square unless told), agent 0 at a corner."""
-        columns = columns or int(np.ceil(np.sqrt(graph.agents)))
+        columns = int(np.ceil(np.sqrt(graph.agents))) if columns is None else columns
+        if columns < 1:
+            raise FormationError(f"`columns` of a grid is {columns}, and must be at least 1.")
         number = np.arange(graph.agents)
         return cls._drawn(
             model, graph, np.column_stack([-(number // columns), number % columns]), spacing
@@ -156,7 +158,12 @@ class Formation:
 
         The row of edge (i, j) has (p_i - p_j)^T in block i and its negative in block j.
         """
-        p = self.offsets[:, model.position_indices()]
+        axes = model.position_indices()
+        if not axes:
+            raise FormationError(
+                f"`{type(model).__name__}` has no position, so rigidity has no meaning for it."
+            )
+        p = self.offsets[:, axes]
         matrix = np.zeros((len(graph.edges), *p.shape))
         for row, (i, j) in enumerate(graph.edges):
             matrix[row, i], matrix[row, j] = p[i] - p[j], p[j] - p[i]
@@ -181,10 +188,10 @@ class Formation:
         """Return which agents' offsets change the dynamics, each with one reason; empty if none.
 
         An offset d keeps the formation law exact only if f(x + d) = f(x) and g(x + d) = g(x). Both
-        are tested at random states about the trim, as differences and as Jacobian-vector products,
-        in float64. It is a sampled test, of at most 64 distinct offsets spread over all of them.
+        are compared at random states about the trim, values and Jacobians, in float64. It is a
+        sampled test, of at most 64 distinct offsets spread over all of them.
         """
-        offsets = self.offsets - self.offsets[0]
+        offsets = self.offsets - self.offsets[0] + 0.0  # which makes -0.0 the same as 0.0
         distinct = np.unique(offsets, axis=0)
         tested = distinct[:: max(1, -(-len(distinct) // _TESTED))]
         with precision("float64"):
@@ -234,14 +241,15 @@ def _changes(model: ControlAffine, offset: np.ndarray) -> str | None:
 def _moved(
     model: ControlAffine, states: States, offset: State
 ) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return f and g at states (S, n), each with its change along the offset.
+    """Return f and g at states (S, n), each with what the offset changes of it or of its Jacobian.
 
-    The change is the larger, entry by entry, of the absolute difference and the absolute slope.
+    The change has the shape of f or g.
     """
 
     def change(function: Callable[[State], jax.Array], x: State) -> tuple[jax.Array, jax.Array]:
-        here, slope = jax.jvp(function, (x,), (offset,))
-        return here, jnp.maximum(jnp.abs(function(x + offset) - here), jnp.abs(slope))
+        here, there = function(x), function(x + offset)
+        slopes = jnp.abs(jax.jacfwd(function)(x + offset) - jax.jacfwd(function)(x))
+        return here, jnp.maximum(jnp.abs(there - here), slopes.max(axis=-1))
 
     parts = {"drift": model.drift, "input map": model.input_map}
     return {name: jax.vmap(functools.partial(change, part))(states) for name, part in parts.items()}

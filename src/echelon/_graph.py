@@ -254,15 +254,31 @@ class Exchange(eqx.Module):
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
 
 
-def _split(edges: list[tuple[float, ...]]) -> tuple[list[tuple[float, ...]], list[float]]:
+def _split(edges: list[tuple[float, ...]]) -> tuple[Matrix, Matrix]:
+    """Return pairs (E, 2) of whole numbers and weights (E,)."""
     for edge in edges:
         if len(edge) not in (2, 3):
             raise GraphError(f"an edge is {list(edge)}, and must be [i, j] or [i, j, weight].")
-    return [edge[:2] for edge in edges], [edge[2] if len(edge) == 3 else 1.0 for edge in edges]
+    weights = np.array([edge[2] if len(edge) == 3 else 1.0 for edge in edges], dtype=np.float64)
+    return _whole([edge[:2] for edge in edges], "an edge is").reshape(-1, 2), weights
 
 
-def _count_agents(pairs: list[tuple[float, ...]], agents: int | None) -> int:
-    named = max((int(max(pair)) for pair in pairs), default=0) + 1
+def _whole(values: Sequence[Any], what: str) -> Matrix:
+    """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
+    for value in values:
+        try:
+            numbers = np.asarray(value, dtype=np.float64)
+            fine = bool((numbers == np.round(numbers)).all() and np.isfinite(numbers).all())
+        except (TypeError, ValueError):
+            fine = False
+        if not fine:
+            shown = list(value) if isinstance(value, tuple) else value
+            raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
+    return np.array(values, dtype=np.float64).astype(np.int64)
+
+
+def _count_agents(pairs: Matrix, agents: int | None) -> int:
+    named = int(pairs.max(initial=0)) + 1
     if agents is None:
         agents = named
     _at_least(agents, 2, "graph")
@@ -273,33 +289,30 @@ def _count_agents(pairs: list[tuple[float, ...]], agents: int | None) -> int:
     return agents
 
 
-def _checked_edges(
-    pairs: list[tuple[float, ...]], weights: list[float], agents: int
-) -> tuple[Matrix, Matrix]:
-    seen: set[tuple[int, int]] = set()
-    for pair, weight in zip(pairs, weights, strict=True):
-        i, j = sorted(int(end) for end in pair)
-        if (i, j) != tuple(sorted(pair)) or i < 0:
-            raise GraphError(
-                f"an edge is {list(pair)}, and agents are whole numbers from 0 to {agents - 1}."
-            )
-        if i == j:
-            raise GraphError(
-                f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents."
-            )
-        if (i, j) in seen:
-            raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
-        if not 0.0 < weight < float("inf"):
-            raise GraphError(
-                f"the weight of edge [{i}, {j}] is {weight}, and must be positive and finite."
-            )
-        seen.add((i, j))
-    array = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-    return np.sort(array, axis=1), np.array(weights, dtype=np.float64)
+def _checked_edges(pairs: Matrix, weights: Matrix, agents: int) -> tuple[Matrix, Matrix]:
+    """Return the edges with the smaller agent first, and their weights."""
+    edges = np.sort(pairs, axis=1)
+    for i, j in pairs[edges[:, 0] < 0][:1]:
+        raise GraphError(
+            f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
+        )
+    for i, j in edges[edges[:, 0] == edges[:, 1]][:1]:
+        raise GraphError(
+            f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents."
+        )
+    _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    for i, j in edges[np.sort(first[count > 1])][:1]:
+        raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
+    wrong = ~((weights > 0.0) & (weights < np.inf))
+    for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
+        raise GraphError(
+            f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive and finite."
+        )
+    return edges, weights
 
 
 def _checked_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
-    chosen = tuple(sorted({int(leader) for leader in leaders}))
+    chosen = tuple(sorted(set(_whole(list(leaders), "a leader is").tolist())))
     if not chosen:
         raise GraphError("the graph has no leader; name at least one agent in `leaders`.")
     for leader in chosen:

@@ -13,6 +13,7 @@ from echelon._graph import Graph
 from echelon._numerics import precision
 from echelon._result import Result
 from echelon._types import Matrix
+from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 
 # Below this fraction of its largest value V is made of rounding and its rises mean nothing.
@@ -57,12 +58,8 @@ def lyapunov(result: Result) -> Lyapunov | None:
     if P is None or not len(result.times):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
-        f, xdot = (
-            np.asarray(part)
-            for part in _fields(
-                result.model, jnp.asarray(result.states), jnp.asarray(result.inputs)
-            )
-        )
+        x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
+        f, xdot = (np.asarray(part) for part in _fields(result.follower, result.model, x, u))
         y = result.states - result.formation.offsets
         z, zdot = (_disagreement(result.graph, part) for part in (y, xdot))
         delta = _grounded_inverse(result.graph, z)
@@ -75,9 +72,11 @@ def lyapunov(result: Result) -> Lyapunov | None:
 
 
 @eqx.filter_jit
-def _fields(model: ControlAffine, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the drift about the trim and xdot for x (T, N, n), u (T, N, m)."""
-    over = jax.vmap(jax.vmap(lambda x, u: (model.normalized_drift(x), model.velocity(x, u))))
+def _fields(
+    law: Law, model: ControlAffine, x: jax.Array, u: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the law's drift and xdot for x (T, N, n), u (T, N, m)."""
+    over = jax.vmap(jax.vmap(lambda x, u: (law.drift(model, x), model.velocity(x, u))))
     return over(x, u)
 
 

@@ -161,7 +161,9 @@ def check_settings(settings: Settings) -> None:
             f"`integrator` is `{settings.integrator}`, allowed are {listing(known)}"
             f"{did_you_mean(settings.integrator, known)}."
         )
-    if settings.store_every < 1:
+    if settings.seed != int(settings.seed) or settings.seed < 0:
+        raise SimulationError(f"`seed` is {settings.seed}, and must be a whole number from 0 on.")
+    if settings.store_every != int(settings.store_every) or settings.store_every < 1:
         raise SimulationError(f"`store_every` is {settings.store_every}, and must be at least 1.")
     if settings.precision not in ("float64", "float32"):
         raise SimulationError(
@@ -223,20 +225,21 @@ def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]
 
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
     wanted_l, u_l, memory_l = act(loop.leader, loop.leaders, silence, now.leader_memory)
-    said = _relayed(loop, u_l)
+    said = _relayed(loop, x[loop.leaders], u_l)
     wanted_f, u_f, memory_f = act(loop.follower, loop.followers, said, now.follower_memory)
     u = jnp.concatenate([u_l, u_f])[loop.order]
     limited = jnp.any(u != jnp.concatenate([wanted_l, wanted_f])[loop.order], axis=1)
     return u, limited, memory_l, memory_f
 
 
-def _relayed(loop: Loop, u: Inputs) -> jax.Array:
-    """Return the normalized input that each follower is told, (followers, m)."""
+def _relayed(loop: Loop, x: States, u: Inputs) -> jax.Array:
+    """Return what each follower is told of its leader, (followers, m), from its x and u."""
     if loop.follower.asks() == "none":
         return jnp.zeros((len(loop.followers), u.shape[1]), u.dtype)
     trim = jnp.asarray(loop.model.trim[1], u.dtype)
     v = (u - trim[None]) @ jnp.asarray(loop.normalizer, u.dtype).T
-    return v[loop.sender]
+    told = jax.vmap(loop.follower.message, in_axes=(None, 0, 0))(loop.model, x, v)
+    return told[loop.sender]
 
 
 def step(loop: Loop, now: Moment) -> Moment:

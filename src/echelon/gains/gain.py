@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from echelon._certificates import Certificate
 from echelon._errors import GainError
 from echelon._graph import Graph
-from echelon._types import Matrix
+from echelon._types import Input, Matrix, State
 from echelon.models.model import ControlAffine
 
 Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Matrix
@@ -28,6 +29,7 @@ class Gain(eqx.Module):
         coupling: c > 0.
         method: the name of the synthesis.
         certificate: what is promised.
+        inner: (m, n) feedback K of an inner loop, v = -K (x - x*) + the law above; None without.
 
     Raises:
         GainError: P or R is not symmetric positive definite, or c is not positive.
@@ -39,17 +41,30 @@ class Gain(eqx.Module):
     method: str = eqx.field(static=True)
     certificate: Certificate
     R_inverse: Matrix
+    inner: Matrix | None
 
     def __init__(
-        self, P: Matrix, R: Matrix, coupling: float, method: str, certificate: Certificate
+        self,
+        P: Matrix,
+        R: Matrix,
+        coupling: float,
+        method: str,
+        certificate: Certificate,
+        inner: Matrix | None = None,
     ) -> None:
         """Refuse P or R not symmetric positive definite, and a coupling that is not positive."""
         check_definite("P", P)
         check_definite("R", R)
-        if not 0.0 < coupling < float("inf"):
-            raise GainError(f"`coupling` is {coupling}, and must be positive and finite.")
+        check_coupling(coupling)
         self.P, self.R, self.R_inverse = P, R, np.linalg.inv(R)
         self.coupling, self.method, self.certificate = float(coupling), method, certificate
+        self.inner = inner
+
+    def inner_loop(self, model: ControlAffine, x: State) -> Input:
+        """Return kappa(x) = -K (x - x*), the inner loop; zero without one."""
+        if self.inner is None:
+            return jnp.zeros(len(model.input_names), x.dtype)
+        return -jnp.asarray(self.inner, x.dtype) @ (x - jnp.asarray(model.trim[0], x.dtype))
 
 
 class Method(eqx.Module):
@@ -62,6 +77,16 @@ class Method(eqx.Module):
         Raises:
             GainError: the method does not apply, with the reason.
         """
+
+
+def check_coupling(coupling: float) -> None:
+    """Check that a coupling is positive and finite.
+
+    Raises:
+        GainError: it is not.
+    """
+    if not 0.0 < coupling < float("inf"):
+        raise GainError(f"`coupling` is {coupling}, and must be positive and finite.")
 
 
 def check_definite(name: str, matrix: np.ndarray) -> None:

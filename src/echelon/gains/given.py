@@ -8,7 +8,7 @@ from echelon._certificates import certify
 from echelon._errors import GainError
 from echelon._graph import Graph
 from echelon._linearization import linearize
-from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_definite
+from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
 from echelon.models.model import ControlAffine
 
 
@@ -36,6 +36,7 @@ class Given(Method):
         R = np.eye(m) if self.R is None else as_matrix("R", self.R, m)
         for name, matrix in (("P", P), ("R", R)):
             check_definite(name, matrix)
+        check_coupling(self.coupling)
         certificate = certify(linearize(model), graph, P, R, self.coupling, edge=None)
         return Gain(
             P=P, R=R, coupling=float(self.coupling), method="given", certificate=certificate

@@ -7,7 +7,7 @@ from echelon._errors import GainError
 from echelon._graph import Graph
 from echelon._linearization import Linearization, linearize
 from echelon._numerics import riccati, uncontrollable_modes
-from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_definite
+from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
 from echelon.models.model import ControlAffine
 
 
@@ -43,6 +43,7 @@ class Riccati(Method):
         P = riccati(*linear, Q, R)
         low = float(graph.grounded_spectrum()[0])
         coupling = 1.0 / low if self.coupling is None else float(self.coupling)
+        check_coupling(coupling)
         certificate = certify(linear, graph, P, R, coupling, edge=0.5 / low)
         return Gain(P=P, R=R, coupling=coupling, method="riccati", certificate=certificate)
 

@@ -12,9 +12,9 @@ from echelon.models.model import ControlAffine
 
 
 class Consensus(Law):
-    """u_i = u* + S (v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)).
+    """u_i = u* + S (kappa(x_i) + v_ff - c R^-1 (g(x_i) S)'P (e_i + d_i)).
 
-    It is the paper's law at c = 1, R = I, v_ff = 0.
+    It is the paper's law at c = 1, R = I, v_ff = 0. kappa is the gain's inner loop, if it has one.
 
     Args:
         gain: P, R and c.
@@ -58,7 +58,15 @@ class Consensus(Law):
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
         v = view.feedforward - feedback(self.gain, model, view.x, view.disagreement)
-        return model.physical(v, trim=self.trim), memory
+        return model.physical(v + self.gain.inner_loop(model, view.x), trim=self.trim), memory
+
+    def message(self, model: ControlAffine, x: State, v: Input) -> Input:
+        """Return the leader's input beyond the inner loop, v - kappa(x)."""
+        return v - self.gain.inner_loop(model, x)
+
+    def drift(self, model: ControlAffine, x: State) -> State:
+        """Return the drift with the inner loop closed."""
+        return model.velocity(x, model.physical(self.gain.inner_loop(model, x)))
 
 
 def feedback(gain: Gain, model: ControlAffine, x: State, error: State) -> Input:

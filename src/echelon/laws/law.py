@@ -79,6 +79,18 @@ class Law(eqx.Module):
         """Return one agent's memory before the first step; none unless replaced."""
         return None
 
+    def message(self, model: ControlAffine, x: State, v: Input) -> Input:
+        """Return what followers under this law are told of a leader at x with normalized input v.
+
+        The input itself unless replaced: a law with an inner loop of its own asks for what the
+        leader applies beyond that loop.
+        """
+        return v
+
+    def drift(self, model: ControlAffine, x: State) -> State:
+        """Return xdot (n,) when the disagreement and the feed-forward are zero."""
+        return model.normalized_drift(x)
+
     @abc.abstractmethod
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return one agent's physical input (m,), before actuator limits, and its next memory."""

@@ -6,8 +6,9 @@ It serves the paper's Assumption 4.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from echelon._errors import LawError, listing
+from echelon._errors import LawError, ReferenceError, listing
 from echelon._graph import Graph
 from echelon._types import Input, Scalar, State
 from echelon.gains.gain import Gain
@@ -47,7 +48,13 @@ class Tracking(Law):
             if each is not None:
                 check_gain_fits(self, model, each.P.shape, each.R.shape)
         unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
-        return Tracking(self.reference, unit, self.reaction)
+        law = Tracking(self.reference, unit, self.reaction)
+        if not all(np.isfinite(part).all() for part in _targets(law, model, jnp.zeros(1))):
+            raise ReferenceError(
+                f"the reference `{type(self.reference).__name__}` cannot be followed by "
+                f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
+            )
+        return law
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
@@ -55,11 +62,11 @@ class Tracking(Law):
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""
-        return _targets(self, model, jnp.zeros(1))[0]
+        return _targets(self, model, jnp.zeros(1))[0][0]
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return x_r at each of `times`, (T, n)."""
-        return _targets(self, model, times)
+        return _targets(self, model, times)[0]
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""
@@ -89,6 +96,6 @@ def _check_flat(model: ControlAffine) -> None:
 
 
 @eqx.filter_jit
-def _targets(law: Tracking, model: ControlAffine, times: jax.Array) -> jax.Array:
-    """Return x_r at each of `times`, (T, n)."""
-    return jax.vmap(lambda t: law.target(model, t)[0])(times)
+def _targets(law: Tracking, model: ControlAffine, times: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return x_r (T, n) and u_r (T, m) at each of `times`."""
+    return jax.vmap(lambda t: law.target(model, t))(times)

@@ -27,6 +27,12 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
             f"the model is {model!r}, and must be an instance of a `ControlAffine` class."
         )
     name = type(model).__name__
+    for what, names in (("state_names", model.state_names), ("input_names", model.input_names)):
+        if isinstance(names, str):
+            raise ModelError(
+                f"`{what}` of `{name}` is the text `{names}`, and must be a tuple of names; "
+                f'one name is written ("{names}",).'
+            )
     n, m = len(model.state_names), len(model.input_names)
     if not (n and m):
         raise ModelError(
@@ -64,17 +70,37 @@ def _check_names(model: ControlAffine, name: str) -> None:
 
 
 def _trim(model: ControlAffine, name: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the trim as arrays, after checking the sizes of all constant data."""
-    x, u = (np.atleast_1d(np.asarray(part, float)) for part in model.trim)
-    _check_shape(name, "trim[0]", x.shape, (n,))
-    _check_shape(name, "trim[1]", u.shape, (m,))
-    scale = np.asarray(model.input_scale, float)
-    _check_shape(name, "input_scale", scale.shape, (m, m))
+    """Return the trim as arrays, after checking all constant data."""
+    x, u = _pair(name, "trim", model.trim, n, m)
+    _pair(name, "weights", model.weights, n, m)
+    scale = _numbers(name, "input_scale", model.input_scale, (m, m))
     if np.linalg.cond(scale) > 1e15:
         raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")
-    for part, size, what in zip(model.weights, (n, m), ("weights[0]", "weights[1]"), strict=True):
-        _check_shape(name, what, np.shape(part), (size,))
     return x, u
+
+
+def _pair(name: str, what: str, pair: Any, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return data given as (state, input), after checking both."""
+    if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+        raise ModelError(f"`{what}` of `{name}` is {pair}, and must be a pair (state, input).")
+    return (
+        _numbers(name, f"{what}[0]", pair[0], (n,)),
+        _numbers(name, f"{what}[1]", pair[1], (m,)),
+    )
+
+
+def _numbers(name: str, what: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return constant data as a finite array of the given shape."""
+    try:
+        array = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ModelError(f"`{what}` of `{name}` is {value}, and must be numbers.") from None
+    if len(shape) == 1:
+        array = np.atleast_1d(array)
+    _check_shape(name, what, array.shape, shape)
+    if not np.isfinite(array).all():
+        raise ModelError(f"`{what}` of `{name}` is {value}, and must be finite.")
+    return array
 
 
 def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
@@ -103,13 +129,19 @@ def _with_jacobians(model: ControlAffine, x: jax.Array) -> dict[str, tuple[jax.A
 def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ...]:
     """Return the shape of a model's function, telling apart the errors of the model's own code."""
     try:
-        return jax.eval_shape(lambda x: jnp.asarray(function(x)), jnp.asarray(at)).shape
+        value = jax.eval_shape(function, jnp.asarray(at))
     except Exception as error:
         told = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
         raise ModelError(
             f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {told}; "
             "it must be written with `jax.numpy` and take one agent's state."
         ) from error
+    if not hasattr(value, "shape"):
+        raise ModelError(
+            f"`{what}` of `{name}` returns a {type(value).__name__}, and must return one array, "
+            "such as `jnp.stack([...])` makes."
+        )
+    return value.shape
 
 
 def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, ...]) -> None:

@@ -88,6 +88,15 @@ class ControlAffine(eqx.Module):
     )
     """Diagonals of the default Riccati weights (Q, R), R on normalized inputs; all ones."""
 
+    damping: ClassVar[Rows | None] = None
+    """Feedback K (m, n) of an inner loop v = -K (x - x*) that leaves symmetric states alone."""
+
+    symmetry_weights: ClassVar[tuple[float, ...] | None] = None
+    """Weights of the symmetric states in the P that goes with `damping`, one each."""
+
+    chart: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Open bounds of states outside which the equations do not hold, such as a pitch of 90 deg."""
+
     flat_outputs: ClassVar[tuple[str, ...]] = ()
     """Which of a reference's coordinates (x, y, z, yaw) the model can be told to follow."""
 

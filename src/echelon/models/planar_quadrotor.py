@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon._types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, diagonal, positive
-from echelon.models.rotors import attitude_priority
+from echelon.models.rotors import attitude_priority, fits
 
 # Right and left pairs of motors; each pair counts as one rotor with twice the thrust.
 _LEFT = np.array([1.0, -1.0])
@@ -101,5 +101,5 @@ class PlanarQuadrotor(ControlAffine):
         tilt = u[1] * _LEFT / (2.0 * self.arm)
         wanted = u[0] / 2.0 + tilt
         f = attitude_priority(u[0] / 2.0, tilt, jnp.zeros_like(tilt), self.motor_thrust)
-        fits = jnp.all((wanted >= 0.0) & (wanted <= self.motor_thrust))
-        return jnp.where(fits, u, jnp.stack([jnp.sum(f), self.arm * (_LEFT @ f)]))
+        delivered = jnp.stack([jnp.sum(f), self.arm * (_LEFT @ f)])
+        return jnp.where(fits(wanted, self.motor_thrust), u, delivered)

@@ -3,6 +3,7 @@
 It has the gravity and the thrust rotation that the paper's equations leave out.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,16 +14,17 @@ import numpy as np
 
 from echelon._errors import ModelError, did_you_mean, listing
 from echelon._types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, diagonal, positive
+from echelon.models.model import ControlAffine, Rows, diagonal, positive
 from echelon.models.rigid_body import (
     body_rates,
     check_inertia,
+    check_moments,
     euler_rates,
     free_spin,
     thrust_axis,
     tilt_towards,
 )
-from echelon.models.rotors import attitude_priority
+from echelon.models.rotors import attitude_priority, fits
 
 PARAMETERS: dict[str, dict[str, Any]] = {
     "crazyflie": {"mass": 0.028, "inertia": (16.571710e-6, 16.655602e-6, 29.261652e-6)},
@@ -74,6 +76,7 @@ class Quadrotor(ControlAffine):
     input_units = ("N", "N m", "N m", "N m")
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
+    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
     flat_outputs = ("x", "y", "z", "yaw")
     flat_order = 4
     state_groups = {
@@ -82,6 +85,7 @@ class Quadrotor(ControlAffine):
         "attitude": ("roll", "pitch", "yaw"),
         "rate": ("p", "q", "r"),
     }
+    symmetry_weights = (500.0, 500.0, 50.0)
     weights = ((1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3, (1 / 25,) + (1 / 400,) * 3)
 
     @classmethod
@@ -109,7 +113,7 @@ class Quadrotor(ControlAffine):
         """Refuse parameters that no vehicle can have."""
         names = ("mass", "gravity", "arm", "motor_thrust", "torque_per_thrust")
         positive(self, **{name: getattr(self, name) for name in names})
-        positive(self, **{f"inertia[{k}]": moment for k, moment in enumerate(self.inertia)})
+        check_moments(self, self.inertia)
         if not self.allow_unphysical:
             check_inertia(self.inertia)
 
@@ -117,6 +121,17 @@ class Quadrotor(ControlAffine):
     def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Hover at the origin: thrust m g, no torque."""
         return (0.0,) * 12, (self.mass * self.gravity, 0.0, 0.0, 0.0)
+
+    @property
+    def damping(self) -> Rows:
+        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw; position is left out."""
+        lean, stiff, damp = 1.6 / self.gravity, 60.0, 16.0
+        K = np.zeros((4, 12))
+        K[0, 5] = 2.0
+        K[1, [4, 6, 9]] = -stiff * lean, stiff, damp
+        K[2, [3, 7, 10]] = stiff * lean, stiff, damp
+        K[3, [8, 11]] = 4.0, 4.0
+        return tuple(tuple(float(entry) for entry in row) for row in K)
 
     @property
     def input_scale(self) -> tuple[tuple[float, ...], ...]:
@@ -182,5 +197,4 @@ class Quadrotor(ControlAffine):
             self.torque_per_thrust * (_SPIN @ f),
         ]
         delivered = jnp.stack([jnp.sum(f), *torque])
-        fits = jnp.all((wanted >= 0.0) & (wanted <= self.motor_thrust))
-        return jnp.where(fits, u, delivered)
+        return jnp.where(fits(wanted, self.motor_thrust), u, delivered)

@@ -1,10 +1,12 @@
 """The quadrotor exactly as the paper prints it (literal), kept to show what follows from it."""
 
+import math
+
 import jax.numpy as jnp
 
 from echelon._types import InputMap, Output, State
 from echelon.models.model import ControlAffine, diagonal, positive
-from echelon.models.rigid_body import euler_rates, free_spin
+from echelon.models.rigid_body import check_moments, euler_rates, free_spin
 
 
 class PrintedQuadrotor(ControlAffine):
@@ -28,6 +30,7 @@ class PrintedQuadrotor(ControlAffine):
     input_units = ("N", "N m", "N m", "N m")
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
+    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
     state_groups = {
         "position": ("x", "y", "z"),
         "velocity": ("vx", "vy", "vz"),
@@ -41,7 +44,7 @@ class PrintedQuadrotor(ControlAffine):
         The printed inertia itself is kept on purpose.
         """
         positive(self, mass=self.mass)
-        positive(self, **{f"inertia[{k}]": moment for k, moment in enumerate(self.inertia)})
+        check_moments(self, self.inertia)
 
     @property
     def input_scale(self) -> tuple[tuple[float, ...], ...]:

@@ -7,17 +7,32 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from echelon._errors import ModelError
+from echelon.models.model import positive
+
+
+def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
+    """Check that an inertia is three positive moments.
+
+    Raises:
+        ModelError: it is not.
+    """
+    if not isinstance(inertia, (tuple, list)) or len(inertia) != 3:
+        raise ModelError(
+            f"`inertia` of `{type(owner).__name__}` is {inertia}, and must be three moments "
+            "(Ixx, Iyy, Izz) in kg m^2."
+        )
+    positive(owner, **{f"inertia[{k}]": moment for k, moment in enumerate(inertia)})
 
 
 def check_inertia(inertia: tuple[float, float, float]) -> None:
     """Check that a rigid body can have these principal moments of inertia, kg m^2.
 
     Raises:
-        ModelError: one exceeds the sum of the other two.
+        ModelError: one exceeds the sum of the other two, by more than rounding.
     """
     total = sum(inertia)
     for axis, moment in zip("xyz", inertia, strict=True):
-        if 2.0 * moment > total:
+        if 2.0 * moment > total * (1.0 + 1e-12):
             raise ModelError(
                 f"`inertia` is {tuple(inertia)} kg m^2, and no rigid body has that: "
                 f"I{axis}{axis} = {moment:.6g} exceeds the sum of the other two, "

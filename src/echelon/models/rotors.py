@@ -5,6 +5,7 @@ the torques: the collective gives way first, then yaw, and roll and pitch are sc
 alone do not fit.
 """
 
+import jax
 import jax.numpy as jnp
 
 from echelon._types import Input, Scalar
@@ -16,6 +17,12 @@ def _largest_share(base: Input, extra: Input, maximum: float) -> Scalar:
     growth = extra[:, None] - extra[None, :]
     bound = jnp.where(growth > 0.0, room / jnp.where(growth > 0.0, growth, 1.0), jnp.inf)
     return jnp.clip(jnp.min(bound), 0.0, 1.0)
+
+
+def fits(thrusts: Input, maximum: float) -> jax.Array:
+    """Tell whether all thrusts are within [0, maximum], to the rounding of their computation."""
+    slack = 64.0 * jnp.finfo(thrusts.dtype).eps * maximum
+    return jnp.all((thrusts >= -slack) & (thrusts <= maximum + slack))
 
 
 def attitude_priority(collective: Scalar, tilt: Input, yaw: Input, maximum: float) -> Input:

@@ -1,0 +1,122 @@
+"""Quadrotors under computed torque: the input map becomes constant, which global proofs need.
+
+An inner loop on board cancels the attitude dynamics, so that Euler-angle accelerations become the
+input. Gains made for these agents say what formation laws can promise above such a loop.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from echelon._types import Input, InputMap, Output, State
+from echelon.models.model import ControlAffine, positive
+from echelon.models.quadrotor import Quadrotor
+from echelon.models.rigid_body import body_rates, euler_rates, free_spin, thrust_axis
+
+_GROUPS = {
+    "position": ("x", "y", "z"),
+    "velocity": ("vx", "vy", "vz"),
+    "attitude": ("roll", "pitch", "yaw"),
+    "rate": ("roll_rate", "pitch_rate", "yaw_rate"),
+}
+_NAMES = tuple(name for group in _GROUPS.values() for name in group)
+_UNITS = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
+_WEIGHTS = (1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3
+
+
+class QuadrotorEuler(ControlAffine):
+    """pdot = v, vdot = R(zeta) e3 (g + a) - g e3, zetaddot = input.
+
+    12 states: position (m), velocity (m/s), Euler angles (rad), Euler-angle rates (rad/s). Inputs:
+    thrust over mass minus gravity, a (m/s^2), and Euler-angle accelerations (rad/s^2). The thrust
+    column of g still turns with the attitude; see `QuadrotorThrust` for a constant g.
+    """
+
+    gravity: float = 9.81
+
+    state_names = _NAMES
+    state_units = _UNITS
+    state_groups = _GROUPS
+    input_names = ("thrust", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
+    input_units = ("m/s^2",) + ("rad/s^2",) * 3
+    output_names = ("x", "y", "z", "yaw")
+    position = ("x", "y", "z")
+    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    weights = (_WEIGHTS, (1 / 25,) + (1 / 400,) * 3)
+
+    def __check_init__(self) -> None:
+        """Refuse a gravity that is not positive."""
+        positive(self, gravity=self.gravity)
+
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+        lift = self.gravity * (thrust_axis(x[6:9]) - jnp.array([0.0, 0.0, 1.0], x.dtype))
+        return jnp.concatenate([x[3:6], lift, x[9:12], jnp.zeros(3, x.dtype)])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x); only the thrust column depends on x."""
+        nothing = jnp.zeros((3, 4), x.dtype)
+        lift = jnp.pad(thrust_axis(x[6:9])[:, None], ((0, 0), (0, 3)))
+        spin = jnp.pad(jnp.eye(3, dtype=x.dtype), ((0, 0), (1, 0)))
+        return jnp.concatenate([nothing, lift, nothing, spin])
+
+    def output(self, x: State) -> Output:
+        """Return position and yaw."""
+        return jnp.concatenate([x[:3], x[8:9]])
+
+
+class QuadrotorThrust(ControlAffine):
+    """The same agent with its thrust as a 13th state, so that g is constant.
+
+    pdot = v, vdot = R(zeta) e3 (g + a) - g e3, zetaddot = input, adot = input. The state a is
+    thrust over mass minus gravity (m/s^2); its input is in m/s^3.
+    """
+
+    gravity: float = 9.81
+
+    state_names = (*_NAMES, "thrust")
+    state_units = (*_UNITS, "m/s^2")
+    state_groups = _GROUPS
+    input_names = ("thrust_rate", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
+    input_units = ("m/s^3",) + ("rad/s^2",) * 3
+    output_names = ("x", "y", "z", "yaw")
+    position = ("x", "y", "z")
+    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    weights = ((*_WEIGHTS, 0.04), (1 / 25,) + (1 / 400,) * 3)
+
+    def __check_init__(self) -> None:
+        """Refuse a gravity that is not positive."""
+        positive(self, gravity=self.gravity)
+
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+        up = jnp.array([0.0, 0.0, self.gravity], x.dtype)
+        lift = thrust_axis(x[6:9]) * (self.gravity + x[12]) - up
+        return jnp.concatenate([x[3:6], lift, x[9:12], jnp.zeros(4, x.dtype)])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g, constant."""
+        spin = jnp.pad(jnp.eye(3, dtype=x.dtype), ((0, 0), (1, 0)))
+        thrust = jnp.eye(4, dtype=x.dtype)[:1]
+        return jnp.concatenate([jnp.zeros((9, 4), x.dtype), spin, thrust])
+
+    def output(self, x: State) -> Output:
+        """Return position and yaw."""
+        return jnp.concatenate([x[:3], x[8:9]])
+
+
+def computed_torque(model: Quadrotor, x: State, v: Input) -> Input:
+    """Return the thrust and torques of a quadrotor that realize an input of `QuadrotorEuler`.
+
+    Args:
+        model: the vehicle.
+        x: its state (12,), with body rates.
+        v: (thrust over mass minus gravity, Euler-angle accelerations), (4,).
+    """
+    zeta, omega = x[6:9], x[9:12]
+    zeta_dot = euler_rates(zeta, omega)
+    # omega = W(zeta)^-1 zetadot, differentiated along (zetadot, zetaddot).
+    _, omega_dot = jax.jvp(body_rates, (zeta, zeta_dot), (zeta_dot, v[1:]))
+    torque = jnp.asarray(model.inertia, x.dtype) * (omega_dot - free_spin(model.inertia, omega))
+    return jnp.concatenate([(model.mass * (model.gravity + v[0]))[None], torque])

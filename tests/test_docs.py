@@ -1,0 +1,221 @@
+"""The pages: what they show runs and prints what stands there, what they name and quote is so."""
+
+import contextlib
+import io
+import re
+import shlex
+import sys
+import types
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+import pytest
+
+import echelon as ech
+from echelon import cli
+from echelon._paper import PRINTED
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+RUN = ["README.md", "tutorial.md", "extending.md"]
+
+FENCE = re.compile(
+    r"^(?P<mark><!-- not executed -->\s+)?^```(?P<language>\w+)(?: title=\"(?P<title>[^\"]+)\")?\n"
+    r"(?P<code>.*?)^```$",
+    re.MULTILINE | re.DOTALL,
+)
+LINK = re.compile(r"\]\((?P<target>[^)\s]+)\)")
+NUMBER = re.compile(r"(?<![\w.^-])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)")
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    language: str
+    title: str | None
+    code: str
+    line: int
+    executed: bool
+
+
+def page(name):
+    return next(path for path in PAGES if path.name == name)
+
+
+def blocks(path):
+    text = path.read_text("utf-8")
+    return [
+        Block(
+            found["language"],
+            found["title"],
+            found["code"],
+            text.count("\n", 0, found.start("code")) + 1,
+            found["mark"] is None,
+        )
+        for found in FENCE.finditer(text)
+    ]
+
+
+def prose(path):
+    """The text without its fenced blocks."""
+    return FENCE.sub("", path.read_text("utf-8"))
+
+
+def anchors(path):
+    """The anchors of a page's headings, as the site and the code hosts make them."""
+    titles = re.findall(r"^#+ (.+)$", prose(path), re.MULTILINE)
+    plain = [re.sub(r"[^\w\s-]", "", title.replace("`", "")).strip().lower() for title in titles]
+    return {re.sub(r"[-\s]+", "-", title) for title in plain}
+
+
+def squeezed(text):
+    """The lines of a text that say something, with runs of spaces as one."""
+    return [" ".join(line.split()) for line in text.splitlines() if line.strip()]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with matplotlib.rc_context({"savefig.dpi": 40}):
+        yield tmp_path
+
+
+class Reader:
+    """Someone who types a page's blocks one after the other."""
+
+    def __init__(self, name, monkeypatch):
+        self.name, self.monkeypatch = name, monkeypatch
+        self.module = types.ModuleType(f"page_{name.removesuffix('.md')}")
+        monkeypatch.setitem(sys.modules, self.module.__name__, self.module)
+        self.printed, self.code = "", 0
+
+    def types(self, block):
+        if block.title:
+            Path(block.title).write_text(block.code, "utf-8")
+        if block.language == "python":
+            self.python(block)
+        elif block.language == "console":
+            self.console(block)
+        elif block.language == "text":
+            assert squeezed(self.printed) == squeezed(block.code), self.where(block)
+
+    def where(self, block):
+        return f"{self.name}:{block.line}"
+
+    def python(self, block):
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            exec(compile(block.code, self.where(block), "exec"), self.module.__dict__)
+        self.printed = out.getvalue()
+
+    def console(self, block):
+        """Run each command, and find the lines that stand below it in what it prints, in order."""
+        printed = iter(())
+        for line in squeezed(block.code):
+            if line == "$ echo $?":
+                printed = iter([str(self.code)])
+            elif line.startswith("$ "):
+                printed = iter(squeezed(self.command(line[2:])))
+            elif line != "...":
+                assert line in printed, f"{self.where(block)} does not print: {line}"
+
+    def command(self, line):
+        arguments = shlex.split(line)
+        assert arguments[0] == "echelon", line
+        self.monkeypatch.setattr(sys, "argv", arguments)
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+            with pytest.raises(SystemExit) as left:
+                cli.main()
+        self.code = left.value.code or 0
+        return out.getvalue()
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_every_block_runs_and_prints_what_stands_below_it(name, folder, monkeypatch):
+    reader, done = Reader(name, monkeypatch), 0
+    for block in blocks(page(name)):
+        if block.executed:
+            reader.types(block)
+            done += block.language == "python"
+    assert done
+
+
+def test_few_blocks_are_left_out():
+    left_out = [f"{path.name}:{b.line}" for path in PAGES for b in blocks(path) if not b.executed]
+    assert len(left_out) <= 2, left_out
+
+
+def test_every_scenario_on_the_pages_is_one(folder):
+    """All but the tutorial's `bad.yaml`, whose faults its page shows."""
+    seen = 0
+    for path in PAGES:
+        for block in blocks(path):
+            if block.language == "yaml" and re.search("^name:", block.code, re.MULTILINE):
+                Path("shown.yaml").write_text(block.code, "utf-8")
+                scenario = ech.load_scenario("shown.yaml")
+                assert re.search(f"^name: {scenario.name}$", block.code, re.MULTILINE)
+                seen += 1
+    assert seen >= 3
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_relative_links_and_images_lead_somewhere(path):
+    dead = []
+    for target in LINK.findall(prose(path)):
+        if "://" in target or target.startswith("mailto:"):
+            continue
+        place, _, anchor = target.partition("#")
+        goal = (path.parent / place).resolve() if place else path
+        if not goal.exists() or (anchor and anchor not in anchors(goal)):
+            dead.append(target)
+    assert dead == []
+
+
+def test_the_readme_quotes_the_measured_numbers():
+    """Rows that both pages have say the same, and no number stands in the README alone."""
+    text = page("README.md").read_text("utf-8")
+    part = text.partition("[start:numbers]")[2].partition("[end:numbers]")[0]
+    measured = {row[0]: row[1] for row in rows(page("results.md").read_text("utf-8"))}
+    quoted = {row[0]: row[1] for row in rows(part) if len(row) == 2 and row[0] != "what"}
+    assert len(quoted) >= 5
+    assert quoted == {name: measured.get(name) for name in quoted}
+    known = numbers("\n".join(" ".join(row) for row in measured.items()))
+    known |= {abs(value) for values in PRINTED.values() for value in values}
+    cells = "\n".join(" ".join(row[1:]) for row in rows(part) if row[0][:6] in ("leader", "follow"))
+    assert numbers(cells) - known - {10.0} == set()  # "over the first 10 s"
+
+
+def rows(text):
+    """The cells of every line of a table."""
+    lines = (line for line in text.splitlines() if line.startswith("|"))
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def numbers(text):
+    return {abs(float(number)) for number in NUMBER.findall(text)}
+
+
+def test_the_reference_has_every_public_name_once():
+    named = re.findall(r"^::: echelon\.(\w+)$", page("api.md").read_text("utf-8"), re.MULTILINE)
+    assert sorted(named) == sorted(ech.__all__)
+
+
+def test_the_theory_page_names_tests_that_exist():
+    named = re.findall(r"`(test_\w+)\.py::(test_\w+)`", page("theory.md").read_text("utf-8"))
+    assert len(named) >= 20
+    missing = [
+        f"{file}.py::{test}"
+        for file, test in named
+        if f"def {test}(" not in (ROOT / "tests" / f"{file}.py").read_text("utf-8")
+    ]
+    assert missing == []
+
+
+def test_the_theory_page_has_every_numbered_statement_of_the_paper():
+    text = page("theory.md").read_text("utf-8")
+    table = text.partition("## The paper, statement by statement")[2].partition("\n### ")[0]
+    last = {"Definition": 3, "Assumption": 6, "Lemma": 4, "Theorem": 3, "Algorithm": 1}
+    statements = [(kind, str(k + 1)) for kind, count in last.items() for k in range(count)]
+    for kind, number in [*statements, ("Table", "I"), ("Table", "II")]:
+        assert re.search(rf"\b{kind}s? (\d, )?{number}\b", table), f"{kind} {number}"

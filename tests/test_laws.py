@@ -1,0 +1,278 @@
+"""Control laws: one agent's form is the paper's block form, and Theorem 1 does what it says."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map
+
+from echelon import _numerics
+from echelon._formation import Formation
+from echelon._graph import Graph
+from echelon._simulate import simulate
+from echelon._synthesize import synthesize
+from echelon.gains import Given, Riccati
+from echelon.laws import Agreement, Consensus, LocalView, Passive, Tracking
+from echelon.models import (
+    DoubleIntegrator,
+    Linear,
+    PlanarQuadrotor,
+    Quadrotor,
+    SingleIntegrator,
+    UnicyclePoint,
+)
+from echelon.references import Circle, Hover, Lemniscate, Line
+
+LINE = Graph.path(4)
+QUAD = Quadrotor()
+
+
+def spd(rng, size):
+    root = rng.normal(size=(size, size))
+    return root @ root.T + 0.1 * np.eye(size)
+
+
+def input_of(law, model, *, x, z=None, offset=None, said=None, t=0.0):
+    """The input of one agent that knows what is given, in float64; zeros for what is not."""
+    n, m = len(model.state_names), len(model.input_names)
+    with _numerics.precision("float64"):
+        known = LocalView(
+            t=jnp.asarray(t),
+            x=jnp.asarray(x),
+            offset=jnp.zeros(n) if offset is None else jnp.asarray(offset),
+            disagreement=jnp.zeros(n) if z is None else jnp.asarray(z),
+            feedforward=jnp.zeros(m) if said is None else jnp.asarray(said),
+        )
+        u, memory = law.update(model, known, law.init())
+        assert memory is None
+        return np.asarray(u)
+
+
+def prepared(law, model, graph=LINE):
+    with _numerics.precision("float64"):
+        return law.prepared(model, graph)
+
+
+def input_map_of(model, x):
+    """g at a state, written again."""
+    if isinstance(model, Quadrotor):
+        return quadrotor_input_map(x, model.mass, model.inertia)
+    if isinstance(model, PlanarQuadrotor):
+        push = np.array([-np.sin(x[2]), np.cos(x[2]), 0.0]) / model.mass
+        spin = np.array([0.0, 0.0, 1.0 / model.inertia])
+        return np.vstack([np.zeros((3, 2)), np.column_stack([push, spin])])
+    c, s = np.cos(x[2]), np.sin(x[2])
+    return np.array([[c, -model.ahead * s], [s, model.ahead * c], [0.0, 1.0]])
+
+
+MODELS = [UnicyclePoint(ahead=0.4), PlanarQuadrotor(), QUAD]
+every_model = pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
+
+
+# ---- the paper's law ----
+
+
+@every_model
+@given(connected(most=6), st.integers(0, 10**6))
+@settings(max_examples=8)
+def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
+    edges, leaders, agents = parts
+    graph, rng = Graph.from_edges(*parts), np.random.default_rng(seed)
+    n, m = len(model.state_names), len(model.input_names)
+    x, xi = rng.uniform(-1.0, 1.0, (2, agents, n))
+    P, R, c = spd(rng, n), spd(rng, m), rng.uniform(0.5, 3.0)
+    law = Consensus(synthesize(model, graph, Given(P=P, R=R, coupling=c)))
+    formation = Formation(xi)
+
+    # The block form over followers: u = -c (I kron R^-1) G^T (I kron P) (e + d), in normalized
+    # inputs, with e from the follower rows of the Laplacian and d from the displacements.
+    pairs, weights = [edge[:2] for edge in edges], [edge[2] for edge in edges]
+    rows = [k for k in range(agents) if k not in leaders]
+    L = laplacian(agents, pairs, weights)[rows]
+    e = np.kron(L, np.eye(n)) @ x.ravel()
+    d = formation.local_displacements(graph)[rows].ravel()
+    S, trim = np.array(model.input_scale), np.array(model.trim[1])
+    G = scipy.linalg.block_diag(*[input_map_of(model, x[k]) @ S for k in rows])
+    blocks = np.kron(np.eye(len(rows)), np.linalg.inv(R)) @ G.T @ np.kron(np.eye(len(rows)), P)
+    v = (-c * blocks @ (e + d)).reshape(-1, m)
+
+    with _numerics.precision("float64"):
+        z = np.asarray(graph.disagreement(jnp.asarray(x - xi)))
+    for k, wanted in zip(rows, v, strict=True):
+        u = input_of(law, model, x=x[k], z=z[k], offset=xi[k])
+        assert np.linalg.solve(S, u - trim) == pytest.approx(wanted, rel=1e-9, abs=1e-9)
+
+
+def test_at_unit_coupling_and_weight_it_is_the_printed_law():
+    model, rng = Linear(np.eye(2), [[1.0, 0.5], [0.0, 2.0]]), np.random.default_rng(0)
+    P = spd(rng, 2)
+    law = Consensus(synthesize(model, LINE, Given(P=P)))
+    z = rng.normal(size=2)
+    wanted = -np.array([[1.0, 0.0], [0.5, 2.0]]) @ P @ z
+    assert input_of(law, model, x=np.ones(2), z=z) == pytest.approx(wanted)
+
+
+def test_on_a_quadrotor_the_printed_law_is_weighted_by_the_squares_of_its_scale():
+    law = Consensus(synthesize(QUAD, LINE, Given()), trim=False)
+    x, z = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 12))
+    S = np.diag([QUAD.mass, *QUAD.inertia])
+    wanted = -S @ S @ quadrotor_input_map(x, QUAD.mass, QUAD.inertia).T @ z
+    assert input_of(law, QUAD, x=x, z=z) == pytest.approx(wanted, rel=1e-9, abs=1e-18)
+
+
+@every_model
+def test_the_trim_and_what_the_leader_says_are_added(model):
+    gain = synthesize(model, LINE, Given(coupling=2.0))
+    rng = np.random.default_rng(2)
+    n, m = len(model.state_names), len(model.input_names)
+    x, z, said = rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), rng.uniform(-1, 1, m)
+    S, trim = np.array(model.input_scale), np.array(model.trim[1])
+    bare = input_of(Consensus(gain, trim=False), model, x=x, z=z)
+    assert input_of(Consensus(gain), model, x=x, z=z) == pytest.approx(bare + trim, rel=1e-12)
+    told = input_of(Consensus(gain, feedforward="relay"), model, x=x, z=z, said=said)
+    assert told == pytest.approx(bare + trim + S @ said, rel=1e-12)
+    assert input_of(Consensus(gain), model, x=x) == pytest.approx(trim, abs=1e-15)
+
+
+def test_a_law_says_what_it_needs_from_others():
+    gain = synthesize(QUAD, LINE, Given())
+    others, leader = "neighbours' states", "the leader's input of the same step"
+    assert Consensus(gain).needs == (others,)
+    assert Consensus(gain, feedforward="relay").needs == (others, leader)
+    assert Agreement().needs == (others,) and Passive().needs == ()
+    assert Tracking(Hover()).needs == ("the reference",)
+    assert Tracking(Hover(), reaction=gain).needs == ("the reference", others)
+    asked = [Consensus(gain).asks(), Consensus(gain, "relay").asks(), Passive().asks()]
+    assert asked == ["none", "relay", "none"]
+
+
+def test_laws_carry_the_metric_of_their_lyapunov_function():
+    gain = synthesize(QUAD, LINE, Riccati())
+    assert np.array_equal(Consensus(gain).metric(QUAD), gain.P)
+    assert np.array_equal(Agreement().metric(SingleIntegrator(2)), np.eye(2))
+    assert Passive().metric(QUAD) is None and Tracking(Hover()).metric(QUAD) is None
+
+
+# ---- the leader's law ----
+
+
+@pytest.mark.parametrize("reacts", [False, True])
+def test_the_leader_tracks_with_unit_coupling_and_reacts_with_the_followers_gain(reacts):
+    rng = np.random.default_rng(3)
+    model = DoubleIntegrator(2, drag=0.4)
+    P, R, Pr, Rr = spd(rng, 4), spd(rng, 2), spd(rng, 4), spd(rng, 2)
+    gain = synthesize(model, LINE, Given(P=P, R=R, coupling=7.0))
+    reaction = synthesize(model, LINE, Given(P=Pr, R=Rr, coupling=3.0)) if reacts else None
+    path = Circle(center=(1.0, 0.0, 0.0), radius=2.0, rate=0.5)
+    law = prepared(Tracking(path, gain, reaction), model)
+
+    t, (x, z, offset) = 1.3, rng.normal(size=(3, 4))
+    th = 0.5 * t
+    p = np.array([1.0 + 2.0 * np.cos(th), 2.0 * np.sin(th)])
+    v, a = np.array([-np.sin(th), np.cos(th)]), -0.5 * np.array([np.cos(th), np.sin(th)])
+    x_r, u_r = np.concatenate([p, v]), a + 0.4 * v
+    g = np.vstack([np.zeros((2, 2)), np.eye(2)])
+    wanted = u_r - np.linalg.solve(R, g.T @ P @ (x - x_r - offset))
+    if reacts:
+        wanted = wanted - 3.0 * np.linalg.solve(Rr, g.T @ Pr @ z)
+    assert input_of(law, model, x=x, z=z, offset=offset, t=t) == pytest.approx(wanted)
+
+
+def test_a_leader_on_its_reference_flies_the_feedforward_alone():
+    law = prepared(Tracking(Lemniscate()), QUAD)
+    with _numerics.precision("float64"):
+        x, u = map(np.asarray, law.target(QUAD, jnp.asarray(2.0)))
+    assert input_of(law, QUAD, x=x, t=2.0) == pytest.approx(u, abs=1e-15)
+    assert u[0] > 0.0
+
+
+def test_a_tracking_gain_is_the_model_s_riccati_gain_unless_given():
+    law = prepared(Tracking(Hover()), QUAD)
+    assert np.array_equal(law.gain.P, synthesize(QUAD, LINE, Riccati()).P)
+    assert law.gain.coupling == 1.0
+
+
+def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():
+    model = UnicyclePoint(ahead=0.4)
+    law = prepared(Tracking(Circle(), synthesize(model, LINE, Given())), model)
+    with _numerics.precision("float64"):
+        x = np.asarray(law.target(model, jnp.asarray(0.3))[0]) + [0.1, 0.2, 0.3]
+    turned = x + [0.0, 0.0, 4.0 * np.pi]
+    once = input_of(law, model, x=x, t=0.3)
+    assert input_of(law, model, x=turned, t=0.3) == pytest.approx(once, abs=1e-12)
+
+
+def test_a_leader_starts_where_its_law_says():
+    with _numerics.precision("float64"):
+        assert np.asarray(Passive().start(QUAD)).tolist() == [0.0] * 12
+        start = np.asarray(Tracking(Line((1, 2, 3), (0.5, 0, 0))).start(QUAD))
+        rows = np.asarray(Tracking(Line()).reference_states(QUAD, jnp.array([0.0, 2.0])))
+    assert start == pytest.approx([1, 2, 3, 0.5, *[0.0] * 8])
+    assert rows[:, :4] == pytest.approx(np.array([[0, 0, 1, 1], [2, 0, 1, 1]]))
+
+
+def test_the_passive_law_is_the_trim():
+    assert input_of(Passive(), QUAD, x=np.ones(12)) == pytest.approx([0.028 * 9.81, 0, 0, 0])
+
+
+# ---- what an agent may know ----
+
+
+@given(connected(most=6), st.integers(0, 10**6))
+@settings(max_examples=10)
+def test_an_agent_hears_its_neighbours_and_nobody_else(parts, seed):
+    graph, rng = Graph.from_edges(*parts), np.random.default_rng(seed)
+    y = rng.normal(size=(graph.agents, 2))
+    moved = int(rng.integers(graph.agents))
+    there = y.copy()
+    there[moved] += 1.0
+    with _numerics.precision("float64"):
+        before, after = (np.asarray(graph.disagreement(jnp.asarray(v))) for v in (y, there))
+    changed = {k for k in range(graph.agents) if not np.array_equal(before[k], after[k])}
+    assert changed == {moved, *graph.neighbours(moved)}
+
+
+# ---- Theorem 1 ----
+
+
+def test_theorem_1_all_agents_settle_at_the_mean_of_their_starts():
+    edges = [(0, 1, 2.0), (1, 2, 1.0), (2, 3, 0.5), (0, 3, 1.0)]
+    graph, model = Graph(edges), SingleIntegrator(2)
+    rng = np.random.default_rng(4)
+    x0, xi = rng.normal(size=(2, 4, 2))
+    law = Agreement()
+    run = simulate(
+        model, graph, Formation(xi), leader=law, follower=law, initial=x0, horizon=25.0, dt=0.01
+    )
+    tau = (x0 - xi).mean(axis=0)
+    assert run.states[-1] - xi == pytest.approx(np.tile(tau, (4, 1)), abs=1e-9)
+    # On the way the mean stays, and each step is that of x + dt u exactly.
+    assert (run.states - xi).mean(axis=1) == pytest.approx(np.tile(tau, (len(run.times), 1)))
+    L = laplacian(4, [e[:2] for e in edges], [e[2] for e in edges])
+    wanted = np.linalg.matrix_power(np.eye(4) - 0.01 * L, 100) @ (x0 - xi)
+    assert run.states[100] - xi == pytest.approx(wanted, abs=1e-12)
+
+
+def test_the_corollary_s_sign_is_wrong_the_error_that_vanishes_is_e_plus_d():
+    graph, model = Graph.path(3), SingleIntegrator(2)
+    xi = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    law = Agreement()
+    run = simulate(
+        model,
+        graph,
+        Formation(xi),
+        leader=law,
+        follower=law,
+        initial={"position": 1.0},
+        horizon=30.0,
+        dt=0.02,
+        store_every=10,
+    )
+    A = adjacency(3, graph.edges)
+    e = disagreements(A, run.states[-1], np.zeros_like(xi))
+    d = disagreements(A, np.zeros_like(xi), xi)
+    assert np.abs(d).max() == 1.0
+    assert e + d == pytest.approx(np.zeros((3, 2)), abs=1e-9)
+    assert d - e == pytest.approx(2.0 * d, abs=1e-9)

@@ -1,0 +1,290 @@
+"""What is said of a malformed agent, once, when it enters `synthesize` or `simulate`."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_models import FAMILY
+
+from echelon import _numerics
+from echelon._errors import EchelonError, ModelError
+from echelon._formation import Formation
+from echelon._graph import Graph
+from echelon._simulate import simulate
+from echelon._synthesize import synthesize
+from echelon.gains import Given
+from echelon.laws import Passive
+from echelon.models import ControlAffine, SingleIntegrator
+from echelon.models.check import check_model
+
+NAN = float("nan")
+
+
+class Tank(ControlAffine):
+    """A sound agent, which every test here spoils in one way."""
+
+    state_names = ("upper", "lower")
+    input_names = ("inflow",)
+
+    def drift(self, x):
+        return jnp.stack([-x[0], x[0] - x[1]])
+
+    def input_map(self, x):
+        return jnp.array([[1.0], [0.0]])
+
+
+def spoiled(**changes):
+    """The agent `Tank` with attributes or methods replaced."""
+    return type("Tank", (Tank,), {"__module__": __name__, "__doc__": "Spoiled.", **changes})()
+
+
+def checked(model):
+    with _numerics.precision("float64"):
+        return check_model(model)
+
+
+def told(model):
+    """The sentence that refuses a model."""
+    with pytest.raises(ModelError) as caught:
+        checked(model)
+    sentence = str(caught.value)
+    assert "\n" not in sentence and sentence.endswith(".") and caught.value.exit_code == 2
+    return sentence
+
+
+@pytest.mark.parametrize("model", [*FAMILY.values(), Tank()], ids=[*FAMILY, "tank"])
+def test_sound_agents_pass_without_a_word(model):
+    assert checked(model) == ()
+
+
+def of_two_names(self, x):
+    return x[:1]
+
+
+SENTENCES = {
+    "no inputs": (
+        {"input_names": ()},
+        "`Tank` has 2 state names and 0 input names, and needs at least one of each.",
+    ),
+    "no states": (
+        {"state_names": ()},
+        "`Tank` has 0 state names and 1 input names, and needs at least one of each.",
+    ),
+    "a name twice": (
+        {"state_names": ("level", "level")},
+        "`state_names` of `Tank` repeats a name: `level`, `level`.",
+    ),
+    "a position that is no state": (
+        {"position": ("uper",)},
+        "`position` of `Tank` names `uper`, which is no state; the states are `upper`, `lower` "
+        "(did you mean `upper`?).",
+    ),
+    "a group of strangers": (
+        {"state_groups": {"levels": ("upper", "x")}},
+        "`state_groups['levels']` of `Tank` names `x`, which is no state; the states are "
+        "`upper`, `lower`.",
+    ),
+    "too few state units": (
+        {"state_units": ("m",)},
+        "`state_units` of `Tank` has 1 entries, and must have 2.",
+    ),
+    "too many input units": (
+        {"input_units": ("l/s", "l/s")},
+        "`input_units` of `Tank` has 2 entries, and must have 1.",
+    ),
+    "a short trim state": (
+        {"trim": ((0.0,), (0.0,))},
+        "`trim[0]` of `Tank` has shape (1,), and must have shape (2,).",
+    ),
+    "a long trim input": (
+        {"trim": ((0.0, 0.0), (0.0, 0.0))},
+        "`trim[1]` of `Tank` has shape (2,), and must have shape (1,).",
+    ),
+    "a scale of another size": (
+        {"input_scale": ((1.0, 0.0), (0.0, 1.0))},
+        "`input_scale` of `Tank` has shape (2, 2), and must have shape (1, 1).",
+    ),
+    "a singular scale": (
+        {"input_scale": ((0.0,),)},
+        "`input_scale` of `Tank` is singular, and must be invertible.",
+    ),
+    "short weights": (
+        {"weights": ((1.0,), (1.0,))},
+        "`weights[0]` of `Tank` has shape (1,), and must have shape (2,).",
+    ),
+    "weights of too many inputs": (
+        {"weights": ((1.0, 1.0), (1.0, 2.0))},
+        "`weights[1]` of `Tank` has shape (2,), and must have shape (1,).",
+    ),
+    "a short drift": (
+        {"drift": of_two_names},
+        "`drift` of `Tank` has shape (1,), and must have shape (2,).",
+    ),
+    "a scalar drift": (
+        {"drift": lambda self, x: x[0]},
+        "`drift` of `Tank` has shape (), and must have shape (2,).",
+    ),
+    "an input map that is a vector": (
+        {"input_map": lambda self, x: jnp.array([1.0, 0.0])},
+        "`input_map` of `Tank` has shape (2,), and must have shape (2, 1).",
+    ),
+    "an input map that lies down": (
+        {"input_map": lambda self, x: jnp.array([[1.0, 0.0]])},
+        "`input_map` of `Tank` has shape (1, 2), and must have shape (2, 1).",
+    ),
+    "an output without its names": (
+        {"output": of_two_names},
+        "`output` of `Tank` has shape (1,), and must have shape (2,).",
+    ),
+    "a limit of another size": (
+        {"limit": lambda self, u: jnp.zeros(3)},
+        "`limit` of `Tank` has shape (3,), and must have shape (1,).",
+    ),
+    "a drift without a value": (
+        {"drift": lambda self, x: jnp.log(x)},
+        "`drift` of `Tank` is not finite at the trim [0.0, 0.0].",
+    ),
+    "a drift without a slope": (
+        {"drift": lambda self, x: jnp.sqrt(x)},
+        "the Jacobian of `drift` of `Tank` is not finite at the trim [0.0, 0.0].",
+    ),
+    "an input map without a slope": (
+        {"input_map": lambda self, x: jnp.sqrt(x)[:, None]},
+        "the Jacobian of `input_map` of `Tank` is not finite at the trim [0.0, 0.0].",
+    ),
+    "an output without a value": (
+        {"output": lambda self, x: 1.0 / x},
+        "`output` of `Tank` is not finite at the trim [0.0, 0.0].",
+    ),
+    "a trim that is no equilibrium": (
+        {"trim": ((0.5, 0.5), (0.25,))},
+        "the trim of `Tank` is no equilibrium: f(x*) + g(x*) u* is -0.25 in state `upper`, and "
+        "must be within 1e-09 of zero; replace `trim`.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SENTENCES)
+def test_each_fault_has_its_sentence(name):
+    changes, sentence = SENTENCES[name]
+    assert told(spoiled(**changes)) == sentence
+
+
+def test_a_trim_within_the_tolerance_passes():
+    assert checked(spoiled(trim=((0.5, 0.5), (0.5 + 5e-10,)))) == ()
+    assert "no equilibrium" in told(spoiled(trim=((0.5, 0.5), (0.5 + 5e-9,))))
+
+
+FAILING = {
+    "numpy": (lambda self, x: np.sin(x[0]) * x, "TracerArrayConversionError"),
+    "a branch": (lambda self, x: x if x[0] > 0 else -x, "TracerBoolConversionError"),
+    "a wrong name": (lambda self, x: x * self.inflw, "AttributeError"),
+    "a wrong index": (lambda self, x: {}["level"], "KeyError"),
+}
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_errors_inside_an_agent_s_own_code_are_told_with_their_kind(name):
+    drift, kind = FAILING[name]
+    sentence = told(spoiled(drift=drift))
+    assert sentence.startswith(f"`drift` of `Tank` fails at the trim with {kind}: ")
+    assert sentence.endswith("; it must be written with `jax.numpy` and take one agent's state.")
+
+
+REFUSED = {
+    "a trim input that is no number": ({"trim": ((0.0, 0.0), (NAN,))}, "`trim"),
+    "a trim state that is no number": ({"trim": ((NAN, 0.0), (0.0,))}, "nan"),
+    "a scale that is no number": ({"input_scale": ((NAN,),)}, "`input_scale`"),
+    "weights that are no numbers": ({"weights": ((NAN, 1.0), (1.0,))}, "`weights[0]`"),
+    "half a trim": ({"trim": ((0.0, 0.0),)}, "`trim`"),
+    "half of the weights": ({"weights": ((1.0, 1.0),)}, "`weights`"),
+    "a drift that is a list": ({"drift": lambda self, x: [-x[0], x[1]]}, "`drift`"),
+    "an input map that is a list": ({"input_map": lambda self, x: [[1.0], [0.0]]}, "`input_map`"),
+    "a forgotten comma": ({"input_names": ("inflow")}, "`input_names`"),
+    "another forgotten comma": ({"state_names": ("ab")}, "`state_names`"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_work_is_refused_by_name(name):
+    changes, fragment = REFUSED[name]
+    assert fragment in told(spoiled(**changes))
+
+
+def test_an_input_map_of_whole_numbers_works():
+    model = spoiled(input_map=lambda self, x: jnp.array([[1], [0]]))
+    assert checked(model) == ()
+
+
+@pytest.mark.parametrize("thing", [Tank, "tank", None, 3.0], ids=str)
+def test_what_is_no_agent_is_refused(thing):
+    sentence = told(thing)
+    assert (
+        sentence == f"the model is {thing!r}, and must be an instance of a `ControlAffine` class."
+    )
+
+
+def test_both_verbs_check_the_agent_they_are_given():
+    model = spoiled(trim=((0.5, 0.5), (0.25,)))
+    graph = Graph.path(2)
+    with pytest.raises(EchelonError, match="is no equilibrium"):
+        synthesize(model, graph, Given())
+    with pytest.raises(EchelonError, match="is no equilibrium"):
+        simulate(
+            model,
+            graph,
+            Formation(np.zeros((2, 2))),
+            leader=Passive(),
+            follower=Passive(),
+            horizon=1.0,
+            dt=0.1,
+        )
+
+
+class Tuned(Tank):
+    """An agent whose parameter may be an array."""
+
+    outflow: np.ndarray | jnp.ndarray | float = 1.0
+
+
+def test_parameters_that_jax_has_rounded_are_warned_of_and_others_are_not():
+    (warning,) = checked(Tuned(outflow=jnp.asarray(0.1, jnp.float32)))
+    assert warning == (
+        "`outflow` of `Tuned` is a float32 array, so its values carry only 7 digits; keep "
+        "parameters as Python numbers or float64 NumPy arrays."
+    )
+    assert checked(Tuned(outflow=np.array(0.1))) == () == checked(Tuned(outflow=0.1))
+    run = simulate(
+        Tuned(outflow=jnp.asarray(0.1, jnp.float32)),
+        Graph.path(2),
+        Formation(np.zeros((2, 2))),
+        leader=Passive(),
+        follower=Passive(),
+        horizon=0.1,
+        dt=0.1,
+    )
+    assert warning in run.warnings
+
+
+def test_names_of_states_and_groups_are_asked_for_by_name():
+    model = spoiled(state_groups={"levels": ("upper", "lower")})
+    assert model.states_called("levels") == (0, 1) and model.states_called("lower") == (1,)
+    with pytest.raises(ModelError) as caught:
+        model.states_called("uper")
+    assert str(caught.value) == (
+        "`uper` is no state or group of `Tank`, which has `levels`, `upper`, `lower` "
+        "(did you mean `upper`?)."
+    )
+
+
+def test_an_agent_without_a_flat_map_says_how_to_go_on():
+    with pytest.raises(ModelError) as caught:
+        Tank().flat(jnp.zeros((1, 1)))
+    assert str(caught.value) == (
+        "model `Tank` cannot track a reference since it defines no `flat`; use the law `passive` "
+        "for its leader, or add `flat_outputs`, `flat_order` and `flat`."
+    )
+
+
+def test_a_sound_agent_needs_no_trim_of_its_own():
+    assert checked(SingleIntegrator(2)) == ()
+    assert checked(spoiled(trim=((0.0, 0.0), (0.0,)))) == ()
