@@ -383,7 +383,7 @@ GAINS = {
     "a pair that cannot be stabilized": (
         lambda: synthesize(Linear([[0.3]], [[0.0]], names=["heat"]), PAIR, Riccati()),
         "the linearization of `Linear` at its trim cannot be stabilized: no input moves the mode "
-        "at 0.3+0j 1/s, which lies along `heat`; give the gain yourself (method `given`) or "
+        "at 0.3 1/s, which lies along `heat`; give the gain yourself (method `given`) or "
         "choose another model of the vehicle.",
     ),
 }

@@ -196,7 +196,7 @@ def test_the_mode_of_a_unicycle_that_no_input_moves_is_named():
         synthesize(Unicycle(), LINE, Riccati())
     assert str(caught.value) == (
         "the linearization of `Unicycle` at its trim cannot be stabilized: no input moves the mode "
-        "at 0+0j 1/s, which lies along `y`; give the gain yourself (method `given`) or choose "
+        "at 0 1/s, which lies along `y`; give the gain yourself (method `given`) or choose "
         "another model of the vehicle."
     )
     with pytest.raises(GainError, match="no input moves the mode"):
@@ -208,8 +208,16 @@ def test_an_uncontrollable_mode_that_decays_by_itself_is_no_obstacle():
     gain = synthesize(model, LINE, Riccati())
     assert gain.certificate.stable
     unstable = Linear([[0.5, 0.0], [0.0, 1.0]], [[0.0], [1.0]], names=["drifting", "driven"])
-    with pytest.raises(GainError, match=r"mode at 0\.5\+0j 1/s, which lies along `drifting`"):
+    with pytest.raises(GainError, match=r"mode at 0\.5 1/s, which lies along `drifting`"):
         synthesize(unstable, LINE, Riccati())
+
+
+def test_a_swinging_mode_that_no_input_moves_is_named_as_a_pair():
+    model = Linear([[0.0, 2.0], [-2.0, 0.0]], [[0.0], [0.0]], names=["left", "right"])
+    with pytest.raises(
+        GainError, match=r"mode at -?0 \+- 2i 1/s, which lies along `left`, `right`"
+    ):
+        synthesize(model, LINE, Riccati())
 
 
 def test_a_position_without_weight_cannot_be_held():

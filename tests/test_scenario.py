@@ -133,7 +133,7 @@ def test_defaults():
             "store_every": 1,
             "precision": "float64",
         },
-        "report": {"steady_window": 5.0},
+        "report": {"steady_window": 6.0},
         "seed": 0,
     }
 
@@ -146,12 +146,13 @@ def test_a_leader_with_a_reference_tracks_it_by_default(load):
 def test_sections_that_are_empty_take_their_defaults(load):
     scenario = load(formation="formation:", report="report:", initial="initial:")
     assert scenario.formation.offsets is None and scenario.initial.spread is None
-    assert scenario.report.steady_window == 10.0
+    assert scenario.report.steady_window == 12.0
 
 
-def test_the_steady_window_is_clipped_to_the_horizon(load):
-    assert load("simulation.horizon=2").report.steady_window == 2.0
-    assert load("simulation.horizon=600", report="report: {}").report.steady_window == 100.0
+def test_a_steady_window_not_shorter_than_the_run_is_a_fifth_of_it(load):
+    assert load("simulation.horizon=10").report.steady_window == 2.0
+    assert load("simulation.horizon=10.5").report.steady_window == 10.0
+    assert load("simulation.horizon=600", report="report: {}").report.steady_window == 120.0
 
 
 @pytest.mark.parametrize(
@@ -205,7 +206,7 @@ def test_the_tables_of_choices_cover_the_registry():
     checks = echelon._scenario_checks
     assert set(checks._GRAPH_KEYS) == {"edges", *GRAPHS}
     assert set(checks._FORMATION_KEYS) == {"offsets", *FORMATIONS}
-    assert set(checks._GAIN_KEYS) == set(METHODS)
+    assert set(checks._GAIN_KEYS) == {*METHODS, "file"}
 
 
 def test_yaml_1_2_decides_what_a_word_is(load, refused):

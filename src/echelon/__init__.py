@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from echelon._archive import dataset, save_dataset, summary
     from echelon._build import build, run
+    from echelon._domain import Domain
     from echelon._errors import EchelonError, Outcome
     from echelon._formation import Formation
+    from echelon._gain_file import load_gain, save_gain
     from echelon._graph import Graph
     from echelon._lyapunov import Lyapunov, lyapunov
     from echelon._metrics import Metrics, metrics
@@ -22,7 +24,18 @@ if TYPE_CHECKING:
     from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
     from echelon._simulate import simulate
     from echelon._synthesize import synthesize
-    from echelon.gains import Certificate, Gain, Given, InnerLoop, Method, Riccati
+    from echelon.gains import (
+        Certificate,
+        Contraction,
+        Gain,
+        Given,
+        InnerLoop,
+        Method,
+        Monotone,
+        Region,
+        Riccati,
+        RobustLQR,
+    )
     from echelon.laws import Agreement, Consensus, Law, LocalView, Passive, Tracking
     from echelon.models import (
         ControlAffine,
@@ -32,6 +45,8 @@ if TYPE_CHECKING:
         PlanarQuadrotor,
         PrintedQuadrotor,
         Quadrotor,
+        QuadrotorEuler,
+        QuadrotorThrust,
         SingleIntegrator,
         Unicycle,
         UnicyclePoint,
@@ -52,8 +67,10 @@ __version__ = "0.1.0"
 _HOMES = {
     "_archive": ("dataset", "save_dataset", "summary"),
     "_build": ("build", "run"),
+    "_domain": ("Domain",),
     "_errors": ("EchelonError", "Outcome"),
     "_formation": ("Formation",),
+    "_gain_file": ("load_gain", "save_gain"),
     "_graph": ("Graph",),
     "_lyapunov": ("Lyapunov", "lyapunov"),
     "_metrics": ("Metrics", "metrics"),
@@ -63,7 +80,18 @@ _HOMES = {
     "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
     "_simulate": ("simulate",),
     "_synthesize": ("synthesize",),
-    "gains": ("Certificate", "Gain", "Given", "InnerLoop", "Method", "Riccati"),
+    "gains": (
+        "Certificate",
+        "Contraction",
+        "Gain",
+        "Given",
+        "InnerLoop",
+        "Method",
+        "Monotone",
+        "Region",
+        "Riccati",
+        "RobustLQR",
+    ),
     "laws": ("Agreement", "Consensus", "Law", "LocalView", "Passive", "Tracking"),
     "models": (
         "ControlAffine",
@@ -73,6 +101,8 @@ _HOMES = {
         "PlanarQuadrotor",
         "PrintedQuadrotor",
         "Quadrotor",
+        "QuadrotorEuler",
+        "QuadrotorThrust",
         "SingleIntegrator",
         "Unicycle",
         "UnicyclePoint",
@@ -95,7 +125,9 @@ __all__ = [
     "Certificate",
     "Circle",
     "Consensus",
+    "Contraction",
     "ControlAffine",
+    "Domain",
     "DoubleIntegrator",
     "EchelonError",
     "FigureEight",
@@ -113,15 +145,20 @@ __all__ = [
     "Lyapunov",
     "Method",
     "Metrics",
+    "Monotone",
     "Outcome",
     "Passive",
     "Pendulum",
     "PlanarQuadrotor",
     "PrintedQuadrotor",
     "Quadrotor",
+    "QuadrotorEuler",
+    "QuadrotorThrust",
     "Reference",
+    "Region",
     "Result",
     "Riccati",
+    "RobustLQR",
     "Scenario",
     "SingleIntegrator",
     "Tracking",
@@ -133,6 +170,7 @@ __all__ = [
     "bundled_scenarios",
     "dataset",
     "figures",
+    "load_gain",
     "load_scenario",
     "lyapunov",
     "metrics",
@@ -140,6 +178,7 @@ __all__ = [
     "run",
     "save_dataset",
     "save_figures",
+    "save_gain",
     "scenario_from_mapping",
     "simulate",
     "summary",

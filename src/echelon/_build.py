@@ -13,13 +13,21 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from echelon import _registry
-from echelon._errors import EchelonError, ModelError, ScenarioError, did_you_mean, listing
+from echelon._errors import (
+    EchelonError,
+    MissingExtraError,
+    ModelError,
+    ScenarioError,
+    did_you_mean,
+    listing,
+)
 from echelon._formation import Formation
+from echelon._gain_file import load_gain
 from echelon._graph import Graph
 from echelon._numerics import precision
 from echelon._provenance import versions
 from echelon._result import Result
-from echelon._scenario import Fault, Scenario
+from echelon._scenario import Fault, Scenario, by_line
 from echelon._scenario_parts import GainSpec
 from echelon._simulate import Progress, simulate
 from echelon._synthesize import synthesize
@@ -52,6 +60,8 @@ class _Faults:
         """Note an error that is raised inside, and go on."""
         try:
             yield
+        except MissingExtraError:
+            raise
         except EchelonError as error:
             self.found.append(
                 Fault(self.scenario.place(*path), ".".join(map(str, path)), str(error))
@@ -60,7 +70,7 @@ class _Faults:
     def settle(self) -> None:
         """Raise all that was noted, a line each."""
         if self.found:
-            raise ScenarioError("\n".join(str(fault) for fault in self.found))
+            raise ScenarioError("\n".join(str(fault) for fault in sorted(self.found, key=by_line)))
 
 
 def build(scenario: Scenario) -> Parts:
@@ -158,7 +168,8 @@ def _checked(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> d
     allowed = inspect.signature(make).parameters
     for name in given:
         if name not in allowed:
-            taken = f"allowed are {listing(allowed)}" if allowed else "it takes none"
+            verb = "is" if len(allowed) == 1 else "are"
+            taken = f"allowed {verb} {listing(allowed)}" if allowed else "it takes none"
             raise ScenarioError(
                 f"got the parameter `{name}` of `{what}`, {taken}{did_you_mean(name, allowed)}."
             )
@@ -259,7 +270,9 @@ def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Format
     return make(model, graph, **_offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
 
 
-def _gain(model: ControlAffine, graph: Graph, spec: GainSpec) -> Gain:
+def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, folder: Path) -> Gain:
+    if spec.file is not None:
+        return load_gain(folder / spec.file, model, graph)
     cls = resolve(_registry.METHODS[spec.method])
     given = {
         key: value
@@ -277,7 +290,7 @@ def _follower(
     offers: dict[str, Any] = {"feedforward": spec.feedforward, "trim": spec.trim}
     if "gain" in _accepted(cls):
         with faults.at("follower", "gain"):
-            offers["gain"] = _gain(model, graph, spec.gain)
+            offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)
         if "gain" not in offers:
             return None
     return cls(**_offered(cls, offers)).prepared(model, graph)
@@ -304,7 +317,7 @@ def _leader(
     offers: dict[str, Any] = {"reference": reference, "reaction": reaction}
     if spec.gain is not None:
         with faults.at("leader", "gain"):
-            offers["gain"] = _gain(model, graph, spec.gain)
+            offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)
         if "gain" not in offers:
             return None
     return cls(**_offered(cls, offers)).prepared(model, graph)

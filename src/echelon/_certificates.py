@@ -13,8 +13,30 @@ from echelon._types import Matrix
 Kind: TypeAlias = Literal["proof", "vertices", "samples", "linearization"]
 
 
+class Region(eqx.Module):
+    """What is promised on a domain, not only at a point.
+
+    Attributes:
+        kind: `proof` (exact arithmetic on a hull of all Jacobians), `vertices` (the same in
+            floating point) or `samples`.
+        rate: alpha, 1/s: errors shrink as e^(-alpha t) in the metric of P, 0 for a drift that only
+            does not grow.
+        theorem: `T1`, nonlocal on the region since g is constant; `T2`, local about the leader's
+            path; `A5`, the paper's Assumption 5 for the drift alone.
+        domain: what the states and inputs must respect, in words.
+        radius: r of the set {sum_i delta_i'P delta_i <= r^2} that cannot leave the domain while the
+            leader stays at the trim; None where the domain bounds nothing.
+    """
+
+    kind: Kind = eqx.field(static=True)
+    rate: float
+    theorem: str = eqx.field(static=True)
+    domain: str = eqx.field(static=True)
+    radius: float | None
+
+
 class Certificate(eqx.Module):
-    """What is known of a gain on a graph by linearization at the trim; no region is proved.
+    """What is known of a gain: by linearization at the trim, and perhaps on a region.
 
     Attributes:
         kind: the kind of argument behind the abscissa.
@@ -26,6 +48,7 @@ class Certificate(eqx.Module):
             is known.
         observable: rank of the observability matrix of (A, g'P), out of n; below n, disagreements
             exist that never enter the input.
+        region: what is promised on a domain; None where nothing is.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -35,6 +58,7 @@ class Certificate(eqx.Module):
     modes: int = eqx.field(static=True)
     edge: float | None
     observable: int = eqx.field(static=True)
+    region: Region | None = None
 
     @property
     def stable(self) -> bool:
@@ -43,7 +67,13 @@ class Certificate(eqx.Module):
 
 
 def certify(
-    linear: Linearization, graph: Graph, P: Matrix, R: Matrix, coupling: float, edge: float | None
+    linear: Linearization,
+    graph: Graph,
+    P: Matrix,
+    R: Matrix,
+    coupling: float,
+    edge: float | None,
+    region: Region | None = None,
 ) -> Certificate:
     """Return what linearization at the trim says of the law with gain P, R and coupling c.
 
@@ -60,6 +90,7 @@ def certify(
         modes=len(eigenvalues),
         edge=edge,
         observable=observability_rank(linear.A, linear.B.T @ P),
+        region=region,
     )
 
 

@@ -5,10 +5,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon._archive import gain_of
+from echelon._certificates import Certificate
 from echelon._errors import Outcome
+from echelon._linearization import linearize
 from echelon._lyapunov import Lyapunov, lyapunov
 from echelon._metrics import Metrics, formation_errors
+from echelon._numerics import held_radius, precision
 from echelon._result import Result
+from echelon.gains.gain import Gain
 
 _LAG = 1e-6
 """A steady error above this, in the result's unit, is told as a lag."""
@@ -22,6 +26,8 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
 def _story(result: Result, numbers: Metrics) -> Iterator[str]:
     """Tell the outcome and how the formation did."""
     yield result.message
+    if result.outcome is Outcome.DIVERGED:
+        yield from _why_growth(result)
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
     error = formation_errors(result)[:, list(result.graph.followers)]
@@ -48,6 +54,7 @@ def _story(result: Result, numbers: Metrics) -> Iterator[str]:
             f"{missing} of {len(settled)} followers have not settled to 0.01{unit} "
             f"by {result.times[-1]:g} s."
         )
+        yield from _unseen(result)
     yield from _lag(result, numbers, unit)
 
 
@@ -56,19 +63,43 @@ def _why_growth(result: Result) -> Iterator[str]:
     gain = gain_of(result)
     if gain is None:
         return
-    n = len(result.model.state_names)
-    rank = gain.certificate.observable
-    if rank < n:
-        yield (
-            f"Cause: observability of (A, g^T P) has rank {rank} of {n}, so {n - rank} directions "
-            "of disagreement never enter any input and the law cannot reduce them."
-        )
+    yield from _unseen(result)
     if not getattr(result.follower, "trim", True) and np.any(np.asarray(result.model.trim[1])):
         yield "The law has no trim input either, so nothing holds the followers against gravity."
     if gain.certificate.edge is not None and gain.coupling < gain.certificate.edge:
         yield (
             f"Cause: coupling {gain.coupling:.4g} is below the edge {gain.certificate.edge:.4g} "
             "= 1/(2 lambda_min) of what this gain guarantees."
+        )
+    yield from _long_step(result, gain)
+
+
+def _unseen(result: Result) -> Iterator[str]:
+    """Tell of directions of disagreement that never enter an input."""
+    gain, n = gain_of(result), len(result.model.state_names)
+    if gain is not None and gain.certificate.observable < n:
+        rank = gain.certificate.observable
+        yield (
+            f"Cause: observability of (A, g^T P) has rank {rank} of {n}, so {n - rank} directions "
+            "of disagreement never enter any input and the law cannot reduce them."
+        )
+
+
+def _long_step(result: Result, gain: Gain) -> Iterator[str]:
+    """Tell where the input, held over a step, makes grow what would decay in continuous time."""
+    if not gain.certificate.stable:
+        return
+    with precision("float64"):
+        A, B = linearize(result.model)
+    inner = np.zeros_like(B.T) if gain.inner is None else gain.inner
+    strength = gain.coupling * gain.certificate.lambda_max
+    K = inner + strength * np.linalg.solve(gain.R, B.T @ gain.P)
+    dt = result.settings.dt
+    radius = held_radius(A, B, K, dt)
+    if radius > 1.0:
+        yield (
+            f"Cause: the step `dt` = {dt:g} s is too long for this gain: with the input held over "
+            f"it, the fastest mode grows by a factor {radius:.3g} a step."
         )
 
 
@@ -79,7 +110,7 @@ def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
     if result.reference is not None and np.ptp(result.reference, axis=0).max() > 0.0:
         yield (
             "Without feed-forward the followers do not know the leader's motion and lag: "
-            f"{worst:.3g}{unit} RMS over the last {numbers.steady_window:g} s for the worst. "
+            f"{worst:.3g}{unit} RMS over the last {numbers.steady_window:.3g} s for the worst. "
             "`feedforward: relay` removes the lag, and asks for the leader's input "
             "at every follower."
         )
@@ -90,7 +121,7 @@ def _promises(result: Result) -> Iterator[str]:
     gain = gain_of(result)
     if gain is not None:
         certificate = gain.certificate
-        verdict = "stable" if certificate.stable else "not stable"
+        verdict = _verdict(certificate.abscissa)
         edge = (
             ""
             if certificate.edge is None
@@ -99,10 +130,31 @@ def _promises(result: Result) -> Iterator[str]:
         yield (
             f"Promise of the gain, by linearization at the trim: the disagreement is {verdict}, "
             f"slowest mode {certificate.abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
-            "no region is proved."
+            f"{_region(certificate)}."
         )
     needs = ", ".join(result.follower.needs) or "nothing from others"
     yield f"Each follower is told: {needs}."
+
+
+def _region(certificate: Certificate) -> str:
+    """Return what is promised on a domain, with the kind of argument."""
+    region = certificate.region
+    if region is None:
+        return "no region is proved"
+    if region.theorem == "A5":
+        return f"the drift does not expand P for {region.domain} ({region.kind})"
+    scope = "everywhere there" if region.theorem == "T1" else "near the leader's path there"
+    return (
+        f"for {region.domain} it contracts at {region.rate:.3g} 1/s {scope} "
+        f"({region.kind}, {region.theorem})"
+    )
+
+
+def _verdict(abscissa: float) -> str:
+    """Return what the slowest mode says of the disagreement."""
+    if abs(abscissa) < 1e-9:
+        return "not damped in every direction"
+    return "stable" if abscissa < 0.0 else "unstable"
 
 
 def _lyapunov_story(result: Result) -> Iterator[str]:

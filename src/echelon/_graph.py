@@ -176,6 +176,10 @@ class Graph:
 
     def neighbours(self, agent: int) -> tuple[int, ...]:
         """Return the agents linked to `agent`, sorted."""
+        if not 0 <= agent < self.agents:
+            raise GraphError(
+                f"agent {agent} is not in this graph, whose agents are 0 to {self.agents - 1}."
+            )
         i, j = self.edges.T
         return tuple(sorted(np.concatenate([j[i == agent], i[j == agent]]).tolist()))
 

@@ -26,35 +26,44 @@ def initial_states(
 ) -> np.ndarray:
     """Return the states (N, n) at time zero.
 
-    A leader starts where its law says, at its own offset, plus `start_error`. A follower starts at
-    its goal relative to the leader, plus a uniform random deviation within +- the spread of each
-    state. The same seed draws the same deviations whatever the spreads are.
+    A leader starts where its law says, or in its given state, plus its offset and `start_error`. A
+    follower starts at its goal relative to the leader, plus a uniform random deviation within +-
+    the spread of each state. The same seed draws the same deviations whatever the spreads are.
 
     Raises:
         SimulationError: given states have a wrong shape or are not finite; a spread is negative.
         ModelError: a spread or error names no state or group.
     """
     shape = (graph.agents, len(model.state_names))
+    error = _per_state(model, start_error, "start error")
     if initial is not None and not isinstance(initial, Mapping):
-        return _checked(initial, shape, "initial states have", "(agents, states)")
-    spreads: dict[str, Any] = {
-        key: value for key, value in (initial or {}).items() if isinstance(key, str)
-    }
-    spread = _per_state(model, spreads, "initial spread")
+        states = _checked(initial, shape, "initial states have", "(agents, states)")
+        states[list(graph.leaders)] += error
+        return states
+    named = dict(initial or {})
+    spread = _per_state(
+        model,
+        {key: value for key, value in named.items() if isinstance(key, str)},
+        "initial spread",
+    )
     if (spread < 0.0).any():
         raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
-    error = _per_state(model, start_error, "start error")
     leaders = np.asarray(leader.start(model), np.float64) + error
     deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
     deviations[list(graph.leaders)] = 0.0
     states = leaders + formation.offsets + deviations
-    for agent, given in (initial or {}).items():
-        if not isinstance(agent, str):
-            _check_agent(agent, graph)
-            states[agent] = _checked(
-                given, shape[1:], f"the initial state of agent {agent} has", "(states,)"
-            )
+    _place(states, {key: value for key, value in named.items() if not isinstance(key, str)}, graph)
+    states[[agent for agent in graph.leaders if agent in named]] += error
     return states
+
+
+def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:
+    """Put the given agents into their given states."""
+    for agent, state in given.items():
+        _check_agent(agent, graph)
+        states[agent] = _checked(
+            state, states.shape[1:], f"the initial state of agent {agent} has", "(states,)"
+        )
 
 
 def _check_agent(agent: int, graph: Graph) -> None:

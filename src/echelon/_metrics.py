@@ -75,10 +75,10 @@ def metrics(result: Result, steady_window: float | None = None) -> Metrics:
 
     Args:
         result: the run.
-        steady_window: length of the last part of the run that counts as steady, s; a sixth of the
+        steady_window: length of the last part of the run that counts as steady, s; a fifth of the
             horizon when left out.
     """
-    window = result.settings.horizon / 6.0 if steady_window is None else steady_window
+    window = result.settings.horizon / 5.0 if steady_window is None else steady_window
     exists = result.outcome is not Outcome.DIVERGED and len(result.times) > 0
     steady = result.times >= result.times[-1] - window - 1e-9 if exists else np.zeros(0, bool)
     with np.errstate(over="ignore", invalid="ignore"):

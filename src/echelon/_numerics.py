@@ -67,6 +67,21 @@ def derivatives(path: Callable[[jax.Array], jax.Array], t: jax.Array, order: int
     return jnp.stack(up_to(order)(t))
 
 
+def held_radius(A: np.ndarray, B: np.ndarray, K: np.ndarray, dt: float) -> float:
+    """Return the spectral radius of a step of xdot = A x - B K x(t_k), the input held over dt."""
+    n, m = B.shape
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = A, B
+    flow = scipy.linalg.expm(block * dt)
+    return float(np.abs(np.linalg.eigvals(flow[:n, :n] - flow[:n, n:] @ K)).max())
+
+
+def in_words(eigenvalue: complex) -> str:
+    """Return an eigenvalue as text, without an imaginary part that is zero."""
+    real = f"{eigenvalue.real + 0.0:.3g}"
+    return real if eigenvalue.imag == 0.0 else f"{real} +- {abs(eigenvalue.imag):.3g}i"
+
+
 def symmetric_part(matrix: np.ndarray) -> np.ndarray:
     """Return (M + M^T) / 2."""
     return 0.5 * (matrix + matrix.T)

@@ -30,10 +30,7 @@ def claim_folder(name: str, out: Path | None, force: bool) -> Path:
     try:
         return _named_folder(out, force) if out is not None else _new_folder(Path("runs"), name)
     except OSError as error:
-        where = out if out is not None else Path("runs")
-        raise OutputError(
-            f"the folder `{where}` cannot be written: {error.strerror or error}."
-        ) from error
+        raise _unwritable(out if out is not None else Path("runs"), error) from error
 
 
 def _new_folder(parent: Path, name: str) -> Path:
@@ -68,10 +65,25 @@ def _named_folder(out: Path, force: bool) -> Path:
     return out
 
 
+def write_data(result: Result, folder: Path) -> None:
+    """Write a run's dataset and scenario: what must not be lost, before all else.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    try:
+        if "scenario_text" in result.provenance:
+            text = result.provenance["scenario_text"]
+            (folder / "scenario.yaml").write_text(text, "utf-8")
+        save_dataset(result, folder / "run.nc")
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
 def write_run(
     result: Result, numbers: Metrics, text: str, folder: Path, figures: bool = True
 ) -> dict[str, Any]:
-    """Write a run's summary, dataset, scenario, report and figures; return the summary.
+    """Write what is made of a run: summary, report and figures; return the summary.
 
     Raises:
         OutputError: a file cannot be written.
@@ -81,16 +93,15 @@ def write_run(
         content = json.dumps(told, indent=2, allow_nan=False)
         (folder / "summary.json").write_text(content + "\n", "utf-8")
         (folder / "report.txt").write_text(text + "\n", "utf-8")
-        if "scenario_text" in result.provenance:
-            (folder / "scenario.yaml").write_text(result.provenance["scenario_text"], "utf-8")
-        save_dataset(result, folder / "run.nc")
         if figures and len(result.times):
             from echelon._plots import save_figures
 
             v = lyapunov(result)
             save_figures(result, folder, None if v is None else (v.value, v.rate))
     except OSError as error:
-        raise OutputError(
-            f"the folder `{folder}` cannot be written: {error.strerror or error}."
-        ) from error
+        raise _unwritable(folder, error) from error
     return told
+
+
+def _unwritable(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"the folder `{folder}` cannot be written: {error.strerror or error}.")

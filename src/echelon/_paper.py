@@ -15,6 +15,7 @@ ROUNDING = (
 )
 
 
-def is_papers_experiment(scenario: str, agents: int) -> bool:
+def is_papers_experiment(scenario: str, model: str, agents: int) -> bool:
     """Tell whether the printed values belong beside a scenario: `paper`, its variants, 4 agents."""
-    return agents == 4 and (scenario == "paper" or scenario.startswith("paper-"))
+    flown = model == "Quadrotor" and agents == 4
+    return flown and (scenario == "paper" or scenario.startswith("paper-"))

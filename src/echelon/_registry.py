@@ -34,6 +34,8 @@ MODELS = _models(
     unicycle_point=("UnicyclePoint", "the same vehicle, seen at a point ahead of its axle"),
     planar_quadrotor=("PlanarQuadrotor", "quadrotor in a vertical plane, 6 states"),
     quadrotor=("Quadrotor", "quadrotor in space, 12 states, ZYX Euler angles, per-motor limits"),
+    quadrotor_euler=("QuadrotorEuler", "quadrotor under computed torque, inputs are accelerations"),
+    quadrotor_thrust=("QuadrotorThrust", "the same with its thrust as a 13th state: g is constant"),
     quadrotor_printed=(
         "PrintedQuadrotor",
         "literal: the paper's equations, without gravity or thrust rotation",
@@ -56,6 +58,14 @@ METHODS = {
         "echelon.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"
     ),
     "given": Entry("echelon.gains:Given", "a P (and R, coupling) of your own"),
+    "inner-loop": Entry(
+        "echelon.gains:InnerLoop", "damp all but position, then any coupling works"
+    ),
+    "monotone": Entry("echelon.gains:Monotone", "the paper's Assumption 5 on a domain, as an SDP"),
+    "robust-lqr": Entry(
+        "echelon.gains:RobustLQR", "one P for all Jacobians of a domain, as an SDP"
+    ),
+    "contraction": Entry("echelon.gains:Contraction", "weakest gain of a given rate on a domain"),
 }
 
 FOLLOWER_LAWS = {

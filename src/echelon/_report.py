@@ -25,7 +25,7 @@ def report(result: Result, steady_window: float | None = None) -> str:
 
     Args:
         result: the run.
-        steady_window: the last part of the run that counts as steady, s; a sixth of the horizon
+        steady_window: the last part of the run that counts as steady, s; a fifth of the horizon
             when left out.
     """
     from rich.console import Console
@@ -39,7 +39,8 @@ def report(result: Result, steady_window: float | None = None) -> str:
 
 def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
     """Print the report of a run on a rich console."""
-    printed = is_papers_experiment(result.provenance.get("scenario", ""), result.graph.agents)
+    scenario, model = result.provenance.get("scenario", ""), type(result.model).__name__
+    printed = is_papers_experiment(scenario, model, result.graph.agents)
     console.print(_table(result, numbers, printed))
     sentences = [*explain(result, numbers), *(f"Warning: {text}" for text in result.warnings)]
     for sentence in [*sentences, ROUNDING] if printed else sentences:
@@ -56,7 +57,7 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     from rich.table import Table
 
     unit = "" if result.unit == "state" else f", {result.unit}"
-    steady = f"steady{unit}\n(last {numbers.steady_window:g} s)"
+    steady = f"steady{unit}\n(last {numbers.steady_window:.3g} s)"
     settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
     columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
     if printed:

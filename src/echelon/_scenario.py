@@ -144,9 +144,11 @@ def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
     simulation = filled.get("simulation")
     horizon = number_of(simulation.get("horizon")) if isinstance(simulation, dict) else None
     if horizon is not None and horizon > 0 and isinstance(report, dict):
-        window = report.get("steady_window", horizon / 6)
-        clipped = window if number_of(window) is None else min(window, horizon)
-        filled["report"] = {**report, "steady_window": clipped}
+        window = report.get("steady_window", horizon / 5)
+        asked = number_of(window)
+        # A window as long as the run would count its transient as steady.
+        fitting = horizon / 5 if asked is not None and asked >= horizon else window
+        filled["report"] = {**report, "steady_window": fitting}
     return filled
 
 
@@ -157,7 +159,7 @@ def _schema_faults(data: Mapping[Any, Any]) -> Iterator[tuple[KeyPath, str]]:
         yield from map(_told, error.errors(include_url=False))
 
 
-def _order(fault: Fault) -> tuple[bool, int]:
+def by_line(fault: Fault) -> tuple[bool, int]:
     """Sort by line, what the command line set last."""
     line = fault.place.rpartition(":")[2]
     overridden = fault.place.startswith("--set ")
@@ -174,7 +176,7 @@ def _faults(document: Document) -> list[Fault]:
         Fault(place, ".".join(map(str, path)), message)
         for path, place, message in (*document.problems, *faults)
     )
-    return sorted(listed, key=_order)
+    return sorted(listed, key=by_line)
 
 
 def _refuse(faults: Sequence[Fault]) -> NoReturn:

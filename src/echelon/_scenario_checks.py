@@ -43,6 +43,11 @@ _FORMATION_KEYS: _Taken = {
 _GAIN_KEYS: _Taken = {
     "riccati": ((), ("Q", "R", "coupling")),
     "given": (("P",), ("R", "coupling")),
+    "inner-loop": ((), ("coupling", "symmetry_weight")),
+    "monotone": (("domain",), ("coupling",)),
+    "robust-lqr": (("domain",), ("Q", "R", "coupling", "exact")),
+    "contraction": (("domain", "rate"), ("coupling", "exact")),
+    "file": ((), ()),
 }
 
 
@@ -121,7 +126,10 @@ def _choices(data: Part) -> Iterator[Fault]:
     yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
     for role in ("leader", "follower"):
         gain = _section(data, role, "gain")
-        yield from _taken((role, "gain"), gain, gain.get("method", "riccati"), _GAIN_KEYS)
+        if gain.get("file") is not None and gain.get("method") is not None:
+            yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
+        made_by = "file" if gain.get("file") is not None else gain.get("method", "riccati")
+        yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:

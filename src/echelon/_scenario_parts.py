@@ -144,6 +144,22 @@ class GainSpec(BaseModel):
     coupling: Positive | None = Field(
         default=None, description="Coupling strength, without unit; default what the method finds."
     )
+    domain: dict[str, Numeric] | None = Field(
+        default=None,
+        description="Half-width, or `[lower, upper]`, by state, group or normalised input.",
+    )
+    rate: Positive | None = Field(
+        default=None, description="Rate that the method `contraction` is asked for, 1/s."
+    )
+    exact: bool | None = Field(
+        default=None, description="Whether a rate is proved in exact arithmetic where it can be."
+    )
+    symmetry_weight: Numeric | None = Field(
+        default=None, description="Weight of the symmetric states in the P of `inner-loop`."
+    )
+    file: str | None = Field(
+        default=None, description="Gain file of `echelon design`, relative to the scenario file."
+    )
 
 
 @final
@@ -225,5 +241,6 @@ class ReportSpec(BaseModel):
 
     steady_window: Positive = Field(
         default_factory=lambda: 1.0,
-        description="The end of the run that counts as steady, s; default a sixth of the horizon.",
+        description="The end of the run that counts as steady, s; a fifth of the horizon by "
+        "default, and where it would not be shorter than the run.",
     )

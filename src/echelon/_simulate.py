@@ -14,12 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon import _numerics
-from echelon._errors import Outcome, SimulationError, did_you_mean, listing
+from echelon._arguments import check_parts, check_settings, formation_warnings
+from echelon._errors import ModelError, Outcome, SimulationError
 from echelon._formation import Formation
 from echelon._graph import Exchange, Graph
 from echelon._initial import Initial, initial_states
 from echelon._result import Result, Settings
 from echelon._types import Inputs, Matrix, States
+from echelon.gains.gain import Gain
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
@@ -110,13 +112,16 @@ def simulate(
     """
     settings = Settings(horizon, dt, integrator, limits, store_every, precision, seed)
     check_settings(settings)
+    check_parts(graph, formation, leader, follower)
     began = time.perf_counter()
-    with _numerics.precision(precision):
+    with _numerics.precision("float64"):
         warnings = check_model(model)
         leader, follower = leader.prepared(model, graph), follower.prepared(model, graph)
         loop = _assemble(model, graph, formation, leader, follower, settings)
         states = initial_states(model, graph, formation, leader, initial, start_error or {}, seed)
+    with _numerics.precision(precision):
         record = _run(loop, states, _frame_counts(settings), progress)
+    with _numerics.precision("float64"):
         times = jnp.asarray(record.times)
         reference = leader.reference_states(model, times) if len(record.times) else None
     outcome, message = _verdict(record, graph)
@@ -128,7 +133,7 @@ def simulate(
         saturated=record.saturated,
         outcome=outcome,
         message=message,
-        warnings=warnings + _formation_warnings(model, formation),
+        warnings=warnings + formation_warnings(model, formation),
         model=model,
         graph=graph,
         formation=formation,
@@ -137,38 +142,6 @@ def simulate(
         settings=settings,
         wall_time=time.perf_counter() - began,
     )
-
-
-def check_settings(settings: Settings) -> None:
-    """Check the numbers of a simulation.
-
-    Raises:
-        SimulationError: one is out of range.
-    """
-    horizon, dt = settings.horizon, settings.dt
-    for name, value in (("horizon", horizon), ("dt", dt)):
-        if not 0.0 < value < math.inf:
-            raise SimulationError(
-                f"`{name}` is {value}, and must be a positive finite number of seconds."
-            )
-    if horizon < dt:
-        raise SimulationError(
-            f"`horizon` is {horizon} s, and must be at least one step `dt` = {dt} s."
-        )
-    if settings.integrator not in _numerics.INTEGRATORS:
-        known = _numerics.INTEGRATORS
-        raise SimulationError(
-            f"`integrator` is `{settings.integrator}`, allowed are {listing(known)}"
-            f"{did_you_mean(settings.integrator, known)}."
-        )
-    if settings.seed != int(settings.seed) or settings.seed < 0:
-        raise SimulationError(f"`seed` is {settings.seed}, and must be a whole number from 0 on.")
-    if settings.store_every != int(settings.store_every) or settings.store_every < 1:
-        raise SimulationError(f"`store_every` is {settings.store_every}, and must be at least 1.")
-    if settings.precision not in ("float64", "float32"):
-        raise SimulationError(
-            f"`precision` is `{settings.precision}`, allowed are `float64` and `float32`."
-        )
 
 
 def _assemble(
@@ -189,8 +162,8 @@ def _assemble(
     nearest = np.array(graph.nearest_leader())
     return Loop(
         model=model,
-        leader=leader,
-        follower=follower,
+        leader=_lean(leader),
+        follower=_lean(follower),
         exchange=graph.exchange(),
         offsets=np.asarray(formation.offsets),
         leaders=leaders,
@@ -202,6 +175,21 @@ def _assemble(
         integrator=settings.integrator,
         limits=settings.limits,
     )
+
+
+def _lean(law: Law) -> Law:
+    """Return a law whose gains carry no certificate and a traced coupling.
+
+    So another coupling or another graph of the same size compiles nothing again.
+    """
+
+    def lean(node: Any) -> Any:
+        if not isinstance(node, Gain):
+            return node
+        parts = (np.asarray(node.coupling), None)
+        return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
+
+    return jax.tree.map(lean, law, is_leaf=lambda node: isinstance(node, Gain))
 
 
 # ---- one step ------------------------------------------------------------------------------------
@@ -228,7 +216,8 @@ def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]
     said = _relayed(loop, x[loop.leaders], u_l)
     wanted_f, u_f, memory_f = act(loop.follower, loop.followers, said, now.follower_memory)
     u = jnp.concatenate([u_l, u_f])[loop.order]
-    limited = jnp.any(u != jnp.concatenate([wanted_l, wanted_f])[loop.order], axis=1)
+    wanted = jnp.concatenate([wanted_l, wanted_f])[loop.order]
+    limited = jnp.any((u != wanted) & ~jnp.isnan(wanted), axis=1)
     return u, limited, memory_l, memory_f
 
 
@@ -310,16 +299,30 @@ def _run(loop: Loop, states: np.ndarray, counts: np.ndarray, progress: Progress 
     now, frames, done = _start(loop, states), [], 0
     try:
         for chunk in padded.reshape(-1, size):
-            now, stored = advance(loop, now, jnp.asarray(chunk))
+            now, stored = _advanced(loop, now, chunk)
             frames.append(jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), stored))
             done += int(chunk.sum())
             if progress is not None:
                 progress(done, int(counts.sum()))
-            if not np.isfinite(frames[-1][0]).all():
+            if not all(np.isfinite(part).all() for part in frames[-1]):
                 break
     except KeyboardInterrupt:
         pass
     return _collect(loop, counts, frames, now)
+
+
+def _advanced(loop: Loop, now: Moment, chunk: np.ndarray) -> tuple[Moment, Any]:
+    """Call `advance`, and say in a sentence what JAX says of constants in another precision."""
+    try:
+        return advance(loop, now, jnp.asarray(chunk))
+    except ValueError as error:
+        if "Cannot lower jaxpr" not in str(error):
+            raise
+        raise ModelError(
+            f"`{type(loop.model).__name__}` or a law uses a NumPy constant that JAX has already "
+            "seen in another precision; write it as Python numbers or as "
+            "`jnp.asarray(constant, x.dtype)`."
+        ) from error
 
 
 def _collect(loop: Loop, counts: np.ndarray, frames: list[Any], now: Moment) -> _Record:
@@ -330,7 +333,7 @@ def _collect(loop: Loop, counts: np.ndarray, frames: list[Any], now: Moment) -> 
         np.concatenate([frame[k] for frame in (nothing, *frames)])[: len(counts)] for k in (0, 1)
     )
     times = loop.dt * np.concatenate([[0], np.cumsum(counts[:-1])])[: len(states)]
-    lost = np.array(~np.isfinite(states).all(axis=2))
+    lost = np.array(~(np.isfinite(states).all(axis=2) & np.isfinite(inputs).all(axis=2)))
     failed = None
     if lost.any():
         cut, agent = np.argwhere(lost)[0]
@@ -355,20 +358,3 @@ def _verdict(record: _Record, graph: Graph) -> tuple[Outcome, str]:
         Outcome.INTERRUPTED,
         f"The run was interrupted at t = {reached:.6g} s; what was computed is kept.",
     )
-
-
-def _formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
-    """Tell of offsets that the dynamics do not respect, and of goals that coincide."""
-    broken = formation.broken_symmetries(model)
-    told = [
-        f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
-        "so the agents settle off their goals."
-        for agent, reason in list(broken.items())[:1]
-    ]
-    pairs = formation.coincident() if model.position else ()
-    told += [
-        f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
-    ]
-    if len(pairs) > 3:
-        told.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
-    return tuple(told)

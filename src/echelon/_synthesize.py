@@ -1,5 +1,6 @@
 """The verb that turns a model, a graph and a method into a gain."""
 
+from echelon._errors import GainError
 from echelon._graph import Graph
 from echelon._numerics import precision
 from echelon.gains.gain import Gain, Method
@@ -16,6 +17,9 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
         ModelError: the model is malformed.
         GainError: the method does not apply, with the reason.
     """
+    if not isinstance(method, Method):
+        got = f"the class `{method.__name__}`" if isinstance(method, type) else f"{method!r}"
+        raise GainError(f"`method` is {got}, and must be a gain method such as `Riccati()`.")
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph)

@@ -37,10 +37,18 @@ class Document(NamedTuple):
     problems: tuple[Problem, ...] = ()
 
     def place(self, path: KeyPath) -> str:
-        """Return the place of `path`, or of the nearest part above it that stands somewhere."""
+        """Return the place of `path`, or of the nearest part above it that stands somewhere.
+
+        Where the command line changed something inside, that is the place.
+        """
         while path and path not in self.places:
             path = path[:-1]
-        return self.places[path]
+        changed = [
+            place
+            for inside, place in self.places.items()
+            if path and inside[: len(path)] == path and place.startswith("--set ")
+        ]
+        return changed[-1] if changed else self.places[path]
 
 
 def _infinite(text: str) -> float:

@@ -1,9 +1,23 @@
 """Gains: what a synthesis returns, the interface `Method`, and the bundled methods."""
 
-from echelon._certificates import Certificate
+from echelon._certificates import Certificate, Region
+from echelon.gains.contraction import Contraction
 from echelon.gains.gain import Gain, Method
 from echelon.gains.given import Given
 from echelon.gains.inner_loop import InnerLoop
+from echelon.gains.monotone import Monotone
 from echelon.gains.riccati import Riccati
+from echelon.gains.robust_lqr import RobustLQR
 
-__all__ = ["Certificate", "Gain", "Given", "InnerLoop", "Method", "Riccati"]
+__all__ = [
+    "Certificate",
+    "Contraction",
+    "Gain",
+    "Given",
+    "InnerLoop",
+    "Method",
+    "Monotone",
+    "Region",
+    "Riccati",
+    "RobustLQR",
+]

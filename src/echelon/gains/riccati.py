@@ -6,7 +6,7 @@ from echelon._certificates import certify
 from echelon._errors import GainError
 from echelon._graph import Graph
 from echelon._linearization import Linearization, linearize
-from echelon._numerics import riccati, uncontrollable_modes
+from echelon._numerics import in_words, riccati, uncontrollable_modes
 from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
 from echelon.models.model import ControlAffine
 
@@ -68,6 +68,7 @@ def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
             )
             raise GainError(
                 f"the linearization of `{type(model).__name__}` at its trim cannot be stabilized: "
-                f"no input moves the mode at {eigenvalue:.3g} 1/s, which lies along {states}; "
+                f"no input moves the mode at {in_words(eigenvalue)} 1/s, which lies along "
+                f"{states}; "
                 "give the gain yourself (method `given`) or choose another model of the vehicle."
             )

@@ -30,7 +30,12 @@ class Consensus(Law):
     trim: bool = eqx.field(default=True, static=True)
 
     def __check_init__(self) -> None:
-        """Refuse an unknown feed-forward."""
+        """Refuse what is no gain, and an unknown feed-forward."""
+        if not isinstance(self.gain, Gain):
+            raise LawError(
+                f"`gain` of `Consensus` is {self.gain!r}, and must be a `Gain`, as `synthesize` "
+                "returns it."
+            )
         if self.feedforward not in ("none", "relay"):
             raise LawError(
                 f"`feedforward` is `{self.feedforward}`, allowed are `none` and `relay`."

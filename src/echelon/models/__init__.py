@@ -6,6 +6,7 @@ from echelon.models.model import ControlAffine
 from echelon.models.pendulum import Pendulum
 from echelon.models.planar_quadrotor import PlanarQuadrotor
 from echelon.models.quadrotor import Quadrotor
+from echelon.models.quadrotor_euler import QuadrotorEuler, QuadrotorThrust
 from echelon.models.quadrotor_printed import PrintedQuadrotor
 from echelon.models.unicycle import Unicycle, UnicyclePoint
 from echelon.models.van_der_pol import VanDerPol
@@ -18,6 +19,8 @@ __all__ = [
     "PlanarQuadrotor",
     "PrintedQuadrotor",
     "Quadrotor",
+    "QuadrotorEuler",
+    "QuadrotorThrust",
     "SingleIntegrator",
     "Unicycle",
     "UnicyclePoint",

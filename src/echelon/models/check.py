@@ -42,7 +42,7 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     x, u = _trim(model, name, n, m)
     _check_values(model, name, x, u)
     _check_trim(model, name, x, u)
-    return _low_precision(model, name)
+    return (*_low_precision(model, name), *_weak_actuators(model, name, u))
 
 
 def _check_names(model: ControlAffine, name: str) -> None:
@@ -159,6 +159,19 @@ def _check_trim(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -
             f"in state `{model.state_names[worst]}`, and must be within {_TRIM_TOLERANCE:g} "
             "of zero; replace `trim`."
         )
+
+
+def _weak_actuators(model: ControlAffine, name: str, u: np.ndarray) -> tuple[str, ...]:
+    """Warn of a trim that the actuators cannot hold."""
+    delivered = np.asarray(model.limit(jnp.asarray(u)))
+    short = [
+        f"`{what}` {got:.4g} of {asked:.4g}"
+        for what, got, asked in zip(model.input_names, delivered, u, strict=True)
+        if got != asked
+    ]
+    if not short:
+        return ()
+    return (f"the actuators of `{name}` cannot hold its trim: they deliver {', '.join(short)}.",)
 
 
 def _low_precision(model: ControlAffine, name: str) -> tuple[str, ...]:

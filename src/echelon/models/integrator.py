@@ -1,12 +1,14 @@
 """Single and double integrators in any dimension, the agents of most consensus literature."""
 
+import numbers
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from echelon._errors import ModelError
 from echelon._types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine
+from echelon.models.model import ControlAffine, not_negative
 
 _AXES = ("x", "y", "z")
 
@@ -17,7 +19,7 @@ def _axes(dimension: int) -> tuple[str, ...]:
 
 
 def _check_dimension(model: eqx.Module, dimension: int) -> None:
-    if isinstance(dimension, bool) or not isinstance(dimension, int) or dimension < 1:
+    if isinstance(dimension, bool) or not isinstance(dimension, numbers.Integral) or dimension < 1:
         raise ModelError(
             f"`dimension` of `{type(model).__name__}` is {dimension}, "
             "and must be a whole number of at least 1."
@@ -97,10 +99,7 @@ class DoubleIntegrator(ControlAffine):
     def __check_init__(self) -> None:
         """Refuse a dimension below one or a negative drag."""
         _check_dimension(self, self.dimension)
-        if not 0.0 <= self.drag < float("inf"):
-            raise ModelError(
-                f"`drag` of `DoubleIntegrator` is {self.drag}, and must be finite and not negative."
-            )
+        not_negative(self, drag=self.drag)
 
     @property
     def state_names(self) -> tuple[str, ...]:

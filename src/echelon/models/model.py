@@ -6,6 +6,7 @@ method of the same name.
 """
 
 import abc
+import numbers
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar, cast
 
@@ -186,8 +187,22 @@ def positive(owner: object, **values: float) -> None:
         ModelError: one is not.
     """
     for name, value in values.items():
-        if not (isinstance(value, (int, float)) and 0.0 < value < float("inf")):
+        if not (isinstance(value, numbers.Real) and 0.0 < value < float("inf")):
             raise ModelError(
                 f"`{name}` of `{type(owner).__name__}` is {value}, "
                 "and must be a positive finite number."
+            )
+
+
+def not_negative(owner: object, **values: float) -> None:
+    """Check that each named parameter is a finite number of at least zero.
+
+    Raises:
+        ModelError: one is not.
+    """
+    for name, value in values.items():
+        if not (isinstance(value, numbers.Real) and 0.0 <= value < float("inf")):
+            raise ModelError(
+                f"`{name}` of `{type(owner).__name__}` is {value}, and must be finite "
+                "and not negative."
             )

@@ -2,9 +2,8 @@
 
 import jax.numpy as jnp
 
-from echelon._errors import ModelError
 from echelon._types import InputMap, State
-from echelon.models.model import ControlAffine, positive
+from echelon.models.model import ControlAffine, not_negative, positive
 
 
 class Pendulum(ControlAffine):
@@ -25,10 +24,7 @@ class Pendulum(ControlAffine):
     def __check_init__(self) -> None:
         """Refuse a stiffness that is not positive or a negative damping."""
         positive(self, stiffness=self.stiffness)
-        if not 0.0 <= self.damping < float("inf"):
-            raise ModelError(
-                f"`damping` of `Pendulum` is {self.damping}, and must be finite and not negative."
-            )
+        not_negative(self, damping=self.damping)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

@@ -4,14 +4,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from echelon._types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, diagonal, positive
 from echelon.models.rotors import attitude_priority, fits
 
 # Right and left pairs of motors; each pair counts as one rotor with twice the thrust.
-_LEFT = np.array([1.0, -1.0])
+_LEFT = (1.0, -1.0)
 
 
 class PlanarQuadrotor(ControlAffine):
@@ -98,8 +97,9 @@ class PlanarQuadrotor(ControlAffine):
 
     def limit(self, u: Input) -> Input:
         """Return what two rotors within [0, motor_thrust] deliver, attitude before collective."""
-        tilt = u[1] * _LEFT / (2.0 * self.arm)
+        left = jnp.asarray(_LEFT, u.dtype)
+        tilt = u[1] * left / (2.0 * self.arm)
         wanted = u[0] / 2.0 + tilt
         f = attitude_priority(u[0] / 2.0, tilt, jnp.zeros_like(tilt), self.motor_thrust)
-        delivered = jnp.stack([jnp.sum(f), self.arm * (_LEFT @ f)])
+        delivered = jnp.stack([jnp.sum(f), self.arm * (left @ f)])
         return jnp.where(fits(wanted, self.motor_thrust), u, delivered)

@@ -42,9 +42,9 @@ def _with_rate(
 
 # Motors at (+-l, +-l): front-left, rear-left, rear-right, front-right as signs of (x, y); the spin
 # of each gives the sign of its yaw torque.
-_FRONT = np.array([1.0, -1.0, -1.0, 1.0])
-_LEFT = np.array([1.0, 1.0, -1.0, -1.0])
-_SPIN = np.array([1.0, -1.0, 1.0, -1.0])
+_FRONT = (1.0, -1.0, -1.0, 1.0)
+_LEFT = (1.0, 1.0, -1.0, -1.0)
+_SPIN = (1.0, -1.0, 1.0, -1.0)
 
 
 class Quadrotor(ControlAffine):
@@ -185,16 +185,17 @@ class Quadrotor(ControlAffine):
     def limit(self, u: Input) -> Input:
         """Return what four motors within [0, motor_thrust] deliver.
 
-        Attitude comes before the collective, and the collective before yaw.
+        What does not fit gives way in this order: the collective, then yaw, then roll and pitch.
         """
-        tilt = (u[1] * _LEFT - u[2] * _FRONT) / (4.0 * self.arm)
-        yaw = u[3] * _SPIN / (4.0 * self.torque_per_thrust)
+        left, front, spin = (jnp.asarray(sign, u.dtype) for sign in (_LEFT, _FRONT, _SPIN))
+        tilt = (u[1] * left - u[2] * front) / (4.0 * self.arm)
+        yaw = u[3] * spin / (4.0 * self.torque_per_thrust)
         wanted = u[0] / 4.0 + tilt + yaw
         f = attitude_priority(u[0] / 4.0, tilt, yaw, self.motor_thrust)
         torque = [
-            self.arm * (_LEFT @ f),
-            -self.arm * (_FRONT @ f),
-            self.torque_per_thrust * (_SPIN @ f),
+            self.arm * (left @ f),
+            -self.arm * (front @ f),
+            self.torque_per_thrust * (spin @ f),
         ]
         delivered = jnp.stack([jnp.sum(f), *torque])
         return jnp.where(fits(wanted, self.motor_thrust), u, delivered)

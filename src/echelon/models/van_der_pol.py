@@ -2,9 +2,8 @@
 
 import jax.numpy as jnp
 
-from echelon._errors import ModelError
 from echelon._types import InputMap, State
-from echelon.models.model import ControlAffine
+from echelon.models.model import ControlAffine, not_negative
 
 
 class VanDerPol(ControlAffine):
@@ -17,10 +16,7 @@ class VanDerPol(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse a damping that is negative or not finite."""
-        if not 0.0 <= self.damping < float("inf"):
-            raise ModelError(
-                f"`damping` of `VanDerPol` is {self.damping}, and must be finite and not negative."
-            )
+        not_negative(self, damping=self.damping)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

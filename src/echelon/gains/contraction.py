@@ -1,0 +1,54 @@
+"""The weakest feedback that contracts at a wanted rate on a domain, with one constant metric."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from echelon._certificates import certify
+from echelon._domain import Bound, Domain
+from echelon._graph import Graph
+from echelon._jacobians import jacobians
+from echelon._linearization import linearize
+from echelon._lmi import contraction
+from echelon.gains.gain import Gain, Method, check_coupling
+from echelon.gains.regional import contracting_region, the_domain
+from echelon.models.model import ControlAffine
+
+
+class Contraction(Method):
+    """W = P^-1 with A W + W A' - rho B B' + 2 rate W <= 0 for every Jacobian A, least rho.
+
+    The coupling is rho / (2 lambda_min), and R = I (theory page, T1).
+
+    Args:
+        domain: half-widths, or (lower, upper), by state, group or normalized input.
+        rate: alpha, 1/s.
+        coupling: c; what the inequality needs when left out.
+        exact: whether to prove the rate in exact arithmetic where g is constant (seconds).
+    """
+
+    domain: Mapping[str, Bound] | Domain | None = None
+    rate: float = 0.1
+    coupling: float | None = None
+    exact: bool = True
+
+    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
+        """Return the gain; needs the extra `certify`.
+
+        Raises:
+            GainError: there is no such metric, or the domain does not fit.
+            MissingExtraError: the solver is not installed.
+        """
+        domain, linear = the_domain(model, self.domain), linearize(model)
+        found = jacobians(model, domain)
+        metric = contraction(found.matrices, linear.B, self.rate)
+        low = float(graph.grounded_spectrum()[0])
+        edge = metric.rho / (2.0 * low)
+        coupling = edge if self.coupling is None else float(self.coupling)
+        check_coupling(coupling)
+        R, strength = np.eye(len(model.input_names)), 2.0 * coupling * low
+        region, _ = contracting_region(
+            model, domain, found, metric.P, linear.B, R, strength, metric.rate, self.exact
+        )
+        certificate = certify(linear, graph, metric.P, R, coupling, edge=edge, region=region)
+        return Gain(metric.P, R, coupling, "contraction", certificate)

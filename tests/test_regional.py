@@ -1,0 +1,273 @@
+"""Gains with a promise on a domain, gain files, `check` and `design`."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon import cli
+from echelon._check import check
+from echelon._jacobians import has_constant_input_map, jacobians
+from echelon._numerics import precision
+from echelon.gains.regional import radius
+
+LINE = ech.Graph.path(4)
+DEG = np.pi / 180.0
+TILT = {"roll": 20 * DEG, "pitch": 20 * DEG, "yaw": 10 * DEG, "thrust": 2.0}
+
+
+def sentence(act):
+    with pytest.raises(ech.EchelonError) as caught:
+        act()
+    return str(caught.value)
+
+
+def rate_seen(model, gain, domain, low, count=500):
+    """The slowest contraction at random states of a domain, by eigenvalues of the inequality."""
+    from echelon._hull import model_jacobian
+    from echelon._linearization import linearize
+
+    states, inputs = domain.sample(count, seed=7)
+    with precision("float64"):
+        _, B = linearize(model)
+        jacobian = model_jacobian(model)
+        As = [np.asarray(jacobian(x, v)) for x, v in zip(states, inputs, strict=True)]
+    P, K = gain.P, np.linalg.solve(gain.R, B.T @ gain.P)
+    root = np.linalg.inv(np.linalg.cholesky(P))
+    worst = -np.inf
+    for A in As:
+        slope = P @ A + A.T @ P - 2.0 * gain.coupling * low * P @ B @ K
+        worst = max(worst, np.linalg.eigvalsh(root @ slope @ root.T)[-1])
+    return -0.5 * worst
+
+
+@pytest.fixture(scope="module")
+def robust():
+    return ech.synthesize(ech.QuadrotorThrust(), LINE, ech.RobustLQR(TILT, exact=True))
+
+
+def test_a_robust_gain_is_proved_and_no_sample_contradicts_it(robust):
+    region, model = robust.certificate.region, ech.QuadrotorThrust()
+    assert (region.kind, region.theorem) == ("proof", "T1")
+    assert region.rate >= 0.2 and np.linalg.cond(robust.P) <= 500
+    low = float(LINE.grounded_spectrum()[0])
+    assert rate_seen(model, robust, ech.Domain.about(model, TILT), low, 60) >= region.rate
+
+
+def test_the_certified_set_fits_into_the_domain(robust):
+    domain = ech.Domain.about(ech.QuadrotorThrust(), TILT)
+    r = robust.certificate.region.radius
+    assert r == radius(domain, robust.P)
+    W = np.linalg.inv(robust.P)
+    # The farthest point of {x'Px <= r^2} along state j is r sqrt(W_jj).
+    reach, margins = r * np.sqrt(np.diag(W)), domain.margins()
+    assert (reach <= margins * (1 + 1e-12)).all()
+    assert np.isclose((reach / margins).max(), 1.0)
+
+
+def test_only_a_constant_input_map_gives_the_nonlocal_theorem():
+    euler, thrust = ech.QuadrotorEuler(), ech.QuadrotorThrust()
+    with precision("float64"):
+        assert has_constant_input_map(thrust, ech.Domain.about(thrust, TILT))
+        assert not has_constant_input_map(euler, ech.Domain.about(euler, TILT))
+
+
+def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():
+    # sqrt(g)(1 - sqrt(cos th)) > damping: infeasible beyond 0.787 rad for 9.81 and 0.5.
+    pendulum = ech.Pendulum(damping=0.5)
+    edge = np.arccos((1.0 - 0.5 / np.sqrt(9.81)) ** 2)
+    gain = ech.synthesize(pendulum, LINE, ech.Monotone({"angle": 0.99 * edge}))
+    assert gain.certificate.region.theorem == "A5" and gain.certificate.region.kind == "vertices"
+    with precision("float64"):
+        found = jacobians(pendulum, ech.Domain.about(pendulum, {"angle": 0.99 * edge}))
+    for A in found.matrices:
+        assert np.linalg.eigvalsh(gain.P @ A + A.T @ gain.P).max() <= 1e-7 * np.abs(gain.P).max()
+    told = sentence(lambda: ech.synthesize(pendulum, LINE, ech.Monotone({"angle": 1.01 * edge})))
+    assert "no constant metric" in told
+
+
+@pytest.mark.parametrize("model", [ech.DoubleIntegrator(3), ech.PrintedQuadrotor()])
+def test_nilpotent_drifts_have_no_monotone_metric_and_the_block_is_named(model):
+    told = sentence(
+        lambda: (
+            ech.synthesize(model, LINE, ech.Monotone({"attitude": 0.2, "rate": 0.5}))
+            if model.state_groups.get("attitude")
+            else ech.synthesize(model, LINE, ech.Monotone({}))
+        )
+    )
+    assert "has a Jordan block on the imaginary axis, at 0" in told and "`vx`" in told
+
+
+def test_a_contraction_gain_is_the_weakest_and_keeps_its_rate():
+    model = ech.Pendulum()
+    gain = ech.synthesize(model, LINE, ech.Contraction({"angle": 1.0}, rate=0.5))
+    region = gain.certificate.region
+    assert region.kind == "proof" and region.rate >= 0.5 * (1 - 1e-5)
+    low = float(LINE.grounded_spectrum()[0])
+    assert rate_seen(model, gain, ech.Domain.about(model, {"angle": 1.0}), low) >= region.rate
+
+
+DOMAINS = {
+    "beyond the chart": (
+        {"pitch": 1.6},
+        "the domain of `pitch` reaches [-1.6, 1.6], and `Quadrotor` holds only inside "
+        "(-1.571, 1.571).",
+    ),
+    "inverted": (
+        {"roll": (0.2, -0.2)},
+        "the domain of `roll` is [0.2, -0.2], and must be finite with its lower end below its "
+        "upper.",
+    ),
+    "without the trim": (
+        {"roll": (0.1, 0.2)},
+        "the domain of `roll` is [0.1, 0.2], and must hold the trim, 0.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DOMAINS)
+def test_a_bad_domain_has_its_sentence(name):
+    bounds, told = DOMAINS[name]
+    assert sentence(lambda: ech.Domain.about(ech.Quadrotor(), bounds)) == told
+
+
+def test_a_domain_needs_known_names_and_all_bounds_that_matter():
+    euler = ech.QuadrotorEuler()
+    told = sentence(lambda: ech.Domain.about(euler, {"rol": 0.1}))
+    assert "did you mean `roll`?" in told
+    told = sentence(lambda: ech.synthesize(euler, LINE, ech.RobustLQR({"roll": 0.1})))
+    assert told.startswith("the domain leaves `pitch` unbounded")
+    told = sentence(lambda: ech.synthesize(euler, LINE, ech.RobustLQR()))
+    assert told.startswith("this method needs a `domain`")
+
+
+# ---- gain files ----
+
+
+@pytest.fixture
+def saved(tmp_path):
+    model = ech.Quadrotor.crazyflie()
+    gain = ech.synthesize(model, LINE, ech.InnerLoop())
+    ech.save_gain(gain, model, LINE, tmp_path / "gain.json")
+    return model, gain, tmp_path / "gain.json"
+
+
+def test_a_gain_comes_back_to_the_bit(saved):
+    model, gain, file = saved
+    again = ech.load_gain(file, model, LINE)
+    for name in ("P", "R", "inner", "R_inverse"):
+        assert getattr(again, name).tobytes() == getattr(gain, name).tobytes()
+    assert again.coupling == gain.coupling and again.method == "inner-loop"
+    assert again.certificate.abscissa == gain.certificate.abscissa
+
+
+def test_a_gain_for_another_model_or_graph_is_refused_with_the_reason(saved, tmp_path):
+    model, gain, file = saved
+    told = sentence(lambda: ech.load_gain(file, ech.Quadrotor(mass=0.03), LINE))
+    assert "made for another `Quadrotor`: input_scale differs by 0.002" in told
+    told = sentence(lambda: ech.load_gain(file, ech.PlanarQuadrotor(), LINE))
+    assert "made for `Quadrotor` with state_names" in told
+    told = sentence(lambda: ech.load_gain(file, model, ech.Graph.path(5)))
+    assert "made for a graph of 4 agents with lambda_min = 0.198062" in told
+    content = json.loads(file.read_text())
+    content["P"][0][0] = float("nan")
+    file.write_text(json.dumps(content))
+    assert "`P` holds a number that is not finite" in sentence(
+        lambda: ech.load_gain(file, model, LINE)
+    )
+    file.write_text("{}")
+    assert "is no gain file" in sentence(lambda: ech.load_gain(file, model, LINE))
+    assert "cannot be read" in sentence(lambda: ech.load_gain(tmp_path / "no.json", model, LINE))
+
+
+# ---- check and design ----
+
+
+def verdicts(scenario, *changes):
+    found = check(ech.build(ech.load_scenario(scenario, list(changes))))
+    return {line.statement: line for line in found.lines}, found
+
+
+def test_the_papers_own_experiment_is_checked_line_by_line():
+    lines, found = verdicts("paper-literal")
+    assert not found.promised
+    assert lines["detectability of (A, g'P)"].verdict == "fails"
+    assert lines["detectability of (A, g'P)"].number == "rank 4 of 12"
+    assert lines["finite condition on P"].verdict == "vacuous"
+    assert lines["LMI as printed"].verdict == "fails"
+    assert lines["Assumption 5, P-monotone drift"].verdict == "fails"
+    assert "no P > 0 can" in lines["Assumption 5, P-monotone drift"].text
+    lines, found = verdicts("paper")
+    assert found.promised and lines["disagreement decays"].verdict == "holds"
+    low, high = (float(part) for part in lines["gain margin"].number.split(" to "))
+    assert low <= 0.5 and high > 1e3
+    assert all(line.verdict in ("holds", "fails", "vacuous", "not needed") for line in found.lines)
+
+
+def test_an_inner_loop_makes_assumption_5_hold():
+    lines, found = verdicts("paper", "follower.gain={method: inner-loop}")
+    assert lines["Assumption 5, P-monotone drift"].verdict == "holds"
+    assert lines["Lemma 4, drift along z"].verdict == "holds" and found.promised
+
+
+def test_a_broken_offset_and_a_missing_relay_are_named():
+    lines, found = verdicts("paper", "formation.offsets.1=[1,0,0,0,0,0,0.2,0,0,0,0,0]")
+    assert lines["offsets are symmetries"].verdict == "fails" and not found.promised
+    assert lines["offsets are symmetries"].text.startswith("agent 1: it changes the drift")
+    lines, found = verdicts("paper", "follower.feedforward=none")
+    assert lines["leader's motion is matched"].verdict == "fails"
+    assert "once the leader's input rests" in found.promise
+
+
+@pytest.fixture
+def echelon(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        told = capsys.readouterr()
+        return left.value.code or 0, told.out, told.err
+
+    return call
+
+
+def test_check_exits_by_what_is_promised(echelon):
+    code, out, err = echelon("check", "paper")
+    assert (code, err) == (0, "") and "Promised, by linearization" in out
+    code, out, _ = echelon("check", "paper-literal", "--json")
+    assert code == 1 and json.loads(out)["promised"] is False
+
+
+def test_design_recommends_and_its_gain_runs(echelon):
+    code, out, _ = echelon("design", "paper", "--out", "gain.json", "--json")
+    told = json.loads(out)
+    assert code == 0 and told["recommended"] == "riccati"
+    assert {row["method"] for row in told["methods"]} >= {"riccati", "inner-loop", "monotone"}
+    quick = ["--set", "simulation.horizon=0.5", "--no-figures", "--json"]
+    text = ech.load_scenario("paper").text
+    text = text.replace("gain: {method: riccati}", "gain: {file: gain.json}")
+    with open("mine.yaml", "w") as mine:
+        mine.write(text)
+    code, out, err = echelon("run", "mine.yaml", *quick, "--out", "o")
+    assert (code, err) == (0, "")
+    _, direct, _ = echelon("run", "paper", *quick, "--out", "p")
+    ours, theirs = json.loads(out), json.loads(direct)
+    assert ours["followers"] == theirs["followers"] and ours["gain"] == theirs["gain"]
+    code, _, err = echelon("design", "paper", "--method", "ricatti")
+    assert code == 2 and "did you mean `riccati`?" in err
+
+
+def test_a_missing_solver_is_exit_code_four(echelon, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    with open("mine.yaml", "w") as mine:
+        mine.write(
+            "name: mine\nmodel: {name: pendulum}\ngraph: {name: path, agents: 3}\n"
+            "follower: {gain: {method: robust-lqr, domain: {angle: 0.5}}}\n"
+            "simulation: {horizon: 1.0, dt: 0.01}\n"
+        )
+    code, _, err = echelon("run", "mine.yaml")
+    assert code == 4 and "pip install" in err and "certify" in err
