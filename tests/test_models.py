@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import echelon.models
 from echelon import _numerics, _registry
+from echelon._numerics import precision
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -21,11 +22,15 @@ from echelon.models import (
     PlanarQuadrotor,
     PrintedQuadrotor,
     Quadrotor,
+    QuadrotorEuler,
+    QuadrotorThrust,
     SingleIntegrator,
     Unicycle,
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.models.quadrotor_euler import computed_torque
+from echelon.models.rigid_body import euler_rates
 
 rng = np.random.default_rng(7)
 A, B, C = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=(1, 3))
@@ -46,6 +51,8 @@ FAMILY = {
     "crazyflie": Quadrotor.crazyflie(),
     "big": Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0),
     "printed": PrintedQuadrotor(),
+    "euler": QuadrotorEuler(gravity=3.7),
+    "thrust": QuadrotorThrust(),
 }
 FLAT = {name: model for name, model in FAMILY.items() if model.flat_outputs}
 
@@ -99,6 +106,19 @@ EQUATIONS = {
     PlanarQuadrotor: planar,
     Quadrotor: lambda m, x, u: newton_euler(x, u, m.mass, m.inertia),
     PrintedQuadrotor: printed,
+    QuadrotorEuler: lambda m, x, u: [
+        *x[3:6],
+        *((m.gravity + u[0]) * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
+        *x[9:12],
+        *u[1:],
+    ],
+    QuadrotorThrust: lambda m, x, u: [
+        *x[3:6],
+        *((m.gravity + x[12]) * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
+        *x[9:12],
+        *u[1:],
+        u[0],
+    ],
 }
 
 
@@ -485,3 +505,29 @@ def test_an_agent_of_ones_own_may_replace_any_default_by_attribute_property_or_m
     assert model.input_scale == ((0.4,),) and model.state_units == ("K", "K")
     assert numpy(model.difference, np.ones(2), np.zeros(2)) == pytest.approx([2.0, 2.0])
     assert numpy(model.physical, np.array([2.0])) == pytest.approx([1.2])
+
+
+def test_computed_torque_turns_the_quadrotor_into_its_euler_form():
+    model, euler = FAMILY["big"], QuadrotorEuler()
+    for _ in range(20):
+        x = rng.uniform(-1.0, 1.0, 12)
+        v = rng.uniform(-3.0, 3.0, 4)
+        with precision("float64"):
+            u = computed_torque(model, jnp.asarray(x), jnp.asarray(v))
+            xdot = model.velocity(jnp.asarray(x), u)
+            # The Euler-angle rates of the vehicle, and how they change along its motion.
+            rates, accelerations = jax.jvp(
+                lambda y: euler_rates(y[6:9], y[9:12]), (jnp.asarray(x),), (xdot,)
+            )
+            seen = euler.velocity(jnp.concatenate([jnp.asarray(x)[:9], rates]), jnp.asarray(v))
+        assert np.asarray(seen[:9]) == pytest.approx(np.asarray(xdot[:9]), abs=1e-12)
+        assert np.asarray(accelerations) == pytest.approx(v[1:], abs=1e-10)
+
+
+def test_a_thrust_that_is_a_state_changes_nothing_but_its_lag():
+    euler, thrust = QuadrotorEuler(), QuadrotorThrust()
+    for _ in range(20):
+        x, v = rng.uniform(-1.0, 1.0, 12), rng.uniform(-3.0, 3.0, 4)
+        slow = numpy(thrust.velocity, np.append(x, v[0]), np.append(0.5, v[1:]))
+        assert slow[:12] == pytest.approx(numpy(euler.velocity, x, v), abs=1e-12)
+        assert slow[12] == 0.5

@@ -121,15 +121,14 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
         GainError: a mode forbids it, and is named, or no such P was found.
         MissingExtraError: cvxpy or clarabel is not installed.
     """
-    As = _vertices(As)
-    found = obstacle(As)
+    As, found = _vertices(As), obstacle(As)
     if found is not None:
         along = listing(names[i] if names else f"x{i + 1}" for i in found.states)
         kind = "a Jordan block on the imaginary axis" if found.defective else "an unstable mode"
+        what = f"matrix {found.vertex} has {kind}, at {found.eigenvalue:.3g} 1/s along {along}"
         raise GainError(
-            f"no P > 0 keeps this drift from expanding: matrix {found.vertex} has {kind}, at "
-            f"{found.eigenvalue:.3g} 1/s along {along}; damp it by an inner loop, shrink the "
-            "domain, or take a method with feedback."
+            f"no P > 0 keeps this drift from expanding: {what}; damp it by an inner loop, shrink "
+            "the domain, or take a method with feedback."
         )
     cp = _cvxpy()
     d = scipy.linalg.matrix_balance(np.abs(As).sum(0), permute=False, separate=True)[1][0]
@@ -152,10 +151,9 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
 def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Metric:
     """Return the P of least trace with A_k'P + P A_k + Q - P B R^-1 B'P <= 0 for all k.
 
-    The theorem needs rho = 1, that is c lambda_min >= 1/2, and the inequality, which the solver
-    meets to its accuracy, gives there half the smallest eigenvalue of P^-1 Q as rate; the rate that
-    is returned, and accepted if positive, is measured at that edge. At c = 1/lambda_min the
-    strength is 2, and `rate_of(P, As, B, R, 2.0)` is no smaller.
+    The theorem needs rho = 1, that is c lambda_min >= 1/2; there the inequality, which the solver
+    meets to its accuracy, gives half the smallest eigenvalue of P^-1 Q as rate, and there the rate
+    returned is measured. At c = 1/lambda_min `rate_of(P, As, B, R, 2.0)` is no smaller.
 
     Args:
         As: (K, n, n) vertices, 1/s.
@@ -169,16 +167,15 @@ def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Metric:
     """
     cp, As = _cvxpy(), _vertices(As)
     M = _scale(As, B, Q, R)
-    basis, unit = _basis(len(M)), np.eye(len(M))
+    basis, one = _basis(len(M)), np.eye(len(M))
     values, vectors = np.linalg.eigh(Q)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T @ np.linalg.inv(M)
     w, y = cp.Variable(len(basis)), cp.Variable(len(basis))
-    Z = cp.Variable(unit.shape, symmetric=True)
+    Z = cp.Variable(one.shape, symmetric=True)
     # Y stands for W Q W once for all vertices, which keeps each vertex's own cone at n x n.
     W, Y = _matrix(cp, basis, w), _matrix(cp, basis, y)
-    blocks = [[[Z, unit], [unit, W]], [[Y, W @ root.T], [root @ W, unit]]]
+    cones = [cp.bmat([[Z, one], [one, W]]) >> 0, cp.bmat([[Y, W @ root.T], [root @ W, one]]) >> 0]
     gaps = _gaps(cp, _stack(As, B, R, M, basis), cp.hstack([w, y, [-1.0]]))
-    cones = [cp.bmat(block) >> 0 for block in blocks]
     solved = _least(cp, cp.trace(M @ M.T @ Z), cones, gaps)
     P = _unscaled(W.value, M) if solved else None
     if P is None or rate_of(P, As, B, R, 1.0) <= 0.0:
@@ -210,16 +207,15 @@ def contraction(As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4) 
     n = As.shape[-1]
     M = _scale(As + rate * np.eye(n), B, np.eye(n), np.eye(B.shape[-1]))
     # The solver's error grows with W: it is asked for a little more than eigenvalues must show.
-    size = np.linalg.norm(M @ As @ np.linalg.inv(M), axis=(1, 2)).max()
-    shifted = As + (rate + _STRICT * size) * np.eye(n)
-    basis, unit = _basis(n), M @ M.T
+    more = _STRICT * np.linalg.norm(M @ As @ np.linalg.inv(M), axis=(1, 2)).max()
+    shifted, basis, unit = As + (rate + more) * np.eye(n), _basis(n), M @ M.T
     w, rho = cp.Variable(len(basis)), cp.Variable(nonneg=True)
     W = _matrix(cp, basis, w)
     gaps = _gaps(cp, _stack(shifted, B, None, M, basis[:0]), cp.hstack([w, -rho]))
     solved = _least(cp, rho, [W - unit >> 0, 0.999 * condition_max * unit - W >> 0], gaps)
     P = _unscaled(W.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
-    tried = [] if P is None else [float(rho.value) * more for more in (1.0, 1.0001, 1.01, 1.1)]
+    tried = [float(rho.value) * part for part in (1.0, 1.0001, 1.01, 1.1)] if solved else []
     enough = [s for s in tried if P is not None and rate_of(P, As, B, None, s) >= rate]
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(
@@ -253,7 +249,7 @@ def _drift(P: Matrix, As: Matrix, B: Matrix | None, R: Matrix | None, strength: 
 
 def _condition(P: Matrix) -> float:
     """Return the condition number of P, infinite where it is not positive definite."""
-    low, *_, high = np.linalg.eigvalsh(P)[[0, -1]]
+    low, high = np.linalg.eigvalsh(P)[[0, -1]]
     return float(high / low) if low > 0.0 else np.inf
 
 
@@ -272,17 +268,16 @@ def _measured(P: Matrix, As: Matrix, B: Matrix | None, R: Matrix | None, rho: fl
 def _axis_modes(A: Matrix) -> list[tuple[complex, Matrix, Matrix]]:
     """Return each s = i w, w >= 0, on the imaginary axis with right and left null space of A - s I.
 
-    Rounding scatters a Jordan block of size k by the k-th root of the machine epsilon and leaves
-    the mean of its eigenvalues in place, so means of clusters are tried, the widest first.
+    Rounding scatters the eigenvalues of a Jordan block and leaves their mean in place, so means of
+    clusters are tried, the widest first.
     """
-    size = float(np.linalg.norm(A, 2)) or 1.0
-    values = np.linalg.eigvals(A)
+    size, values = float(np.linalg.norm(A, 2)) or 1.0, np.linalg.eigvals(A)
     points: dict[float, complex] = {}
     for radius in size * 10.0 ** np.arange(-1.0, -11.0, -1.0):
         close = np.abs(values[:, None] - values) <= radius
         for mean in (close @ values) / close.sum(1):
             if abs(mean.real) <= _AXIS * size and mean.imag >= -_AXIS * size:
-                points.setdefault(round(float(mean.imag / size), 8), 1j * mean.imag)
+                points.setdefault(round(float(mean.imag / size), 10), 1j * mean.imag)
     cuts = [(s, *np.linalg.svd(A - s * np.eye(len(A)))) for s in points.values()]
     modes = [(s, v[w <= _AXIS * size].conj().T, u[:, w <= _AXIS * size]) for s, u, w, v in cuts]
     return [mode for mode in modes if mode[1].size]
@@ -370,8 +365,7 @@ def _stack(As: Matrix, B: Matrix, R: Matrix | None, M: Matrix, more: Matrix) -> 
 def _scale(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
     """Return M with M'M the Riccati P of the mean, so that metrics are near I in the states M x."""
     try:
-        P = riccati(As.mean(0), B if B.ndim == 2 else B.mean(0), Q, R)
-        return np.linalg.cholesky(P).T
+        return np.linalg.cholesky(riccati(As.mean(0), B if B.ndim == 2 else B.mean(0), Q, R)).T
     except (GainError, np.linalg.LinAlgError):
         return np.eye(As.shape[-1])
 

@@ -353,10 +353,8 @@ def _impulse_norms(A: Matrix, E: Matrix) -> Matrix:
         starts = np.concatenate([starts, scipy.linalg.expm(A * h) @ starts])
         steps = scipy.linalg.expm(A * (0.5 * h * (nodes + 1.0))[:, None, None])
         few = np.array_split(starts[:, None], 1 + len(starts) // 4096)
-        parts = [
-            np.tensordot(np.linalg.norm(steps @ some, axis=-1), weights, (1, 0)) for some in few
-        ]
-        parts = 0.5 * h * np.concatenate(parts)
+        rows = np.concatenate([np.linalg.norm(steps @ some, axis=-1) for some in few])
+        parts = 0.5 * h * np.einsum("pij,i->pj", rows, weights)
         total, halves = closed + parts.sum(0), parts.reshape(2, -1, len(A)).sum(0)
         still = (np.abs(halves - wholes) > 1e-8 * total + 1e-13 * total.max()).any(1)
         if first:
