@@ -134,6 +134,38 @@ def what_fails(seeds: Sequence[int]) -> list[Row]:
     ]
 
 
+def inner_loops() -> list[Row]:
+    """Quadrotors in a line by the inner-loop gain: the same coupling and step for all lengths."""
+    model, rows = ech.Quadrotor.crazyflie(), list[Row]()
+    for followers, horizon in ((3, 40.0), (10, 120.0), (30, 700.0)):
+        graph = ech.Graph.path(followers + 1)
+        result = ech.simulate(
+            model,
+            graph,
+            ech.Formation.line(model, graph, 0.5),
+            leader=ech.Tracking(ech.FigureEight()),
+            follower=ech.Consensus(
+                ech.synthesize(model, graph, ech.InnerLoop()), feedforward="relay"
+            ),
+            initial={"position": 1.0, "attitude": 0.3},
+            horizon=horizon,
+            dt=0.005,
+            store_every=100,
+        )
+        worst = formation_errors(result)[:, 1:].max(axis=1)
+        above = np.flatnonzero(worst > 1e-9)
+        reached = result.times[above[-1] + 1]
+        last = steady(result, 0.9 * horizon, horizon).max()
+        rows.append(
+            (
+                f"line of {followers} followers: time to 1e-9 m, then steady RMSE of the worst",
+                f"{reached:.1f} s, {last:.1e} m",
+                "1e-9 m",
+            )
+        )
+    return rows
+
+
 def chain_lag() -> Row:
     """Single integrators on the chain L-1-2-3 behind a leader at 1 m/s."""
     model, graph = ech.SingleIntegrator(1), ech.Graph.path(4)
@@ -232,6 +264,11 @@ def main() -> None:
         "of constant offsets, present from the first sample although the text says random starts, "
         "and not the error of a closed loop. The steady RMSE above is that of a closed loop from "
         "random starts; it too is rounding, of states of a few metres in float64.",
+        "## The inner loop",
+        "Gain `inner-loop`, coupling 3 and step 5 ms for every length, starts within 1 m, 0.3 rad "
+        "(seed 0), leader on a figure eight. The rate falls like the smallest eigenvalue of the "
+        "graph, 1/N^2 on a line; a graph with short paths to a leader shortens it.",
+        table(inner_loops()),
         "## What fails, and by how much",
         table(what_fails(seeds)),
         "## Closed forms",

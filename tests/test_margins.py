@@ -234,9 +234,11 @@ def test_a_spread_that_turns_an_input_around_is_refused():
 # ---- disturbances ----
 
 
-def l1_by_trapezoids(A, E, steps=50_000):
+def l1_by_trapezoids(A, E):
     """Integral of the row norms of exp(A t) E by a plain sum over one long sequence of powers."""
     horizon = 40.0 / -abscissa(A)
+    # A step of 1/50 of the fastest time constant: the rule is then off by 1/30,000 of its part.
+    steps = max(50_000, int(50.0 * horizon * np.abs(np.linalg.eigvals(A)).max()))
     h = horizon / steps
     block, values = E[None], np.array([scipy.linalg.expm(A * h)])
     while len(block) <= steps:
