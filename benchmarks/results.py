@@ -58,7 +58,7 @@ ORACLES = """Asserted by `tests/test_simulate.py`, against code that shares noth
 | Runge-Kutta with held input against DOP853 step by step, 4 quadrotors, 5 s | 4.9e-10 | 1e-9 |
 | measured order of Runge-Kutta and of Euler | 3.99, 1.03 | 3.8, 0.9 at least |
 | linear agents with held input against the matrix exponential | within | 1e-10 |
-| renaming agents permutes the run; moving all starts and the reference moves it | within | rounding |
+| renaming agents permutes the run; moving all starts moves it | within | rounding |
 
 `python3 dev.py demo` after set-up, import, compilation and figures included: 13.4 and 14.2 s in two
 runs on two cores."""
