@@ -221,6 +221,14 @@ def test_a_broken_offset_and_a_missing_relay_are_named():
     assert "once the leader's input rests" in found.promise
 
 
+def test_a_weak_input_weakens_the_trim_thrust_too():
+    # At the edge of the gain, on the line of 3: the published corner is -0.094 1/s.
+    edge = 0.5 / float(LINE.grounded_spectrum()[0])
+    lines, _ = verdicts("paper-line", f"follower.gain.coupling={edge!r}")
+    told = float(lines["input scaling"].number.removesuffix(" 1/s"))
+    assert told == pytest.approx(-0.094, abs=6e-4)
+
+
 @pytest.fixture
 def echelon(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)

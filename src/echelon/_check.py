@@ -11,7 +11,7 @@ import numpy as np
 from echelon import _margins
 from echelon._build import Parts
 from echelon._certificates import Certificate, Kind, certify
-from echelon._linearization import Linearization, linearize
+from echelon._linearization import Linearization, linearize, trim_slopes
 from echelon._lmi import obstacle
 from echelon._numerics import in_words, precision
 from echelon._types import Matrix, States
@@ -233,13 +233,17 @@ def _margin_lines(loop: _Loop) -> Iterator[Line]:
         return
     A, B = loop.linear
     given = (A, B, loop.P, loop.R, loop.coupling, loop.eigenvalues)
-    gain, delay = _margins.gain_margin(*given), _margins.delay_margin(*given)
-    number = f"{gain.low:.3g} to {gain.high:.3g}"
+    factors, delay = _margins.gain_margin(*given), _margins.delay_margin(*given)
+    number = f"{factors.low:.3g} to {factors.high:.3g}"
     yield Line("gain margin", "holds", "linearization", number, "factors on the coupling")
     number = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}"
     yield Line("delay margin", "holds", "linearization", number, text)
-    worst = _margins.input_scaling(*given)
+    # The trim input, and an inner loop's, weaken with the rest.
+    slopes, gain = trim_slopes(loop.parts.model), getattr(loop.parts.follower, "gain", None)
+    if isinstance(gain, Gain) and gain.inner is not None:
+        slopes = slopes - B.T[:, :, None] * gain.inner[:, None, :]
+    worst = _margins.input_scaling(*given, slopes=slopes)
     verdict = "holds" if worst.abscissa < 0.0 else "fails"
     text = "inputs 30 % weaker or stronger, as by a wrong mass or inertia"
     yield Line("input scaling", verdict, "linearization", f"{worst.abscissa:.3g} 1/s", text)

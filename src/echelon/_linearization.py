@@ -28,3 +28,16 @@ def linearize(model: ControlAffine) -> Linearization:
 @eqx.filter_jit
 def _slopes(model: ControlAffine, x: State) -> tuple[jax.Array, jax.Array]:
     return jax.jacfwd(model.normalized_drift)(x), model.normalized_input_map(x)
+
+
+def trim_slopes(model: ControlAffine) -> Matrix:
+    """Return u*_k dg_k/dx at the trim, (m, n, n): what each trim input puts into A."""
+    x = jnp.asarray(np.asarray(model.trim[0], float))
+    u = np.asarray(model.trim[1], np.float64)
+    slopes = np.moveaxis(np.asarray(_input_slopes(model, x), np.float64), 1, 0)
+    return u[:, None, None] * slopes
+
+
+@eqx.filter_jit
+def _input_slopes(model: ControlAffine, x: State) -> jax.Array:
+    return jax.jacfwd(model.input_map)(x)
