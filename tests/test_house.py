@@ -40,7 +40,7 @@ FLOORS = [
     ["_build", "_metrics", "_lyapunov"],
     ["_archive", "_check", "_design"],
     ["_explain", "_plots"],
-    ["_output", "_report", "_doctor"],
+    ["_output", "_report", "_doctor", "_tables"],
     ["cli"],
     ["__main__", ""],
 ]

@@ -3,20 +3,16 @@
 import contextlib
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from echelon import _tables
 from echelon._errors import EchelonError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from echelon._check import Line
-    from echelon._design import Design
     from echelon._simulate import Progress
 
 _EPILOG = (
@@ -89,7 +85,7 @@ def run(
     # Parts before the folder: a bad scenario must leave no empty folder behind.
     parts = _build.build(checked)
     folder = _output.claim_folder(checked.name, out, force)
-    console = _console()
+    console = _tables.console()
     with _progress(quiet=as_json) as progress:
         result = _build.run(checked, progress, parts)
     _output.write_data(result, folder)
@@ -128,8 +124,8 @@ def check(
             )
         )
     else:
-        console = _console()
-        console.print(_lines(found.lines), soft_wrap=not console.is_terminal)
+        console = _tables.console()
+        console.print(_tables.lines_table(found.lines), soft_wrap=not console.is_terminal)
         console.print(found.promise, highlight=False, soft_wrap=not console.is_terminal)
     raise typer.Exit(0 if found.promised else 1)
 
@@ -155,12 +151,12 @@ def design(
     parts = _build.build(checked)
     tried = _design.designs(checked, parts, method)
     best = _design.recommended(tried)
-    rows = [_design_row(each) for each in tried]
+    rows = [_tables.design_row(each) for each in tried]
     if as_json:
         chosen = best.method if best else None
         print(json.dumps({"recommended": chosen, "methods": rows}, indent=2))
     else:
-        _print_designs(rows, best.method if best else None)
+        _tables.print_designs(rows, best.method if best else None)
     if out is not None and best is not None and best.gain is not None:
         _gain_file.save_gain(best.gain, parts.model, parts.graph, out)
     raise typer.Exit(0 if best is not None else 1)
@@ -207,8 +203,8 @@ def doctor(as_json: _Json = False) -> None:
             json.dumps({"facts": facts, "checks": [check._asdict() for check in checks]}, indent=2)
         )
     else:
-        console = _console()
-        console.print(_pairs(facts))
+        console = _tables.console()
+        console.print(_tables.pairs(facts))
         for check in checks:
             verdict = "[green]pass[/]" if check.holds else "[red]FAIL[/]"
             console.print(f"{verdict}  {check.claim} ({check.found})", highlight=False)
@@ -224,22 +220,6 @@ def schema() -> None:
     print(json.dumps(json_schema(), indent=2))
 
 
-def _console() -> "Console":
-    """Return a console that keeps tables whole where the output is no terminal."""
-    from rich.console import Console
-
-    return Console() if sys.stdout.isatty() else Console(width=200)
-
-
-def _pairs(facts: dict[str, str]) -> "Table":
-    from rich.table import Table
-
-    table = Table.grid(padding=(0, 2))
-    for name, text in facts.items():
-        table.add_row(name, text)
-    return table
-
-
 def _known_method(method: str | None) -> None:
     from echelon._errors import GainError, did_you_mean, listing
     from echelon._registry import METHODS
@@ -249,80 +229,6 @@ def _known_method(method: str | None) -> None:
             f"`--method` is `{method}`, allowed are {listing(METHODS)}"
             f"{did_you_mean(method, METHODS)}."
         )
-
-
-def _design_row(design: "Design") -> dict[str, Any]:
-    """Return what is told of a design; what does not exist is None."""
-    row: dict[str, Any] = {"method": design.method, "reason": design.reason}
-    gain = design.gain
-    if gain is None:
-        return {**row, "seconds": design.seconds}
-    import numpy as np
-
-    certificate, region = gain.certificate, gain.certificate.region
-    return {
-        **row,
-        "coupling": gain.coupling,
-        "edge": certificate.edge,
-        "slowest_mode": certificate.abscissa,
-        "fastest_mode": design.fastest,
-        "condition": float(np.linalg.cond(gain.P)),
-        "region_rate": None if region is None else region.rate,
-        "region_kind": None if region is None else region.kind,
-        "theorem": None if region is None else region.theorem,
-        "radius": None if region is None else region.radius,
-        "seconds": design.seconds,
-    }
-
-
-def _print_designs(rows: list[dict[str, Any]], chosen: str | None) -> None:
-    from rich import box
-    from rich.table import Table
-
-    console = _console()
-    keys = {
-        "method": "method",
-        "coupling": "coupling",
-        "edge": "edge",
-        "slowest_mode": "slowest,\n1/s",
-        "fastest_mode": "fastest,\n1/s",
-        "condition": "cond(P)",
-        "region_rate": "rate on\ndomain, 1/s",
-        "region_kind": "kind",
-        "theorem": "theorem",
-        "radius": "radius",
-        "seconds": "seconds",
-    }
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for key, title in keys.items():
-        table.add_column(title, justify="left" if key == "method" else "right")
-    for row in rows:
-        table.add_row(*(_cell(row.get(key)) for key in keys))
-    console.print(table)
-    for row in rows:
-        if row["reason"]:
-            text = f"- {row['method']}: {row['reason']}"
-            console.print(text, highlight=False, markup=False, soft_wrap=not console.is_terminal)
-    text = f"Recommended: {chosen}." if chosen else "No method gives a stable loop here."
-    console.print(text, highlight=False)
-
-
-def _cell(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    return "-" if value is None else str(value)
-
-
-def _lines(lines: "Iterable[Line]") -> "Table":
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in ("statement", "verdict", "kind", "number", "why, or what to change"):
-        table.add_column(column)
-    for line in lines:
-        table.add_row(*(text.replace("[", "\\[") for text in line))
-    return table
 
 
 @contextlib.contextmanager
