@@ -105,6 +105,7 @@ def test_defaults():
             "parameters": None,
             "allow_unphysical": False,
         },
+        "plant": None,
         "graph": {
             "edges": None,
             "name": "path",
@@ -136,6 +137,7 @@ def test_defaults():
             "trim": True,
         },
         "initial": {"spread": None, "states": None},
+        "disturbance": None,
         "simulation": {
             "horizon": 30.0,
             "dt": 0.01,
@@ -252,9 +254,9 @@ def test_a_missing_key_is_told_at_its_parent(refused, key):
 
 def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
-        "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `graph`, `formation`,"
-        " `reference`, `leader`, `follower`, `initial`, `simulation`, `report`, `seed` (did you"
-        " mean `seed`?)."
+        "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
+        " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`, `simulation`,"
+        " `report`, `seed` (did you mean `seed`?)."
     ]
 
 
@@ -360,9 +362,9 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     with pytest.raises(ScenarioError) as caught:
         load_scenario(file)
     assert str(caught.value) == (
-        f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `graph`,"
-        " `formation`, `reference`, `leader`, `follower`, `initial`, `simulation`, `report`,"
-        " `seed`."
+        f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
+        " `graph`, `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
+        " `simulation`, `report`, `seed`."
     )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from echelon._archive import dataset, save_dataset, summary
     from echelon._build import build, run
+    from echelon._disturbance import Disturbance
     from echelon._domain import Domain
     from echelon._errors import EchelonError, Outcome
     from echelon._formation import Formation
@@ -67,6 +68,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "_archive": ("dataset", "save_dataset", "summary"),
     "_build": ("build", "run"),
+    "_disturbance": ("Disturbance",),
     "_domain": ("Domain",),
     "_errors": ("EchelonError", "Outcome"),
     "_formation": ("Formation",),
@@ -127,6 +129,7 @@ __all__ = [
     "Consensus",
     "Contraction",
     "ControlAffine",
+    "Disturbance",
     "Domain",
     "DoubleIntegrator",
     "EchelonError",

@@ -10,6 +10,7 @@ import numpy as np
 
 from echelon._lyapunov import lyapunov
 from echelon._metrics import Metrics, metrics
+from echelon._plant import differences
 from echelon._result import Result
 from echelon.gains.gain import Gain
 
@@ -66,7 +67,8 @@ def _attributes(result: Result) -> dict[str, Any]:
         f"{role}_needs": "; ".join(law.needs) or "nothing"
         for role, law in (("leader", result.leader), ("follower", result.follower))
     }
-    told = {"outcome": result.outcome.name.lower(), "message": result.message}
+    told = {key: text for key, text in imperfections(result).items() if text is not None}
+    told |= {"outcome": result.outcome.name.lower(), "message": result.message}
     warnings = {"warnings": "\n".join(result.warnings)}
     return {
         **result.provenance,
@@ -75,6 +77,15 @@ def _attributes(result: Result) -> dict[str, Any]:
         **settings,
         **laws,
         "model": type(result.model).__name__,
+    }
+
+
+def imperfections(result: Result) -> dict[str, str | None]:
+    """Return in words how the plant differs from the model, and what disturbed it; else None."""
+    plant, disturbance = result.plant, result.disturbance
+    return {
+        "plant": None if plant is None else differences(result.model, plant),
+        "disturbance": None if disturbance is None else str(disturbance),
     }
 
 
@@ -102,6 +113,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         "horizon_s": result.settings.horizon,
         "dt_s": result.settings.dt,
         "seed": result.settings.seed,
+        **imperfections(result),
         "leader": numbers.leader._asdict(),
         "followers": [_follower(each._asdict()) for each in numbers.followers],
         "edges": [

@@ -2,6 +2,7 @@
 
 import math
 
+from echelon._disturbance import Disturbance
 from echelon._errors import SimulationError, did_you_mean, listing
 from echelon._formation import Formation
 from echelon._graph import Graph
@@ -11,10 +12,14 @@ from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 
 
-def check_parts(graph: object, formation: object, leader: object, follower: object) -> None:
+def check_parts(
+    graph: object, formation: object, leader: object, follower: object, disturbance: object
+) -> None:
     """Check that each part is what its place asks for."""
     wanted = {"graph": (graph, Graph), "formation": (formation, Formation)}
     wanted |= {"leader": (leader, Law), "follower": (follower, Law)}
+    if disturbance is not None:
+        wanted["disturbance"] = disturbance, Disturbance
     for place, (part, kind) in wanted.items():
         if not isinstance(part, kind):
             got = (

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from echelon import _registry
+from echelon._disturbance import Disturbance
 from echelon._errors import (
     EchelonError,
     MissingExtraError,
@@ -25,6 +26,7 @@ from echelon._formation import Formation
 from echelon._gain_file import load_gain
 from echelon._graph import Graph
 from echelon._numerics import precision
+from echelon._plant import check_plant, varied
 from echelon._provenance import versions
 from echelon._result import Result
 from echelon._scenario import Fault, Scenario, by_line
@@ -38,7 +40,10 @@ from echelon.models.model import ControlAffine
 
 
 class Parts(NamedTuple):
-    """What a scenario is made of, ready for `simulate`; `settings` are its other arguments."""
+    """What a scenario is made of, ready for `simulate`; `settings` are its other arguments.
+
+    Plant and disturbance stand there too, None where the scenario has none.
+    """
 
     model: ControlAffine
     graph: Graph
@@ -100,7 +105,10 @@ def _with_laws(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Any
 ) -> Parts:
     """Return the parts that need a model and a graph, with these."""
-    formation = leader = follower = None
+    formation = leader = follower = plant = None
+    with faults.at("plant"):
+        plant = _plant(scenario, model)
+    disturbance = _disturbance(scenario, faults, model)
     with faults.at("formation"):
         formation = _formation(scenario, model, graph)
     with faults.at("follower"):
@@ -122,7 +130,7 @@ def _with_laws(
         cast(Formation, formation),
         cast(Law, leader),
         cast(Law, follower),
-        _settings(scenario),
+        {**_settings(scenario), "plant": plant, "disturbance": disturbance},
     )
 
 
@@ -243,6 +251,26 @@ def _is_model(value: object) -> bool:
 
 def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or ["no message"])[0].rstrip(".")
+
+
+def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
+    spec = scenario.plant
+    if spec is None:
+        return None
+    plant = varied(model, spec.parameters, spec.scale)
+    check_model(plant)
+    check_plant(model, plant)
+    return plant
+
+
+def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Disturbance | None:
+    spec = scenario.disturbance
+    if spec is None:
+        return None
+    for key in ("constant", "rms", "input_rms"):
+        with faults.at("disturbance", key):
+            Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
+    return Disturbance(**spec.model_dump())
 
 
 def _graph(scenario: Scenario) -> Graph:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echelon._archive import gain_of
+from echelon._archive import gain_of, imperfections
 from echelon._certificates import Certificate
 from echelon._errors import Outcome
 from echelon._linearization import linearize
@@ -20,7 +20,12 @@ _LAG = 1e-6
 
 def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     """Return what happened, why, and what to be wary of, a sentence each."""
-    return (*_story(result, numbers), *_promises(result), *_lyapunov_story(result))
+    return (
+        *_story(result, numbers),
+        *_imperfections(result),
+        *_promises(result),
+        *_lyapunov_story(result),
+    )
 
 
 def _story(result: Result, numbers: Metrics) -> Iterator[str]:
@@ -116,6 +121,15 @@ def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
         )
 
 
+def _imperfections(result: Result) -> Iterator[str]:
+    """Tell what the laws did not know."""
+    told = imperfections(result)
+    if told["plant"]:
+        yield f"Plant: {told['plant']}; laws and gains know the model alone."
+    if told["disturbance"]:
+        yield f"Disturbance: {told['disturbance']}; no law is told of it."
+
+
 def _promises(result: Result) -> Iterator[str]:
     """Say what the gain promises, and what the law needs to be told."""
     gain = gain_of(result)
@@ -163,14 +177,15 @@ def _lyapunov_story(result: Result) -> Iterator[str]:
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
     rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
-    if forbidden:
+    if forbidden and result.disturbance is None:
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
             f"Warning: V rises at {forbidden} of {len(v.value) - 1} frames (first at {when:.4g} s) "
             "although V' <= 0 there; the step `dt` is too long for this gain."
         )
     elif rises:
-        yield f"V rises at {rises} of {len(v.value) - 1} frames; {_excuse(v)}."
+        excuse = _excuse(v) if result.disturbance is None else "the disturbance pushes it up"
+        yield f"V rises at {rises} of {len(v.value) - 1} frames; {excuse}."
     else:
         yield f"V never rises: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."
 

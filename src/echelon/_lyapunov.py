@@ -1,6 +1,6 @@
 """The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and why it falls or rises."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
+from echelon._disturbance import Wind, disturbed
 from echelon._graph import Graph
 from echelon._numerics import precision
 from echelon._result import Result
@@ -59,7 +60,9 @@ def lyapunov(result: Result) -> Lyapunov | None:
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
-        f, xdot = (np.asarray(part) for part in _fields(result.follower, result.model, x, u))
+        steps = jnp.asarray(np.rint(result.times / result.settings.dt).astype(np.int32))
+        fields = _fields(result.follower, result.moved, _wind(result), x, u, steps)
+        f, xdot = (np.asarray(part) for part in fields)
         y = result.states - result.formation.offsets
         z, zdot = (_disagreement(result.graph, part) for part in (y, xdot))
         delta = _grounded_inverse(result.graph, z)
@@ -71,13 +74,28 @@ def lyapunov(result: Result) -> Lyapunov | None:
         return Lyapunov(value, np.einsum("tia,ab,tib->t", delta, P, zdot), drift)
 
 
+def _wind(result: Result) -> Wind | None:
+    if result.disturbance is None:
+        return None
+    return result.disturbance.prepared(result.moved, result.settings.dt, result.settings.seed)
+
+
 @eqx.filter_jit
 def _fields(
-    law: Law, model: ControlAffine, x: jax.Array, u: jax.Array
+    law: Law,
+    plant: ControlAffine,
+    wind: Wind | None,
+    x: jax.Array,
+    u: jax.Array,
+    steps: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the law's drift and xdot for x (T, N, n), u (T, N, m)."""
-    over = jax.vmap(jax.vmap(lambda x, u: (law.drift(model, x), model.velocity(x, u))))
-    return over(x, u)
+    """Return the law's drift and xdot for x (T, N, n), u (T, N, m) at steps (T,)."""
+
+    def one(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> tuple[Any, Any]:
+        return law.drift(plant, x), disturbed(plant, wind, step, agent)(x, u)
+
+    over = jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
+    return over(x, u, jnp.arange(x.shape[1]), steps)
 
 
 def _disagreement(graph: Graph, values: Matrix) -> Matrix:

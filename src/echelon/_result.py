@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from echelon._disturbance import Disturbance
 from echelon._errors import Outcome
 from echelon._formation import Formation
 from echelon._graph import Graph
@@ -39,6 +40,8 @@ class Result:
         outcome: how the run ended; `message` says it with time and agent.
         warnings: what is allowed but probably not meant, one sentence each.
         model, graph, formation, leader, follower, settings: the parts that ran.
+        plant: the agents as they were, or None where that is `model`.
+        disturbance: the wind and noise that acted, or None.
         wall_time: seconds of computing, compilation included.
         provenance: scenario text, versions and the like, as text.
     """
@@ -58,6 +61,8 @@ class Result:
     follower: Law
     settings: Settings
     wall_time: float
+    plant: ControlAffine | None = None
+    disturbance: Disturbance | None = None
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
@@ -68,6 +73,11 @@ class Result:
         """
         y = self.states - self.formation.offsets
         return y - y[:, list(self.graph.nearest_leader())]
+
+    @property
+    def moved(self) -> ControlAffine:
+        """What moved: the plant, or the model where no other was given."""
+        return self.model if self.plant is None else self.plant
 
     @property
     def measured(self) -> tuple[int, ...]:

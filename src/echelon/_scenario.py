@@ -16,12 +16,14 @@ from echelon._errors import ScenarioError, did_you_mean, listing
 from echelon._scenario_checks import cross_faults, number_of
 from echelon._scenario_parts import (
     STRICT,
+    DisturbanceSpec,
     FollowerSpec,
     FormationSpec,
     GraphSpec,
     InitialSpec,
     LeaderSpec,
     ModelSpec,
+    PlantSpec,
     ReferenceSpec,
     ReportSpec,
     SimulationSpec,
@@ -40,12 +42,14 @@ class Scenario(BaseModel):
 
     name: Annotated[str, Field(pattern=FOLDER_NAME)] = Field(description="Name of its folder.")
     model: ModelSpec
+    plant: PlantSpec | None = None
     graph: GraphSpec
     formation: FormationSpec = Field(default_factory=FormationSpec)
     reference: ReferenceSpec | None = None
     leader: LeaderSpec = Field(default_factory=LeaderSpec)
     follower: FollowerSpec = Field(default_factory=FollowerSpec)
     initial: InitialSpec = Field(default_factory=InitialSpec)
+    disturbance: DisturbanceSpec | None = None
     simulation: SimulationSpec
     report: ReportSpec = Field(default_factory=ReportSpec)
     seed: Seed = Field(default=0, description="Seed of everything random in the run.")

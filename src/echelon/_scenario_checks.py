@@ -239,6 +239,14 @@ def _following(data: Part) -> Iterator[Fault]:
         yield ("reference",), f"{said}, allowed is one only with the law `tracking`."
 
 
+def _changed(data: Part) -> Iterator[Fault]:
+    """Yield parameters of the plant that are both given and scaled."""
+    given, scaled = (_section(data, "plant", key) for key in ("parameters", "scale"))
+    for name in (name for name in scaled if isinstance(name, str) and name in given):
+        said = "got a factor on a parameter that `plant.parameters` gives"
+        yield ("plant", "scale", name), f"{said}, allowed is one of them."
+
+
 def _durations(data: Part) -> Iterator[Fault]:
     simulation = _section(data, "simulation")
     horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
@@ -264,4 +272,5 @@ def cross_faults(document: Document) -> Iterator[Fault]:
     yield from _grid(data)
     yield from _members(data)
     yield from _following(data)
+    yield from _changed(data)
     yield from _durations(data)

@@ -25,6 +25,7 @@ from echelon._scenario_values import (
     Edges,
     Matrix,
     MatrixOrIdentity,
+    NotNegative,
     Numbers,
     Numeric,
     OneOf,
@@ -58,6 +59,21 @@ class ModelSpec(BaseModel):
     )
     allow_unphysical: bool = Field(
         default=False, description="Accept parameters that no body can have."
+    )
+
+
+@final
+class PlantSpec(BaseModel):
+    """The agents as they are, where they differ from the model that laws and gains know."""
+
+    model_config = STRICT
+
+    parameters: dict[str, Numeric] = Field(
+        default={}, description="Parameters that differ, in the model's units."
+    )
+    scale: dict[str, Positive] = Field(
+        default={},
+        description="Factors on the model's parameters, without unit; on each number of a list.",
     )
 
 
@@ -205,13 +221,41 @@ class InitialSpec(BaseModel):
 
     model_config = STRICT
 
-    spread: dict[str, Annotated[float, Field(ge=0)]] | None = Field(
+    spread: dict[str, NotNegative] | None = Field(
         default=None,
         description="Half-width of the spread, by state or group, in the states' units.",
     )
     states: dict[int, Numbers] | None = Field(
         default=None,
         description="All states of an agent, in the states' units; the others start on goal.",
+    )
+
+
+@final
+class DisturbanceSpec(BaseModel):
+    """Wind and noise that act on all agents."""
+
+    model_config = STRICT
+
+    constant: dict[str, float] = Field(
+        default={},
+        description="Lasting wind by state or group, in the states' units per second: m/s^2 for a "
+        "velocity.",
+    )
+    rms: dict[str, NotNegative] = Field(
+        default={},
+        description="Root mean square of the random wind by state or group, for each state, in the "
+        "states' units per second.",
+    )
+    input_rms: dict[str, NotNegative] = Field(
+        default={},
+        description="Root mean square of the noise by input, in normalised inputs; no limit "
+        "touches it.",
+    )
+    hold: Positive = Field(default=0.5, description="How long a random draw lasts, s.")
+    common: bool = Field(default=False, description="Whether all agents feel the same random wind.")
+    seed: Seed | None = Field(
+        default=None, description="Seed of wind and noise; default the scenario's."
     )
 
 

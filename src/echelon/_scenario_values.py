@@ -127,6 +127,7 @@ _EDGE = {
 }
 
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]

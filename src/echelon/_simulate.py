@@ -15,14 +15,16 @@ import numpy as np
 
 from echelon import _numerics
 from echelon._arguments import check_parts, check_settings, formation_warnings
-from echelon._errors import ModelError, Outcome, SimulationError
+from echelon._disturbance import Disturbance
+from echelon._errors import ModelError, Outcome
 from echelon._formation import Formation
-from echelon._graph import Exchange, Graph
+from echelon._graph import Graph
 from echelon._initial import Initial, initial_states
+from echelon._loop import Loop, Moment, assemble, control, step
+from echelon._plant import check_plant
 from echelon._result import Result, Settings
-from echelon._types import Inputs, Matrix, States
-from echelon.gains.gain import Gain
-from echelon.laws.law import Law, LocalView, Memory
+from echelon._types import Matrix
+from echelon.laws.law import Law, Memory
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
 
@@ -30,41 +32,6 @@ Progress = Callable[[int, int], None]
 """Called now and then with the steps done and the steps in all."""
 
 _CHUNKS = 100
-
-
-class Loop(eqx.Module):
-    """All that never changes during a run.
-
-    Agents are kept in their own order; leaders act first in a step.
-    """
-
-    model: ControlAffine
-    leader: Law
-    follower: Law
-    exchange: Exchange
-    offsets: Matrix
-    leaders: Matrix
-    followers: Matrix
-    sender: Matrix
-    order: Matrix
-    normalizer: Matrix
-    dt: float = eqx.field(static=True)
-    integrator: str = eqx.field(static=True)
-    limits: bool = eqx.field(static=True)
-
-
-class Moment(NamedTuple):
-    """All that changes during a run.
-
-    The step number, the states (N, n), the memories of leaders and followers, and the number of
-    saturated steps (N,).
-    """
-
-    step: jax.Array
-    states: States
-    leader_memory: Memory
-    follower_memory: Memory
-    saturated: jax.Array
 
 
 def simulate(
@@ -76,6 +43,8 @@ def simulate(
     follower: Law,
     initial: Initial = None,
     start_error: Mapping[str, float] | None = None,
+    plant: ControlAffine | None = None,
+    disturbance: Disturbance | None = None,
     horizon: float,
     dt: float,
     integrator: str = "rk4",
@@ -97,12 +66,15 @@ def simulate(
             within +- the number); or states (n,) by agent, all others on their goals; or all states
             (N, n).
         start_error: what is added to the leaders' starts, per state or group.
+        plant: the agents as they are, where they differ from `model`: these move and have these
+            actuators, and laws, gains and feed-forward go on knowing `model` alone.
+        disturbance: wind and noise on all agents.
         horizon: length of the run, s; rounded to whole steps.
         dt: step, s.
         integrator: `rk4`, `euler` or `printed`; the input is held over a step.
-        limits: whether the model's actuator limits act.
+        limits: whether the actuators' limits act.
         store_every: steps between stored frames; the last state is always stored.
-        seed: of the random starts.
+        seed: of the random starts, and of the disturbance unless it has its own.
         precision: `float64` or `float32`, whatever the flags of JAX are.
         progress: called about a hundred times with (steps done, steps in all).
 
@@ -112,12 +84,12 @@ def simulate(
     """
     settings = Settings(horizon, dt, integrator, limits, store_every, precision, seed)
     check_settings(settings)
-    check_parts(graph, formation, leader, follower)
+    check_parts(graph, formation, leader, follower, disturbance)
     began = time.perf_counter()
     with _numerics.precision("float64"):
-        warnings = check_model(model)
+        warnings = _checked(model, plant)
         leader, follower = leader.prepared(model, graph), follower.prepared(model, graph)
-        loop = _assemble(model, graph, formation, leader, follower, settings)
+        loop = assemble(model, graph, formation, leader, follower, settings, plant, disturbance)
         states = initial_states(model, graph, formation, leader, initial, start_error or {}, seed)
     with _numerics.precision(precision):
         record = _run(loop, states, _frame_counts(settings), progress)
@@ -140,103 +112,20 @@ def simulate(
         leader=leader,
         follower=follower,
         settings=settings,
+        plant=plant,
+        disturbance=disturbance,
         wall_time=time.perf_counter() - began,
     )
 
 
-def _assemble(
-    model: ControlAffine,
-    graph: Graph,
-    formation: Formation,
-    leader: Law,
-    follower: Law,
-    settings: Settings,
-) -> Loop:
-    shape = (graph.agents, len(model.state_names))
-    if formation.offsets.shape != shape:
-        raise SimulationError(
-            f"the formation has offsets {formation.offsets.shape}, and {graph.agents} agents "
-            f"with {shape[1]} states need {shape}."
-        )
-    leaders, followers = np.array(graph.leaders), np.array(graph.followers)
-    nearest = np.array(graph.nearest_leader())
-    return Loop(
-        model=model,
-        leader=_lean(leader),
-        follower=_lean(follower),
-        exchange=graph.exchange(),
-        offsets=np.asarray(formation.offsets),
-        leaders=leaders,
-        followers=followers,
-        sender=np.searchsorted(leaders, nearest[followers]),
-        order=np.argsort(np.concatenate([leaders, followers])),
-        normalizer=np.linalg.inv(np.asarray(model.input_scale, float)),
-        dt=settings.dt,
-        integrator=settings.integrator,
-        limits=settings.limits,
-    )
-
-
-def _lean(law: Law) -> Law:
-    """Return a law whose gains carry no certificate and a traced coupling.
-
-    So another coupling or another graph of the same size compiles nothing again.
-    """
-
-    def lean(node: Any) -> Any:
-        if not isinstance(node, Gain):
-            return node
-        parts = (np.asarray(node.coupling), None)
-        return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
-
-    return jax.tree.map(lean, law, is_leaf=lambda node: isinstance(node, Gain))
-
-
-# ---- one step ------------------------------------------------------------------------------------
-
-
-def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]:
-    """Return delivered inputs (N, m), who saturated (N,), and the next memories.
-
-    The memories are those of the leaders, then those of the followers.
-    """
-    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
-    y = x - offsets
-    z = loop.exchange(y, y)
-    t = now.step.astype(x.dtype) * loop.dt
-
-    def act(law: Law, who: Matrix, said: Inputs, memory: Memory) -> tuple[Inputs, Inputs, Memory]:
-        view = LocalView(t, x[who], offsets[who], z[who], said)
-        axes = LocalView(None, 0, 0, 0, 0)  # type: ignore[arg-type]
-        wanted, memory = jax.vmap(law.update, in_axes=(None, axes, 0))(loop.model, view, memory)
-        return wanted, jax.vmap(loop.model.limit)(wanted) if loop.limits else wanted, memory
-
-    silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
-    wanted_l, u_l, memory_l = act(loop.leader, loop.leaders, silence, now.leader_memory)
-    said = _relayed(loop, x[loop.leaders], u_l)
-    wanted_f, u_f, memory_f = act(loop.follower, loop.followers, said, now.follower_memory)
-    u = jnp.concatenate([u_l, u_f])[loop.order]
-    wanted = jnp.concatenate([wanted_l, wanted_f])[loop.order]
-    limited = jnp.any((u != wanted) & ~jnp.isnan(wanted), axis=1)
-    return u, limited, memory_l, memory_f
-
-
-def _relayed(loop: Loop, x: States, u: Inputs) -> jax.Array:
-    """Return what each follower is told of its leader, (followers, m), from its x and u."""
-    if loop.follower.asks() == "none":
-        return jnp.zeros((len(loop.followers), u.shape[1]), u.dtype)
-    trim = jnp.asarray(loop.model.trim[1], u.dtype)
-    v = (u - trim[None]) @ jnp.asarray(loop.normalizer, u.dtype).T
-    told = jax.vmap(loop.follower.message, in_axes=(None, 0, 0))(loop.model, x, v)
-    return told[loop.sender]
-
-
-def step(loop: Loop, now: Moment) -> Moment:
-    """Advance all agents by one dt with the inputs held."""
-    u, limited, memory_l, memory_f = control(loop, now)
-    integrate = _numerics.INTEGRATORS[loop.integrator]
-    states = jax.vmap(lambda x, u: integrate(loop.model.velocity, x, u, loop.dt))(now.states, u)
-    return Moment(now.step + 1, states, memory_l, memory_f, now.saturated + limited)
+def _checked(model: ControlAffine, plant: ControlAffine | None) -> tuple[str, ...]:
+    """Check the model, and the plant where there is one; return the warnings about both."""
+    warnings = check_model(model)
+    if plant is None:
+        return warnings
+    moved = check_model(plant)
+    check_plant(model, plant)
+    return tuple(dict.fromkeys((*warnings, *moved)))
 
 
 @eqx.filter_jit
