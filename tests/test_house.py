@@ -28,9 +28,11 @@ FLOORS = [
     ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact", "_margins"],
     ["_scenario_values", "models.model", "references.reference", "_graph", "_hull_curves", "_lmi"]
     + ["_casadi"],
-    ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors", "_hull_algebra"],
-    ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"],
-    ["_certificates", "_domain", "models.quadrotor_euler", "_hull_trace"],
+    ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors", "_hull_algebra"]
+    + ["_optimal_control"],
+    ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"]
+    + ["_transcription"],
+    ["_certificates", "_domain", "models.quadrotor_euler", "_hull_trace", "_plan"],
     ["_hull"],
     ["_jacobians"],
     ["gains.gain", "laws.law"],

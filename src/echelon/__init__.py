@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from echelon._graph import Graph
     from echelon._lyapunov import Lyapunov, lyapunov
     from echelon._metrics import Metrics, metrics
+    from echelon._optimal_control import Constraint, OptimalControl
+    from echelon._plan import Plan, Planner, plan
     from echelon._plots import figures, save_figures
     from echelon._report import report
     from echelon._result import Result
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
         UnicyclePoint,
         VanDerPol,
     )
+    from echelon.models.model import Limits
     from echelon.references import (
         Circle,
         FigureEight,
@@ -74,6 +77,8 @@ _HOMES = {
     "_graph": ("Graph",),
     "_lyapunov": ("Lyapunov", "lyapunov"),
     "_metrics": ("Metrics", "metrics"),
+    "_optimal_control": ("Constraint", "OptimalControl"),
+    "_plan": ("Plan", "Planner", "plan"),
     "_plots": ("figures", "save_figures"),
     "_report": ("report",),
     "_result": ("Result",),
@@ -108,6 +113,7 @@ _HOMES = {
         "UnicyclePoint",
         "VanDerPol",
     ),
+    "models.model": ("Limits",),
     "references": (
         "Circle",
         "FigureEight",
@@ -125,6 +131,7 @@ __all__ = [
     "Certificate",
     "Circle",
     "Consensus",
+    "Constraint",
     "Contraction",
     "ControlAffine",
     "Domain",
@@ -139,6 +146,7 @@ __all__ = [
     "InnerLoop",
     "Law",
     "Lemniscate",
+    "Limits",
     "Line",
     "Linear",
     "LocalView",
@@ -146,10 +154,13 @@ __all__ = [
     "Method",
     "Metrics",
     "Monotone",
+    "OptimalControl",
     "Outcome",
     "Passive",
     "Pendulum",
+    "Plan",
     "PlanarQuadrotor",
+    "Planner",
     "PrintedQuadrotor",
     "Quadrotor",
     "QuadrotorEuler",
@@ -174,6 +185,7 @@ __all__ = [
     "load_scenario",
     "lyapunov",
     "metrics",
+    "plan",
     "report",
     "run",
     "save_dataset",

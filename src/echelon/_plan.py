@@ -10,7 +10,7 @@ import numpy as np
 from echelon._casadi import casadi
 from echelon._errors import PlanError, listing
 from echelon._numerics import precision
-from echelon._problem import OptimalControl
+from echelon._optimal_control import OptimalControl
 from echelon._transcription import Program, transcribe
 from echelon._types import Matrix
 from echelon.models.check import check_model
@@ -57,18 +57,10 @@ class Plan:
 
 
 _DEFAULTS: dict[str, dict[str, Any]] = {
-    "ipopt": {"expand": True, "ipopt.print_level": 0, "ipopt.sb": "yes"},
-    "fatrop": {"expand": True, "structure_detection": "auto", "fatrop.print_level": 0},
-    "sqpmethod": {
-        "expand": True,
-        "qpsol": "qrqp",
-        "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
-        "print_header": False,
-        "print_iteration": False,
-        "print_status": False,
-    },
+    "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes"},
+    "fatrop": {"structure_detection": "auto", "fatrop.print_level": 0},
 }
-"""What makes a solver silent, and fast on these programs."""
+"""What makes a solver silent, and shows it the structure."""
 
 
 class Planner:
@@ -243,7 +235,8 @@ _WORDS = {
 
 
 def _message(solver: str, status: str, solved: bool, missed: tuple[Violation, ...]) -> str:
-    words = _WORDS.get(status, f"it ended with the status `{status}`")
+    usual = "Solve_Succeeded" if solved else status
+    words = _WORDS.get(status, _WORDS.get(usual, f"it ended with the status `{status}`"))
     told = f"{solver} {'solved' if solved else 'failed to solve'} the problem: {words}"
     if solved or not missed:
         return f"{told}."

@@ -12,7 +12,7 @@ import numpy as np
 from echelon._casadi import casadi, casadi_function
 from echelon._errors import PlanError
 from echelon._numerics import rk4
-from echelon._problem import OptimalControl
+from echelon._optimal_control import OptimalControl
 from echelon._types import Matrix
 from echelon.models.model import ControlAffine
 
