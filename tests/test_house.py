@@ -33,7 +33,7 @@ FLOORS = [
     ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"]
     + ["_transcription"],
     ["_certificates", "_domain", "models.quadrotor_euler", "_hull_trace", "_plan"],
-    ["_hull"],
+    ["_hull", "_demand", "_planar_baseline"],
     ["_jacobians"],
     ["gains.gain", "laws.law"],
     ["_initial", "_result", "laws.consensus", "gains.riccati", "gains.regional"],
