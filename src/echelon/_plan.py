@@ -57,10 +57,10 @@ class Plan:
 
 
 _DEFAULTS: dict[str, dict[str, Any]] = {
-    "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes"},
+    "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.bound_relax_factor": 0.0},
     "fatrop": {"structure_detection": "auto", "fatrop.print_level": 0},
 }
-"""What makes a solver silent, and shows it the structure."""
+"""What makes a solver silent, exact about limits, and aware of the structure."""
 
 
 class Planner:
@@ -246,10 +246,11 @@ def _message(solver: str, status: str, solved: bool, missed: tuple[Violation, ..
 
 def _violations(program: Program, g: Matrix) -> tuple[Violation, ...]:
     """Return by how much each kind of constraint is missed at most, the largest first."""
-    amounts = np.maximum(program.low - g, g - program.high)
+    sizes = np.array([row.size for row in program.rows])
+    amounts = sizes * np.maximum(program.low - g, g - program.high)
     worst: dict[str, Violation] = {}
     for row, amount in zip(program.rows, amounts.tolist(), strict=True):
         known = worst.get(row.name)
-        if not amount <= _FELT and (known is None or not amount <= known.amount):
+        if not amount <= _FELT * row.size and (known is None or not amount <= known.amount):
             worst[row.name] = Violation(row.name, amount, row.time)
     return tuple(sorted(worst.values(), key=lambda v: -v.amount))

@@ -3,7 +3,7 @@
 An agent plans its whole flight, off-line and open loop, given the plans of its neighbours that come
 before it in the graph. As printed, three things are wrong with the problem, and each has a repair.
 The distance term beta (d - |G_i - G_j|) is linear, so the farther apart the better; the terminal
-cost x(T)' P x(T) pulls to the origin, wherever the path ends; and an open loop integrates the noise.
+cost x(T)' P x(T) pulls to the origin, wherever the path ends; and an open loop adds up the noise.
 """
 
 import dataclasses

@@ -18,10 +18,14 @@ from echelon.models.model import ControlAffine
 
 
 class Row(NamedTuple):
-    """What one constraint of the program says, and at which time (s)."""
+    """What one row of the program's constraints says, at which time (s), and by what it is divided.
+
+    Solvers forgive the same small number in every row, which would be much of a torque in N m.
+    """
 
     name: str
     time: float
+    size: float = 1.0
 
 
 class Program(NamedTuple):
@@ -99,6 +103,7 @@ def _parts(problem: OptimalControl) -> _Parts:
     stage = _scalar("stage", casadi_function("stage", problem.stage, n, m, k))
     terminal = _scalar("terminal", casadi_function("terminal", problem.terminal, n, k))
     matrix = problem.bounds.matrix if problem.bounds else np.zeros((0, m))
+    matrix = np.array(matrix, float) / np.array([size for _, _, size in _limits(problem)])[:, None]
     kept = [
         casadi_function(f"c{i}", one.function, n, k, owner=one.name)(x, p)
         for i, one in enumerate(problem.constraints)
@@ -111,7 +116,7 @@ def _parts(problem: OptimalControl) -> _Parts:
         ca.Function("move", [x, v, y, w], [gap]),
         ca.Function("stage", [x, v, p], [stage(x, u, p)]),
         terminal,
-        ca.Function("limit", [v], [ca.DM(np.array(matrix)) @ u]),
+        ca.Function("limit", [v], [ca.DM(matrix) @ u]),
         ca.Function("restrict", [x, p], [ca.vertcat(ca.SX(0, 1), *kept)]),
     )
 
@@ -142,14 +147,15 @@ def _scalar(name: str, function: Any) -> Any:
 
 def _rows(problem: OptimalControl) -> tuple[Matrix, Matrix, tuple[Row, ...]]:
     """Return the bounds of g and what each row says, in the order of `transcribe`."""
-    n, m, k = len(problem.model.state_names), len(problem.model.input_names), problem.parameters
-    motion = [(0.0, 0.0, f"motion of {name}") for name in problem.model.state_names]
-    begin = [(0.0, 0.0, f"start of {name}") for name in problem.model.state_names]
-    bounds = problem.bounds
-    pairs = zip(bounds.low, bounds.high, strict=True) if bounds else ()
-    limits = [(low, high, f"actuator limit {j + 1}") for j, (low, high) in enumerate(pairs)]
+    n, k = len(problem.model.state_names), problem.parameters
+    motion = [(0.0, 0.0, f"motion of {name}", 1.0) for name in problem.model.state_names]
+    begin = [(0.0, 0.0, f"start of {name}", 1.0) for name in problem.model.state_names]
+    limits = [
+        (low / size, high / size, f"actuator limit {j + 1}", size)
+        for j, (low, high, size) in enumerate(_limits(problem))
+    ]
     kept = [
-        (low, high, one.name)
+        (low, high, one.name, 1.0)
         for one in problem.constraints
         for low, high in _bounds(one, casadi_function("c", one.function, n, k).numel_out())
     ]
@@ -157,12 +163,23 @@ def _rows(problem: OptimalControl) -> tuple[Matrix, Matrix, tuple[Row, ...]]:
     steps += [motion + limits + kept for _ in range(problem.steps - 1)]
     steps += [(limits if problem.nodes > problem.steps else []) + kept]
     table = [
-        (low, high, Row(name, step * problem.dt))
+        (low, high, Row(name, step * problem.dt, size))
         for step, rows in enumerate(steps)
-        for low, high, name in rows
+        for low, high, name, size in rows
     ]
     low, high, rows = zip(*table, strict=True)
     return np.array(low, float), np.array(high, float), tuple(rows)
+
+
+def _limits(problem: OptimalControl) -> list[tuple[float, float, float]]:
+    """Return the bounds of each row of the input limits, and the larger one's size."""
+    if problem.bounds is None:
+        return []
+    pairs = zip(problem.bounds.low, problem.bounds.high, strict=True)
+    sizes = (
+        (low, high, max(abs(b) for b in (low, high, 0.0) if np.isfinite(b))) for low, high in pairs
+    )
+    return [(low, high, size or 1.0) for low, high, size in sizes]
 
 
 def _bounds(constraint: Any, count: int) -> list[tuple[float, float]]:
