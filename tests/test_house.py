@@ -32,9 +32,9 @@ FLOORS = [
     + ["_optimal_control"],
     ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"]
     + ["_transcription"],
-    ["_certificates", "_domain", "models.quadrotor_euler", "_hull_trace", "_plan"],
-    ["_hull", "_demand", "_planar_baseline"],
-    ["_jacobians"],
+    ["_certificates", "_domain", "models.quadrotor_euler", "_hull_trace", "_infeasible"],
+    ["_hull", "_demand", "_plan"],
+    ["_jacobians", "_planar_baseline"],
     ["gains.gain", "laws.law"],
     ["_initial", "_result", "laws.consensus", "gains.riccati", "gains.regional"],
     ["_arguments"],

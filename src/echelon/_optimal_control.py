@@ -23,19 +23,21 @@ TRANSCRIPTIONS = ("shooting", "collocation")
 
 
 class Constraint(NamedTuple):
-    """low <= function(x, p) <= high at every time of the grid but the first, which is given.
+    """low <= function(x, p) <= high at all times of the grid but the first, whose state is given.
 
     Attributes:
         name: what it is called in messages.
         function: written with `jax.numpy`, of the state (n,) and the time's parameters (k,); it
             returns a number or an array.
         low, high: a number, or one for each entry; equal ones make an equation.
+        end: whether it holds at the horizon only.
     """
 
     name: str
     function: Callable[[State, jax.Array], jax.Array]
     low: float | Sequence[float] = -np.inf
     high: float | Sequence[float] = 0.0
+    end: bool = False
 
 
 def _nothing(x: State, p: jax.Array) -> Scalar:

@@ -3,28 +3,18 @@
 import dataclasses
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from echelon._casadi import casadi
 from echelon._errors import PlanError, listing
+from echelon._infeasible import Violation, least_violations, violations
 from echelon._numerics import precision
 from echelon._optimal_control import OptimalControl
 from echelon._transcription import Program, transcribe
 from echelon._types import Matrix
 from echelon.models.check import check_model
-
-_FELT = 1e-6
-"""A constraint that is missed by less than this counts as met."""
-
-
-class Violation(NamedTuple):
-    """By how much a plan misses a constraint at most, in the constraint's own units, and when."""
-
-    name: str
-    amount: float
-    time: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +28,8 @@ class Plan:
         cost: the value of the cost.
         solved: whether the solver reached its tolerance.
         message: how it ended, with the constraints that are missed most if any are.
-        violations: what is missed by more than 1e-6, the largest first.
+        violations: what is missed by more than 1e-6, the largest first; where the solver found a
+            contradiction, what must be missed at least if all else is met.
         iterations: of the solver.
         seconds: of solving.
         multipliers: of the variables' bounds and of the constraints, for a warm start.
@@ -70,6 +61,7 @@ class Planner:
         problem: what to solve.
         solver: a nonlinear solver of CasADi: `ipopt`, `fatrop`, `sqpmethod`, ...
         options: for it, by CasADi's names, on top of what makes it silent.
+        explain: whether to look, after a contradiction, for the least that must be missed.
 
     Raises:
         EchelonError: the model or the problem is malformed, or casadi is missing.
@@ -80,8 +72,9 @@ class Planner:
         problem: OptimalControl,
         solver: str = "ipopt",
         options: Mapping[str, Any] | None = None,
+        explain: bool = True,
     ) -> None:
-        self.problem, self.solver = problem, solver
+        self.problem, self.solver, self.explain = problem, solver, explain
         ca = casadi()
         if not ca.has_nlpsol(solver):
             known = ("ipopt", "fatrop", "sqpmethod")
@@ -125,7 +118,8 @@ class Planner:
         data |= self._begin(x, guess)
         began = time.perf_counter()
         solution = self._solve(**data)
-        return self._plan(solution, self._solve.stats(), time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        return self._plan(solution, data["p"], self._solve.stats(), seconds)
 
     def _begin(self, x: Matrix, guess: Any) -> dict[str, Any]:
         """Return where the solver begins."""
@@ -146,22 +140,24 @@ class Planner:
         body = np.hstack([states[:N], v[:N]]).ravel()
         return {"x0": np.concatenate([body, states[N], v[N:].ravel()]), **multipliers}
 
-    def _plan(self, solution: Any, stats: Mapping[str, Any], seconds: float) -> Plan:
+    def _plan(self, solution: Any, data: Matrix, stats: Mapping[str, Any], seconds: float) -> Plan:
         problem = self.problem
         n, m, N = len(problem.model.state_names), len(problem.model.input_names), problem.steps
         w, g = np.array(solution["x"]).ravel(), np.array(solution["g"]).ravel()
         body, tail = w[: N * (n + m)].reshape(N, n + m), w[N * (n + m) :]
         v = np.vstack([body[:, n:], tail[n:].reshape(-1, m)])
-        missed = _violations(self.program, g)
-        solved = bool(stats["success"])
+        solved, status = bool(stats["success"]), str(stats["return_status"])
+        missed, least = violations(self.program, g), ()
+        if status in _CONTRADICTION and self.explain:
+            least = least_violations(self.program, w, data)
         return Plan(
             times=problem.dt * np.arange(N + 1),
             states=np.vstack([body[:, :n], tail[:n]]),
             inputs=np.array(problem.model.trim[1]) + v @ _scale(problem).T,
             cost=float(solution["f"]),
             solved=solved,
-            message=_message(self.solver, str(stats["return_status"]), solved, missed),
-            violations=missed,
+            message=_message(self.solver, status, solved, least or missed, bool(least)),
+            violations=least or missed,
             iterations=int(stats.get("iter_count", 0)),
             seconds=seconds,
             multipliers=(
@@ -234,23 +230,17 @@ _WORDS = {
 }
 
 
-def _message(solver: str, status: str, solved: bool, missed: tuple[Violation, ...]) -> str:
+_CONTRADICTION = ("Infeasible_Problem_Detected", "Restoration_Failed")
+
+
+def _message(
+    solver: str, status: str, solved: bool, missed: tuple[Violation, ...], least: bool
+) -> str:
     usual = "Solve_Succeeded" if solved else status
     words = _WORDS.get(status, _WORDS.get(usual, f"it ended with the status `{status}`"))
     told = f"{solver} {'solved' if solved else 'failed to solve'} the problem: {words}"
     if solved or not missed:
         return f"{told}."
     largest = "; ".join(f"`{v.name}` by {v.amount:.3g} at {v.time:.3g} s" for v in missed[:3])
-    return f"{told}; what is missed most: {largest}."
-
-
-def _violations(program: Program, g: Matrix) -> tuple[Violation, ...]:
-    """Return by how much each kind of constraint is missed at most, the largest first."""
-    sizes = np.array([row.size for row in program.rows])
-    amounts = sizes * np.maximum(program.low - g, g - program.high)
-    worst: dict[str, Violation] = {}
-    for row, amount in zip(program.rows, amounts.tolist(), strict=True):
-        known = worst.get(row.name)
-        if not amount <= _FELT * row.size and (known is None or not amount <= known.amount):
-            worst[row.name] = Violation(row.name, amount, row.time)
-    return tuple(sorted(worst.values(), key=lambda v: -v.amount))
+    what = "what is missed at least" if least else "what is missed most"
+    return f"{told}; {what}: {largest}."

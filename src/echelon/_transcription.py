@@ -12,20 +12,26 @@ import numpy as np
 from echelon._casadi import casadi, casadi_function
 from echelon._errors import PlanError
 from echelon._numerics import rk4
-from echelon._optimal_control import OptimalControl
+from echelon._optimal_control import Constraint, OptimalControl
 from echelon._types import Matrix
 from echelon.models.model import ControlAffine
 
 
 class Row(NamedTuple):
-    """What one row of the program's constraints says, at which time (s), and by what it is divided.
+    """What one row of the program's constraints says.
 
-    Solvers forgive the same small number in every row, which would be much of a torque in N m.
+    Attributes:
+        name: of the constraint.
+        time: at which it holds, s.
+        size: by which it is divided. Solvers forgive the same small number in every row, which
+            would be much of a torque in N m.
+        own: whether it is one of the problem's constraints, not of the agent.
     """
 
     name: str
     time: float
     size: float = 1.0
+    own: bool = False
 
 
 class Program(NamedTuple):
@@ -49,7 +55,8 @@ class _Parts(NamedTuple):
     stage: Any
     terminal: Any
     limit: Any
-    restrict: Any
+    keep: Any
+    end: Any
 
 
 def transcribe(problem: OptimalControl) -> Program:
@@ -75,10 +82,11 @@ def transcribe(problem: OptimalControl) -> Program:
     cost += parts.terminal(x[:, -1], p[:, -1])
     gaps = parts.move.map(N)(*ends)
     limits = parts.limit.map(problem.nodes)(v)
-    kept = parts.restrict.map(N)(x[:, 1:], p[:, 1:])
+    kept = parts.keep.map(N)(x[:, 1:], p[:, 1:])
     first = ca.vertcat(gaps[:, 0], x[:, 0] - start, limits[:, 0])
     middle = ca.vec(ca.vertcat(gaps[:, 1:], limits[:, 1:N], kept[:, :-1]))
-    last = ca.vertcat(*([limits[:, -1]] if problem.nodes > N else []), kept[:, -1])
+    closing = [limits[:, -1]] if problem.nodes > N else []
+    last = ca.vertcat(*closing, kept[:, -1], parts.end(x[:, -1], p[:, -1]))
     low, high, rows = _rows(problem)
     return Program(
         {
@@ -104,10 +112,11 @@ def _parts(problem: OptimalControl) -> _Parts:
     terminal = _scalar("terminal", casadi_function("terminal", problem.terminal, n, k))
     matrix = problem.bounds.matrix if problem.bounds else np.zeros((0, m))
     matrix = np.array(matrix, float) / np.array([size for _, _, size in _limits(problem)])[:, None]
-    kept = [
-        casadi_function(f"c{i}", one.function, n, k, owner=one.name)(x, p)
-        for i, one in enumerate(problem.constraints)
-    ]
+
+    def joined(name: str, end: bool) -> Any:
+        values = [f(x, p) for one, f in _constraints(problem) if one.end is end]
+        return ca.Function(name, [x, p], [ca.vertcat(ca.SX(0, 1), *values)])
+
     if problem.transcription == "shooting":
         gap = y - _flow(field, problem.substeps, problem.dt)(x, u)
     else:
@@ -117,8 +126,18 @@ def _parts(problem: OptimalControl) -> _Parts:
         ca.Function("stage", [x, v, p], [stage(x, u, p)]),
         terminal,
         ca.Function("limit", [v], [ca.DM(matrix) @ u]),
-        ca.Function("restrict", [x, p], [ca.vertcat(ca.SX(0, 1), *kept)]),
+        joined("keep", False),
+        joined("end", True),
     )
+
+
+def _constraints(problem: OptimalControl) -> list[tuple[Constraint, Any]]:
+    """Return each constraint with its `casadi.Function` of x and p."""
+    n, k = len(problem.model.state_names), problem.parameters
+    return [
+        (one, casadi_function(f"c{i}", one.function, n, k, owner=one.name))
+        for i, one in enumerate(problem.constraints)
+    ]
 
 
 def _physical(model: ControlAffine, v: Any) -> Any:
@@ -147,25 +166,28 @@ def _scalar(name: str, function: Any) -> Any:
 
 def _rows(problem: OptimalControl) -> tuple[Matrix, Matrix, tuple[Row, ...]]:
     """Return the bounds of g and what each row says, in the order of `transcribe`."""
-    n, k = len(problem.model.state_names), problem.parameters
-    motion = [(0.0, 0.0, f"motion of {name}", 1.0) for name in problem.model.state_names]
-    begin = [(0.0, 0.0, f"start of {name}", 1.0) for name in problem.model.state_names]
+    motion = [(0.0, 0.0, f"motion of {name}") for name in problem.model.state_names]
+    begin = [(0.0, 0.0, f"start of {name}") for name in problem.model.state_names]
     limits = [
         (low / size, high / size, f"actuator limit {j + 1}", size)
         for j, (low, high, size) in enumerate(_limits(problem))
     ]
-    kept = [
-        (low, high, one.name, 1.0)
-        for one in problem.constraints
-        for low, high in _bounds(one, casadi_function("c", one.function, n, k).numel_out())
-    ]
+    kept, ending = (
+        [
+            (low, high, one.name, 1.0, True)
+            for one, f in _constraints(problem)
+            if one.end is end
+            for low, high in _bounds(one, f.numel_out())
+        ]
+        for end in (False, True)
+    )
     steps = [motion + begin + limits]
     steps += [motion + limits + kept for _ in range(problem.steps - 1)]
-    steps += [(limits if problem.nodes > problem.steps else []) + kept]
+    steps += [(limits if problem.nodes > problem.steps else []) + kept + ending]
     table = [
-        (low, high, Row(name, step * problem.dt, size))
+        (row[0], row[1], Row(row[2], step * problem.dt, *row[3:]))
         for step, rows in enumerate(steps)
-        for low, high, name, size in rows
+        for row in rows
     ]
     low, high, rows = zip(*table, strict=True)
     return np.array(low, float), np.array(high, float), tuple(rows)
@@ -182,7 +204,7 @@ def _limits(problem: OptimalControl) -> list[tuple[float, float, float]]:
     return [(low, high, size or 1.0) for low, high, size in sizes]
 
 
-def _bounds(constraint: Any, count: int) -> list[tuple[float, float]]:
+def _bounds(constraint: Constraint, count: int) -> list[tuple[float, float]]:
     """Return a constraint's bounds row by row."""
     try:
         low = np.broadcast_to(np.asarray(constraint.low, float), (count,))
