@@ -89,8 +89,9 @@ class Planner:
         try:
             self._solve = ca.nlpsol("plan", solver, self.program.problem, chosen)
         except RuntimeError as error:
-            told = str(error).strip().splitlines()[-1].rstrip(".")
-            raise PlanError(f"`{solver}` refuses the problem or its options: {told}.") from error
+            raise PlanError(
+                f"`{solver}` refuses the problem or its options: {_complaint(error)}."
+            ) from error
 
     def solve(
         self,
@@ -113,7 +114,7 @@ class Planner:
         problem, program = self.problem, self.program
         n, N, k = len(problem.model.state_names), problem.steps, problem.parameters
         x = _numbers("start", start, (n,))
-        p = _numbers("parameters", np.zeros(k) if parameters is None else parameters, (N + 1, k))
+        p = _numbers("parameters", parameters if k else np.zeros(0), (N + 1, k), repeat=True)
         data = {"p": np.concatenate([x, p.ravel()]), "lbg": program.low, "ubg": program.high}
         data |= self._begin(x, guess)
         began = time.perf_counter()
@@ -127,7 +128,10 @@ class Planner:
         shapes = (problem.steps + 1, len(x)), (problem.nodes, len(problem.model.input_names))
         multipliers = {}
         if guess is None:
-            states, inputs = np.tile(x, (shapes[0][0], 1)), np.array([problem.model.trim[1]])
+            states, inputs = (
+                np.tile(x, (shapes[0][0], 1)),
+                np.tile(problem.model.trim[1], (problem.nodes, 1)),
+            )
         elif isinstance(guess, Plan):
             states, inputs = guess.states, guess.inputs
             multipliers = dict(zip(("lam_x0", "lam_g0"), guess.multipliers, strict=True))
@@ -196,17 +200,27 @@ def _scale(problem: OptimalControl) -> Matrix:
     return np.array(problem.model.input_scale)
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Matrix:
-    """Return finite numbers of a shape, repeated along the first axis where there is but one."""
+def _numbers(name: str, value: Any, shape: tuple[int, ...], repeat: bool = False) -> Matrix:
+    """Return finite numbers of a shape; a single row of it is repeated if that is allowed."""
     try:
         array = np.asarray(value, np.float64)
-        array = np.broadcast_to(array, shape) if array.shape != shape else array
     except (TypeError, ValueError):
-        got = np.shape(value) if hasattr(value, "shape") else value
-        raise PlanError(f"`{name}` is {got}, and must be numbers of shape {shape}.") from None
+        array = np.zeros(())
+    if repeat and array.shape == shape[1:]:
+        array = np.tile(array, (shape[0], 1))
+    if array.shape != shape:
+        got = f"of shape {value.shape}" if hasattr(value, "shape") else value
+        raise PlanError(f"`{name}` is {got}, and must be numbers of shape {shape}.")
     if not np.isfinite(array).all():
         raise PlanError(f"`{name}` holds a number that is not finite.")
     return array
+
+
+def _complaint(error: RuntimeError) -> str:
+    """Return the line of a message of CasADi's that speaks of options, or else its last."""
+    lines = str(error).strip().splitlines()
+    line = next((line for line in lines if "option: " in line), lines[-1])
+    return line.partition(": ")[2].rstrip(".") or line.rstrip(".")
 
 
 # ---- the ending in words -------------------------------------------------------------------------
