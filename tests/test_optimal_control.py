@@ -329,6 +329,31 @@ def test_a_malformed_problem_is_told(changes, said):
         dataclasses.replace(transfer(5), **changes)
 
 
+def test_a_model_whose_limits_no_solver_can_read_is_told():
+    class Clipped(ech.ControlAffine):
+        state_names = ("x",)
+        input_names = ("v",)
+
+        def drift(self, x):
+            return 0.0 * x
+
+        def input_map(self, x):
+            return jnp.ones((1, 1), x.dtype)
+
+        def limit(self, u):
+            return jnp.clip(u, -1.0, 1.0)
+
+    said = (
+        "`Clipped` has a `limit`, and plans need it as `input_limits` too; add them to the model, "
+        "or give `limits`."
+    )
+    with pytest.raises(PlanError, match=f"^{re.escape(said)}$"):
+        ech.OptimalControl(Clipped(), 1.0, 5, effort)
+    assert ech.OptimalControl(Clipped(), 1.0, 5, effort, limits=False).bounds is None
+    assert ech.OptimalControl(Clipped(), 1.0, 5, effort, limits=PUSH).bounds == PUSH
+    assert ech.OptimalControl(CART, 1.0, 5, effort).bounds is None
+
+
 @pytest.mark.parametrize(
     "changes, said",
     [

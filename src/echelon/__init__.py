@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from echelon._metrics import Metrics, metrics
     from echelon._optimal_control import Constraint, OptimalControl
     from echelon._plan import Plan, Planner, plan
+    from echelon._planar_baseline import PlanarBaseline
     from echelon._plots import figures, save_figures
     from echelon._report import report
     from echelon._result import Result
@@ -79,6 +80,7 @@ _HOMES = {
     "_metrics": ("Metrics", "metrics"),
     "_optimal_control": ("Constraint", "OptimalControl"),
     "_plan": ("Plan", "Planner", "plan"),
+    "_planar_baseline": ("PlanarBaseline",),
     "_plots": ("figures", "save_figures"),
     "_report": ("report",),
     "_result": ("Result",),
@@ -159,6 +161,7 @@ __all__ = [
     "Passive",
     "Pendulum",
     "Plan",
+    "PlanarBaseline",
     "PlanarQuadrotor",
     "Planner",
     "PrintedQuadrotor",

@@ -96,6 +96,8 @@ class OptimalControl:
             raise PlanError(
                 f"`transcription` is `{self.transcription}`, allowed are {listing(TRANSCRIPTIONS)}."
             )
+        if self.limits is True:
+            _check_known(self.model)
         _check_limits(self.bounds, len(self.model.input_names))
 
     @property
@@ -120,6 +122,14 @@ def _check_whole(name: str, value: object, least: int) -> None:
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
         hint = "; the horizon must hold at least one step" if name == "steps" else ""
         raise PlanError(f"`{name}` is {value}, and must be a whole number from {least} on{hint}.")
+
+
+def _check_known(model: ControlAffine) -> None:
+    if model.input_limits is None and type(model).limit is not ControlAffine.limit:
+        raise PlanError(
+            f"`{type(model).__name__}` has a `limit`, and plans need it as `input_limits` too; add "
+            "them to the model, or give `limits`."
+        )
 
 
 def _check_limits(limits: Limits | None, m: int) -> None:
