@@ -261,3 +261,16 @@ def test_graphs_are_values_that_cannot_be_changed():
         graph.edges[0, 0] = 2
     with pytest.raises(ValueError, match="read-only"):
         graph.weights[0] = 2.0
+
+
+@given(graphs())
+def test_outward_goes_by_distance_and_lists_the_neighbours_passed_on_the_way(graph):
+    order = [agent for agent, _ in graph.outward()]
+    far = nx.multi_source_dijkstra_path_length(
+        nx.Graph([(int(i), int(j)) for i, j in graph.edges]), set(graph.leaders)
+    )
+    assert [(far[i], i) for i in order] == sorted((far[i], i) for i in range(graph.agents))
+    for place, (agent, earlier) in enumerate(graph.outward()):
+        passed = {j for j in graph.neighbours(agent) if j in order[:place]}
+        assert set(earlier) == (set() if agent in graph.leaders else passed)
+        assert bool(earlier) == (agent not in graph.leaders)

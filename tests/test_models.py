@@ -191,6 +191,23 @@ def test_the_trim_is_an_equilibrium_within_the_limits(model):
 
 
 @every_model
+def test_the_limits_for_solvers_are_those_of_the_actuators(model):
+    limits = model.input_limits
+    u0, size = np.array(model.trim[1]), np.array(model.input_scale)
+    draws = [
+        u0 + size @ (4.0 ** rng.uniform(-2.0, 5.0) * rng.normal(size=len(u0))) for _ in range(300)
+    ]
+    kept = [numpy(model.limit, u).tobytes() == u.tobytes() for u in draws]
+    if limits is None:
+        assert all(kept)
+        return
+    matrix, low, high = map(np.array, limits)
+    within = [bool(((low <= matrix @ u) & (matrix @ u <= high)).all()) for u in draws]
+    assert within == kept
+    assert 30 < sum(within) < 270
+
+
+@every_model
 def test_normalized_inputs_are_deviations_from_the_trim(model):
     x, u = state_and_input(model)
     S, trim = np.array(model.input_scale), np.array(model.trim[1])

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from echelon._graph import Graph
     from echelon._lyapunov import Lyapunov, lyapunov
     from echelon._metrics import Metrics, metrics
+    from echelon._optimal_control import Constraint, OptimalControl
+    from echelon._plan import Plan, Planner, plan
+    from echelon._planar_baseline import PlanarBaseline
     from echelon._plots import figures, save_figures
     from echelon._report import report
     from echelon._result import Result
@@ -53,6 +56,7 @@ if TYPE_CHECKING:
         UnicyclePoint,
         VanDerPol,
     )
+    from echelon.models.model import Limits
     from echelon.references import (
         Circle,
         FigureEight,
@@ -76,6 +80,9 @@ _HOMES = {
     "_graph": ("Graph",),
     "_lyapunov": ("Lyapunov", "lyapunov"),
     "_metrics": ("Metrics", "metrics"),
+    "_optimal_control": ("Constraint", "OptimalControl"),
+    "_plan": ("Plan", "Planner", "plan"),
+    "_planar_baseline": ("PlanarBaseline",),
     "_plots": ("figures", "save_figures"),
     "_report": ("report",),
     "_result": ("Result",),
@@ -110,6 +117,7 @@ _HOMES = {
         "UnicyclePoint",
         "VanDerPol",
     ),
+    "models.model": ("Limits",),
     "references": (
         "Circle",
         "FigureEight",
@@ -127,6 +135,7 @@ __all__ = [
     "Certificate",
     "Circle",
     "Consensus",
+    "Constraint",
     "Contraction",
     "ControlAffine",
     "Disturbance",
@@ -142,6 +151,7 @@ __all__ = [
     "InnerLoop",
     "Law",
     "Lemniscate",
+    "Limits",
     "Line",
     "Linear",
     "LocalView",
@@ -149,10 +159,14 @@ __all__ = [
     "Method",
     "Metrics",
     "Monotone",
+    "OptimalControl",
     "Outcome",
     "Passive",
     "Pendulum",
+    "Plan",
+    "PlanarBaseline",
     "PlanarQuadrotor",
+    "Planner",
     "PrintedQuadrotor",
     "Quadrotor",
     "QuadrotorEuler",
@@ -177,6 +191,7 @@ __all__ = [
     "load_scenario",
     "lyapunov",
     "metrics",
+    "plan",
     "report",
     "run",
     "save_dataset",

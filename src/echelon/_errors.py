@@ -50,6 +50,10 @@ class SimulationError(EchelonError):
     """The settings of a simulation are out of range."""
 
 
+class PlanError(EchelonError):
+    """An optimal control problem is malformed, or is given data that does not fit it."""
+
+
 class ScenarioError(EchelonError):
     """A scenario file has faults; the message holds one line for each of them."""
 

@@ -188,6 +188,20 @@ class Graph:
         hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
         return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
 
+    def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
+        """Return the agents by how far they are from the leaders, each with its earlier neighbours.
+
+        It is the order in which agents can plan when each needs the plans of those before it. Among
+        the equally far the lower number comes first; a leader has no earlier neighbours.
+        """
+        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+        order = np.argsort(np.atleast_2d(hops).min(axis=0), kind="stable").tolist()
+        known = {agent: order[:place] for place, agent in enumerate(order)}
+        return tuple(
+            (i, () if i in self.leaders else tuple(j for j in self.neighbours(i) if j in known[i]))
+            for i in order
+        )
+
     def exchange(self) -> "Exchange":
         """Return the computation of the disagreement on this graph, ready for JAX."""
         i, j = self.edges.T

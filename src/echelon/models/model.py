@@ -8,7 +8,7 @@ method of the same name.
 import abc
 import numbers
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Generic, TypeAlias, TypeVar, cast
+from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,6 +46,19 @@ def diagonal(*entries: float) -> Rows:
     return tuple(
         tuple(e if i == j else 0.0 for j in range(len(entries))) for i, e in enumerate(entries)
     )
+
+
+class Limits(NamedTuple):
+    """What actuators can deliver: low <= G u <= high, row by row.
+
+    Attributes:
+        matrix: G, (k, m).
+        low, high: (k,), infinite where there is no bound.
+    """
+
+    matrix: Rows
+    low: tuple[float, ...]
+    high: tuple[float, ...]
 
 
 class ControlAffine(eqx.Module):
@@ -94,6 +107,12 @@ class ControlAffine(eqx.Module):
 
     symmetry_weights: ClassVar[tuple[float, ...] | None] = None
     """Weights of the symmetric states in the P that goes with `damping`, one each."""
+
+    input_limits: ClassVar[Limits | None] = None
+    """The inputs that `limit` leaves unchanged, as inequalities for solvers; None if it never acts.
+
+    To be replaced together with `limit`.
+    """
 
     chart: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Open bounds of states outside which the equations do not hold, such as a pitch of 90 deg."""

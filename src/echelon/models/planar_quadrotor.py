@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon._types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, diagonal, positive
+from echelon.models.model import ControlAffine, Limits, diagonal, positive
 from echelon.models.rotors import attitude_priority, fits
 
 # Right and left pairs of motors; each pair counts as one rotor with twice the thrust.
@@ -58,6 +58,12 @@ class PlanarQuadrotor(ControlAffine):
     def input_scale(self) -> tuple[tuple[float, ...], ...]:
         """S = diag(m, Ixx)."""
         return diagonal(self.mass, self.inertia)
+
+    @property
+    def input_limits(self) -> Limits:
+        """Each pair of motors gives between 0 and `motor_thrust`."""
+        rows = tuple((0.5, sign / (2.0 * self.arm)) for sign in _LEFT)
+        return Limits(rows, (0.0,) * 2, (self.motor_thrust,) * 2)
 
     def drift(self, x: State) -> State:
         """Return f(x): the rates, and free fall."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from echelon._errors import ModelError, did_you_mean, listing
 from echelon._types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, Rows, diagonal, positive
+from echelon.models.model import ControlAffine, Limits, Rows, diagonal, positive
 from echelon.models.rigid_body import (
     body_rates,
     check_inertia,
@@ -137,6 +137,20 @@ class Quadrotor(ControlAffine):
     def input_scale(self) -> tuple[tuple[float, ...], ...]:
         """S = diag(m, Ixx, Iyy, Izz)."""
         return diagonal(self.mass, *self.inertia)
+
+    @property
+    def input_limits(self) -> Limits:
+        """Each motor gives between 0 and `motor_thrust`."""
+        rows = tuple(
+            (
+                0.25,
+                left / (4.0 * self.arm),
+                -front / (4.0 * self.arm),
+                spin / (4.0 * self.torque_per_thrust),
+            )
+            for left, front, spin in zip(_LEFT, _FRONT, _SPIN, strict=True)
+        )
+        return Limits(rows, (0.0,) * 4, (self.motor_thrust,) * 4)
 
     def drift(self, x: State) -> State:
         """Return f(x): free fall, attitude kinematics and gyroscopic coupling."""
