@@ -7,7 +7,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon._disturbance import disturbance_ellipsoid, disturbance_l1, exponential
+from echelon._disturbance_bounds import disturbance_ellipsoid, disturbance_l1, exponential
 from echelon._errors import GainError
 from echelon._margins import (
     ClosedLoop,
