@@ -25,7 +25,7 @@ PACKAGE = ROOT / "src" / "echelon"
 # `__init__`, which loads lazily and so stands on top.
 FLOORS = [
     ["_types", "_errors", "_registry", "_paper", "_provenance"],
-    ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact", "_margins"],
+    ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact"],
     [
         "_scenario_values",
         "models.model",
@@ -42,13 +42,13 @@ FLOORS = [
     ["_jacobians"],
     ["gains.gain", "laws.law"],
     ["_initial", "_result", "laws.consensus", "gains.riccati", "gains.regional"],
-    ["_arguments"],
+    ["_arguments", "_finite_condition"],
     ["gains.*"],
     ["laws.*", "_simulate", "_synthesize", "_gain_file"],
     ["_build", "_metrics", "_lyapunov"],
-    ["_archive", "_check", "_design"],
-    ["_explain", "_plots"],
-    ["_output", "_report", "_doctor", "_tables"],
+    ["_archive", "_check_loop", "_design"],
+    ["_explain", "_plots", "_check_paper", "_check_margins", "_check_region"],
+    ["_output", "_report", "_doctor", "_tables", "_check"],
     ["cli"],
     ["__main__", ""],
 ]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from echelon._build import build, run
     from echelon._domain import Domain
     from echelon._errors import EchelonError, Outcome
+    from echelon._finite_condition import FiniteCondition, finite_condition
     from echelon._formation import Formation
     from echelon._gain_file import load_gain, save_gain
     from echelon._graph import Graph
@@ -69,6 +70,7 @@ _HOMES = {
     "_build": ("build", "run"),
     "_domain": ("Domain",),
     "_errors": ("EchelonError", "Outcome"),
+    "_finite_condition": ("FiniteCondition", "finite_condition"),
     "_formation": ("Formation",),
     "_gain_file": ("load_gain", "save_gain"),
     "_graph": ("Graph",),
@@ -131,6 +133,7 @@ __all__ = [
     "DoubleIntegrator",
     "EchelonError",
     "FigureEight",
+    "FiniteCondition",
     "Formation",
     "Gain",
     "Given",
@@ -170,6 +173,7 @@ __all__ = [
     "bundled_scenarios",
     "dataset",
     "figures",
+    "finite_condition",
     "load_gain",
     "load_scenario",
     "lyapunov",
