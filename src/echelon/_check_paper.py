@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import jax.numpy as jnp
 import numpy as np
 
 from echelon._check_loop import CheckedLoop, Line
@@ -37,8 +36,8 @@ def graph_lines(loop: CheckedLoop) -> Iterator[Line]:
 
 def _trim_line(loop: CheckedLoop) -> Line:
     """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
-    x = jnp.asarray(np.asarray(loop.parts.model.trim[0], float))
-    size = float(np.abs(np.asarray(loop.parts.model.normalized_drift(x))).max())
+    there = np.zeros_like(loop.parts.formation.offsets)
+    size = float(np.abs(goal_drifts(loop.parts.model, there, loop.parts.follower)).max())
     number, text = f"|f + g u*| {size:.2g}", "about the trim, whose input the law applies"
     if not loop.trimmed:
         text = "the law leaves out the trim input; set `follower.trim: true`"
@@ -103,7 +102,7 @@ def _printed_lmi(loop: CheckedLoop) -> float:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
     few = list(loop.parts.graph.followers[:4])
     goals = np.asarray(loop.parts.model.trim[0]) + loop.parts.formation.offsets[few]
-    drifts = goal_drifts(loop.parts.model, loop.parts.formation.offsets[few])
+    drifts = goal_drifts(loop.parts.model, loop.parts.formation.offsets, loop.parts.follower)[few]
     count, n = goals.shape
     values, vectors = np.linalg.eigh(loop.closed.P)
     X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)

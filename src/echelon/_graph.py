@@ -264,7 +264,7 @@ def _extremes(L: sp.csr_array) -> Matrix:
     # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
     symmetric = {"SymmetricMode": True}
     factor = spla.splu(sp.csc_array(L), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
-    inverse: Any = spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)
+    inverse = spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
     smallest = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
     largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
     return np.concatenate([smallest, largest])
