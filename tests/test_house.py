@@ -25,26 +25,26 @@ PACKAGE = ROOT / "src" / "echelon"
 # `__init__`, which loads lazily and so stands on top.
 FLOORS = [
     ["_types", "_errors", "_registry", "_paper", "_provenance"],
-    ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact", "_margins"],
+    ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact"],
     ["_scenario_values", "models.model", "references.reference", "_graph", "_hull_curves", "_lmi"]
     + ["_casadi"],
     ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors", "_hull_algebra"]
     + ["_optimal_control"],
     ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"]
     + ["_transcription"],
-    ["_certificates", "_disturbance", "_domain", "_plant", "models.quadrotor_euler", "_hull_trace"]
-    + ["_infeasible"],
-    ["_hull", "_demand", "_plan"],
+    ["_disturbance", "_domain", "_plant", "models.quadrotor_euler", "_hull_trace", "_infeasible"]
+    + ["_margins"],
+    ["_hull", "_demand", "_plan", "_certificates", "_disturbance_bounds"],
     ["_jacobians", "_planar_baseline"],
     ["gains.gain", "laws.law"],
     ["_initial", "_result", "laws.consensus", "gains.riccati", "gains.regional"],
-    ["_arguments", "_loop"],
+    ["_arguments", "_loop", "_finite_condition"],
     ["gains.*"],
     ["laws.*", "_simulate", "_synthesize", "_gain_file"],
     ["_build", "_metrics", "_lyapunov"],
-    ["_archive", "_check", "_design"],
-    ["_explain", "_plots"],
-    ["_output", "_report", "_doctor", "_tables"],
+    ["_archive", "_check_loop", "_design"],
+    ["_explain", "_plots", "_check_paper", "_check_margins", "_check_region"],
+    ["_output", "_report", "_doctor", "_tables", "_check"],
     ["cli"],
     ["__main__", ""],
 ]

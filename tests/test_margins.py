@@ -7,12 +7,13 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from echelon._disturbance_bounds import disturbance_ellipsoid, disturbance_l1, exponential
 from echelon._errors import GainError
 from echelon._margins import (
+    ClosedLoop,
+    decays_between,
     delay_margin,
     detectability,
-    disturbance_ellipsoid,
-    disturbance_l1,
     gain_margin,
     input_scaling,
     modes,
@@ -45,6 +46,7 @@ def hovering_quadrotor():
 
 
 QUAD = hovering_quadrotor()
+QUAD_ON_LINE = ClosedLoop(*QUAD, EDGE, LINE)
 
 
 def random_loop(seed, n=3, m=1):
@@ -52,7 +54,7 @@ def random_loop(seed, n=3, m=1):
     rng = np.random.default_rng(seed)
     A, B, R = rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.diag(rng.uniform(0.5, 2.0, m))
     P = scipy.linalg.solve_continuous_are(A, B, np.eye(n), R)
-    return (A, B, P, R, 1.2 * EDGE, LINE), rng
+    return ClosedLoop(A, B, P, R, 1.2 * EDGE, LINE), rng
 
 
 def abscissa(A):
@@ -63,14 +65,14 @@ def abscissa(A):
 
 
 def test_a_scalar_loop_needs_more_feedback_than_growth():
-    margin = gain_margin(2.0 * ONE, ONE, 3.0 * ONE, ONE, 1.5, [1.0, 4.0])
+    margin = gain_margin(ClosedLoop(2.0 * ONE, ONE, 3.0 * ONE, ONE, 1.5, [1.0, 4.0]))
     assert margin.low == pytest.approx(2.0 / 4.5) and margin.high == np.inf
 
 
 def test_three_lags_bear_eight_times_their_gain():
     A = -np.eye(3) + np.eye(3, k=1)
     B = np.array([[0.0], [0.0], [1.0]])
-    margin = gain_margin(A, B, with_rows([1.0, 0.0, 0.0]), ONE, 2.0, [0.5, 2.0])
+    margin = gain_margin(ClosedLoop(A, B, with_rows([1.0, 0.0, 0.0]), ONE, 2.0, [0.5, 2.0]))
     assert margin.low == 0.0 and margin.high == pytest.approx(2.0)
 
 
@@ -78,17 +80,17 @@ def test_a_conditionally_stable_loop_has_two_edges():
     # s^3 - 2 s^2 + 2 s + k (s^2 + 2 s + 3): by Routh (k - 2)(2 k + 2) > 3 k, k > (5 + sqrt 57) / 4.
     A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -2.0, 2.0]])
     B = np.array([[0.0], [0.0], [1.0]])
-    margin = gain_margin(A, B, with_rows([3.0, 2.0, 1.0]), ONE, 10.0, [1.0])
+    margin = gain_margin(ClosedLoop(A, B, with_rows([3.0, 2.0, 1.0]), ONE, 10.0, [1.0]))
     assert margin.low == pytest.approx((5.0 + np.sqrt(57.0)) / 40.0) and margin.high == np.inf
     # s^3 + 4 s^2 + 2 s - 1 + k (1 - s): by Routh k > 1 and 4 (2 - k) > k - 1, k < 9/5.
     A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, -2.0, -4.0]])
-    margin = gain_margin(A, B, with_rows([1.0, -1.0, 0.0]), ONE, 1.4, [1.0])
+    margin = gain_margin(ClosedLoop(A, B, with_rows([1.0, -1.0, 0.0]), ONE, 1.4, [1.0]))
     assert (margin.low, margin.high) == pytest.approx((1.0 / 1.4, 1.8 / 1.4))
 
 
 def test_the_quadrotor_stands_almost_half_of_the_edge_and_any_more():
     A, B, P, R = QUAD
-    margin = gain_margin(A, B, P, R, EDGE, LINE)
+    margin = gain_margin(QUAD_ON_LINE)
     assert 0.5 < margin.low < 0.51 and margin.high == np.inf
     for factor, sign in ((margin.low * 0.999, 1.0), (margin.low * 1.001, -1.0)):
         worst = max(abscissa(A - factor * EDGE * k * B @ np.linalg.solve(R, B.T @ P)) for k in LINE)
@@ -100,7 +102,7 @@ def test_the_quadrotor_stands_almost_half_of_the_edge_and_any_more():
 def test_inside_the_gain_margin_all_decays_and_at_its_edge_not(seed, m):
     loop, rng = random_loop(seed, m=m)
     A, B, P, R, c, lam = loop
-    low, high = gain_margin(*loop)
+    low, high = gain_margin(loop)
     # A Riccati gain keeps what its theorem promises.
     assert low <= EDGE / c + 1e-9 and high == np.inf
     G = B @ np.linalg.solve(R, B.T @ P)
@@ -108,6 +110,23 @@ def test_inside_the_gain_margin_all_decays_and_at_its_edge_not(seed, m):
     assert max(abscissa(A - f * c * k * G) for f in factors for k in lam) < 1e-9
     if low > 0.0:
         assert max(abscissa(A - (1.0 - 1e-6) * low * c * k * G) for k in lam) > -1e-9
+
+
+def test_a_loop_that_only_its_extremes_bear_is_not_called_stable_between_them():
+    # s^3 + (1 + k) s^2 + (1 + k) s + 0.5 + 4 k: Routh asks (1 + k)^2 > 0.5 + 4 k, |k - 1| > 0.71.
+    A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-0.5, -1.0, -1.0]])
+    B = np.array([[0.0], [0.0], [1.0]])
+    for extremes, holds in (
+        ([0.1, 3.0], False),
+        ([0.1, 0.29], True),
+        ([0.1, 0.3], False),
+        ([1.8, 9.0], True),
+        ([0.2, 0.2], True),
+        ([1.0, 1.0], False),
+    ):
+        loop = ClosedLoop(A, B, with_rows([4.0, 1.0, 1.0]), ONE, 1.0, np.array(extremes))
+        assert decays_between(loop) is holds
+    assert decays_between(QUAD_ON_LINE)
 
 
 # ---- delay ----
@@ -128,26 +147,26 @@ def delayed_abscissa(A, G, delay, nodes=24):
 
 
 def test_a_delayed_integrator_bears_a_quarter_turn():
-    margin = delay_margin(0.0 * ONE, ONE, ONE, ONE, 0.5, [1.0, 3.0, 4.0])
+    margin = delay_margin(ClosedLoop(0.0 * ONE, ONE, ONE, ONE, 0.5, [1.0, 3.0, 4.0]))
     assert margin == pytest.approx((np.pi / 4.0, 2.0, 4.0))
 
 
 @given(st.floats(-1.0, 1.0), st.floats(1.1, 5.0))
 @settings(max_examples=20)
 def test_a_delayed_scalar_loop_has_a_closed_form(a, k):
-    margin = delay_margin(a * ONE, ONE, k * ONE, ONE, 1.0, [1.0])
+    margin = delay_margin(ClosedLoop(a * ONE, ONE, k * ONE, ONE, 1.0, [1.0]))
     frequency = np.sqrt(k**2 - a**2)
     assert margin.frequency == pytest.approx(frequency, rel=1e-9)
     assert margin.delay == pytest.approx(np.arccos(a / k) / frequency, rel=1e-9)
 
 
 def test_a_loop_weaker_than_its_own_damping_bears_any_delay():
-    assert delay_margin(-2.0 * ONE, ONE, ONE, ONE, 1.0, [1.0, 1.9]).delay == np.inf
+    assert delay_margin(ClosedLoop(-2.0 * ONE, ONE, ONE, ONE, 1.0, [1.0, 1.9])).delay == np.inf
 
 
 def test_a_double_integrator_bears_its_phase_margin():
     p, d = 4.0, 3.0
-    margin = delay_margin(CHAIN, PUSH, with_rows([p, d]), ONE, 1.0, [1.0])
+    margin = delay_margin(ClosedLoop(CHAIN, PUSH, with_rows([p, d]), ONE, 1.0, [1.0]))
     frequency = np.sqrt(0.5 * (d**2 + np.sqrt(d**4 + 4.0 * p**2)))
     assert margin.frequency == pytest.approx(frequency)
     assert margin.delay == pytest.approx(np.arctan(d * frequency / p) / frequency)
@@ -155,7 +174,7 @@ def test_a_double_integrator_bears_its_phase_margin():
 
 def test_the_quadrotor_on_the_line_of_three_bears_14_5_ms():
     A, B, P, R = QUAD
-    margin = delay_margin(A, B, P, R, EDGE, LINE)
+    margin = delay_margin(QUAD_ON_LINE)
     assert margin.delay == pytest.approx(0.0145, abs=5e-5)
     assert margin.eigenvalue == pytest.approx(LINE[-1])
     G = EDGE * B @ np.linalg.solve(R, B.T @ P)
@@ -169,7 +188,7 @@ def test_the_quadrotor_on_the_line_of_three_bears_14_5_ms():
 def test_the_delay_margin_is_where_the_rightmost_root_crosses(seed, m):
     loop, _ = random_loop(seed, m=m)
     A, B, P, R, c, lam = loop
-    margin = delay_margin(*loop)
+    margin = delay_margin(loop)
     G = c * B @ np.linalg.solve(R, B.T @ P)
     for factor, sign in ((0.5, -1.0), (0.995, -1.0), (1.005, 1.0)):
         worst = max(delayed_abscissa(A, k * G, factor * margin.delay) for k in lam)
@@ -182,7 +201,7 @@ def test_the_delay_margin_is_where_the_rightmost_root_crosses(seed, m):
 def test_a_resonance_between_two_points_of_any_grid_is_met():
     # Light damping 1e-5: the loop exceeds 1 only within 1e-4 of the resonance.
     A = np.array([[0.0, 1.0], [-1.0, -2e-5]])
-    margin = delay_margin(A, PUSH, with_rows([0.0, 1e-4]), ONE, 1.0, [1.0])
+    margin = delay_margin(ClosedLoop(A, PUSH, with_rows([0.0, 1e-4]), ONE, 1.0, [1.0]))
     assert margin.frequency == pytest.approx(1.0, abs=1e-3)
     G = PUSH @ np.array([[0.0, 1e-4]])
     assert delayed_abscissa(A, G, 0.999 * margin.delay) < 0.0
@@ -193,7 +212,7 @@ def test_a_resonance_between_two_points_of_any_grid_is_met():
 
 
 def test_a_scalar_loop_is_worst_where_its_input_is_weakest():
-    worst = input_scaling(1.0 * ONE, ONE, 2.0 * ONE, ONE, 3.0, [0.5, 1.0])
+    worst = input_scaling(ClosedLoop(1.0 * ONE, ONE, 2.0 * ONE, ONE, 3.0, [0.5, 1.0]))
     assert worst.abscissa == pytest.approx(1.0 - 0.7 * 3.0)
     assert (worst.scales, worst.eigenvalue) == ((0.7,), 0.5)
 
@@ -201,8 +220,9 @@ def test_a_scalar_loop_is_worst_where_its_input_is_weakest():
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_the_worst_corner_is_no_better_than_any_corner(seed):
-    (A, B, P, R, c, lam), rng = random_loop(seed, m=2)
-    worst = input_scaling(A, B, P, R, c, lam, spread=0.2)
+    loop, rng = random_loop(seed, m=2)
+    A, B, P, R, c, lam = loop
+    worst = input_scaling(loop, spread=0.2)
     K = np.linalg.solve(R, B.T @ P)
     loops = [
         abscissa(A - c * k * B @ np.diag([s, t]) @ K)
@@ -219,19 +239,44 @@ def test_a_quadrotor_with_thrust_and_torques_off_by_30_percent_still_decays():
     A, B, P, R = QUAD
     hover = np.zeros((4, 12, 12))
     hover[0, 3:6, 6:9] = A[3:6, 6:9]  # the tilt pushes with the trim thrust
-    worst = input_scaling(A, B, P, R, EDGE, LINE, 0.3, hover)
+    worst = input_scaling(QUAD_ON_LINE, 0.3, hover)
     assert worst.abscissa == pytest.approx(-0.094, abs=1e-3)
     assert worst.scales[:3] == pytest.approx((1.3, 0.7, 0.7))
     # With the thrust of the trim known exactly there is more room.
-    assert input_scaling(A, B, P, R, EDGE, LINE).abscissa < -0.4
+    assert input_scaling(QUAD_ON_LINE).abscissa < -0.4
 
 
 def test_a_spread_that_turns_an_input_around_is_refused():
     with pytest.raises(GainError, match=r"^`spread` is 1\.0 on 1 inputs; allowed are \[0, 1\)"):
-        input_scaling(-ONE, ONE, ONE, ONE, 1.0, [1.0], spread=1.0)
+        input_scaling(ClosedLoop(-ONE, ONE, ONE, ONE, 1.0, [1.0]), spread=1.0)
 
 
 # ---- disturbances ----
+
+
+@given(st.integers(0, 10**6), st.integers(1, 6), st.floats(-6.0, 4.0))
+@settings(max_examples=30)
+def test_exponentials_of_a_stack_are_scipy_s(seed, n, size):
+    rng = np.random.default_rng(seed)
+    X = 10.0**size * rng.normal(size=(3, n, n))
+    X -= (np.linalg.eigvals(X).real.max() + 0.1) * np.eye(n)
+    error = 1e-15 * np.linalg.norm(X, 1, axis=(1, 2)).max() + 1e-14
+    for found, one in zip(exponential(X), X, strict=True):
+        wanted = scipy.linalg.expm(one)
+        assert found == pytest.approx(wanted, rel=1e-9, abs=error * np.abs(wanted).max() + 1e-300)
+    assert np.array_equal(exponential(np.zeros((2, n, n))), [np.eye(n)] * 2)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 4))
+@settings(max_examples=10)
+def test_modes_that_do_not_turn_have_the_l1_norm_of_their_sum(seed, n):
+    # T diag(s) T^-1 with T >= 0 and T^-1 E >= 0: every entry of exp(A t) E is a sum of positive
+    # exponentials, whose integral is -A^-1 E.
+    rng = np.random.default_rng(seed)
+    T, slow = rng.uniform(0.0, 1.0, (n, n)) + n * np.eye(n), -(10.0 ** rng.uniform(-3, 4, n))
+    A, E = T @ np.diag(slow) @ np.linalg.inv(T), T @ rng.uniform(0.1, 1.0, (n, 1))
+    loop = ClosedLoop(A, np.zeros((n, 1)), np.eye(n), ONE, 1.0, [1.0])
+    assert disturbance_l1(loop, E) == pytest.approx(np.linalg.solve(-A, E)[:, 0], rel=1e-6)
 
 
 def l1_by_trapezoids(A, E):
@@ -249,25 +294,25 @@ def l1_by_trapezoids(A, E):
 
 
 def test_a_scalar_disturbance_has_one_bound_by_both_arguments():
-    loop = (1.0 * ONE, ONE, ONE, ONE, 1.0, [3.0])
+    loop = ClosedLoop(1.0 * ONE, ONE, ONE, ONE, 1.0, [3.0])
     for bound in (disturbance_ellipsoid, disturbance_l1):
-        assert bound(*loop, 0.5 * ONE, 4.0) == pytest.approx([1.0], rel=1e-6)
+        assert bound(loop, 0.5 * ONE, 4.0) == pytest.approx([1.0], rel=1e-6)
 
 
 @pytest.mark.parametrize("damping", [0.02, 0.3, 0.9])
 def test_an_oscillator_s_l1_norm_has_a_closed_form(damping):
     K = [1.0, 2.0 * damping]
-    found = disturbance_l1(CHAIN, PUSH, with_rows(K), ONE, 1.0, [1.0], PUSH)
+    found = disturbance_l1(ClosedLoop(CHAIN, PUSH, with_rows(K), ONE, 1.0, [1.0]), PUSH)
     turn = np.pi * damping / np.sqrt(1.0 - damping**2)
     assert found[0] == pytest.approx(1.0 / np.tanh(0.5 * turn), rel=1e-6)
 
 
 def test_stiff_and_slow_states_are_integrated_together():
     A = np.diag([-1e4, -1e-3])
-    loop = (A, np.zeros((2, 1)), np.eye(2), ONE, 1.0, [1.0])
+    loop = ClosedLoop(A, np.zeros((2, 1)), np.eye(2), ONE, 1.0, [1.0])
     E = np.array([[1.0], [1.0]])
-    assert disturbance_l1(*loop, E) == pytest.approx([1e-4, 1e3], rel=1e-6)
-    assert disturbance_ellipsoid(*loop, E)[1] == pytest.approx(1e3, rel=1e-6)
+    assert disturbance_l1(loop, E) == pytest.approx([1e-4, 1e3], rel=1e-6)
+    assert disturbance_ellipsoid(loop, E)[1] == pytest.approx(1e3, rel=1e-6)
 
 
 @given(st.integers(0, 10**6), st.integers(1, 2))
@@ -275,18 +320,18 @@ def test_stiff_and_slow_states_are_integrated_together():
 def test_the_ellipsoid_is_no_tighter_than_the_exact_norm(seed, q):
     loop, rng = random_loop(seed)
     E = rng.normal(size=(3, q))
-    outer, exact = disturbance_ellipsoid(*loop, E), disturbance_l1(*loop, E)
+    outer, exact = disturbance_ellipsoid(loop, E), disturbance_l1(loop, E)
     assert (outer >= exact * (1.0 - 1e-6)).all()
-    closed = modes(*loop)
+    closed = modes(loop)
     assert exact == pytest.approx(np.max([l1_by_trapezoids(A, E) for A in closed], 0), rel=2e-4)
 
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
 def test_the_ellipsoid_is_the_best_of_its_family(seed):
-    (A, B, P, R, c, lam), rng = random_loop(seed)
+    loop, rng = random_loop(seed)
     E = rng.normal(size=(3, 1))
-    closed = modes(A, B, P, R, c, lam)
+    closed = modes(loop)
     limit = -2.0 * max(map(abscissa, closed))
 
     def squares(alpha):
@@ -294,27 +339,28 @@ def test_the_ellipsoid_is_the_best_of_its_family(seed):
         solved = [scipy.linalg.solve_continuous_lyapunov(S, -E @ E.T / alpha) for S in shifted]
         return np.max([np.diag(X) for X in solved], 0)
 
-    found = disturbance_ellipsoid(A, B, P, R, c, lam, E) ** 2
+    found = disturbance_ellipsoid(loop, E) ** 2
     tried = np.array([squares(alpha) for alpha in limit * np.linspace(0.002, 0.998, 400)])
     assert (found <= tried.min(0) * (1.0 + 1e-6)).all()
     assert found == pytest.approx(tried.min(0), rel=1e-2)
 
 
 def test_the_ellipsoid_holds_for_every_follower_of_the_whole_network():
-    (A, B, P, R, c, lam), rng = random_loop(5)
+    loop, rng = random_loop(5)
+    A, B, P, R, c, _ = loop
     L = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
     E = rng.normal(size=(3, 1))
     whole = np.kron(np.eye(3), A) - c * np.kron(L, B @ np.linalg.solve(R, B.T @ P))
     exact = l1_by_trapezoids(whole, np.kron(np.eye(3), E)).reshape(3, 3)
-    assert (exact <= disturbance_ellipsoid(A, B, P, R, c, lam, E)).all()
+    assert (exact <= disturbance_ellipsoid(loop, E)).all()
 
 
 def test_a_quadrotor_pushed_by_1_metre_per_second_squared():
     A, B, P, R = QUAD
     E = np.zeros((12, 3))
     E[3:6] = np.eye(3)
-    outer = disturbance_ellipsoid(A, B, P, R, EDGE, LINE, E)
-    exact = disturbance_l1(A, B, P, R, EDGE, LINE, E)
+    outer = disturbance_ellipsoid(QUAD_ON_LINE, E)
+    exact = disturbance_l1(QUAD_ON_LINE, E)
     assert outer[:3].max() == pytest.approx(0.53, abs=5e-3)
     assert exact[:3].max() == pytest.approx(0.46, abs=5e-3)
     # Nothing turns the vehicle in yaw.
@@ -329,7 +375,7 @@ def test_a_quadrotor_pushed_by_1_metre_per_second_squared():
 )
 def test_a_chain_of_quadrotors_amplifies_less_with_more_coupling(coupling, gain):
     A, B, P, R = QUAD
-    found = string_gain(A, B, P, R, coupling)
+    found = string_gain(ClosedLoop(A, B, P, R, coupling, [1.0]))
     assert found.gain == pytest.approx(gain, abs=1e-3)
     K = coupling * np.linalg.solve(R, B.T @ P)
     assert found.gain == pytest.approx(norm_by_bisection(A - B @ K, B, K), rel=1e-5)
@@ -351,7 +397,7 @@ def norm_by_bisection(A, B, C):
 @settings(max_examples=15)
 def test_string_gain_agrees_with_the_hamiltonian(seed, m):
     (A, B, P, R, _, _), _ = random_loop(seed, m=m)
-    found = string_gain(A, B, P, R, 1.0)
+    found = string_gain(ClosedLoop(A, B, P, R, 1.0, [1.0]))
     K = np.linalg.solve(R, B.T @ P)
     assert found.gain == pytest.approx(norm_by_bisection(A - B @ K, B, K), rel=1e-4)
     T = K @ np.linalg.solve(1j * found.frequency * np.eye(3) - A + B @ K, B)
@@ -359,7 +405,9 @@ def test_string_gain_agrees_with_the_hamiltonian(seed, m):
 
 
 def test_a_chain_of_integrators_passes_on_what_it_gets():
-    assert string_gain(0.0 * ONE, ONE, ONE, ONE, 2.0) == pytest.approx((1.0, 0.0))
+    assert string_gain(ClosedLoop(0.0 * ONE, ONE, ONE, ONE, 2.0, [1.0])) == pytest.approx(
+        (1.0, 0.0)
+    )
 
 
 # ---- detectability ----
@@ -425,7 +473,7 @@ def test_a_generic_output_sees_everything(seed):
 @pytest.mark.parametrize("margin", [gain_margin, delay_margin, modes])
 def test_a_loop_that_does_not_decay_has_no_margin(margin):
     with pytest.raises(GainError) as caught:
-        margin(2.0 * ONE, ONE, ONE, ONE, 1.0, [1.5, 4.0])
+        margin(ClosedLoop(2.0 * ONE, ONE, ONE, ONE, 1.0, [1.5, 4.0]))
     assert str(caught.value) == (
         "margins need a loop that decays, and the mode of eigenvalue 1.5 has abscissa 0.5 1/s."
     )

@@ -3,6 +3,8 @@
 import json
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -72,6 +74,61 @@ def test_only_a_constant_input_map_gives_the_nonlocal_theorem():
     with precision("float64"):
         assert has_constant_input_map(thrust, ech.Domain.about(thrust, TILT))
         assert not has_constant_input_map(euler, ech.Domain.about(euler, TILT))
+
+
+def with_its_own_map(model, gain, domain, low):
+    """The slowest contraction at states and corners of a domain, each with the g that it has."""
+    from echelon._hull import model_jacobian
+
+    random = np.random.default_rng(8)
+    points = [np.concatenate(both) for both in zip(*map(domain.sample, (300, 300)), strict=True)]
+    sides = [(domain.lower, domain.upper), (domain.input_lower, domain.input_upper)]
+    for some, (lower, upper) in zip(points, sides, strict=True):
+        bounded = np.isfinite(lower)
+        corners = np.where(random.integers(0, 2, (300, len(lower))), upper, lower)
+        some[300:, bounded] = corners[:, bounded]
+    root, worst = np.linalg.inv(np.linalg.cholesky(gain.P)), -np.inf
+    with precision("float64"):
+        jacobian = jax.jit(model_jacobian(model))
+        for x, v in zip(np.array(model.trim[0]) + points[0], points[1], strict=True):
+            A, g = np.asarray(jacobian(x, v)), np.asarray(model.normalized_input_map(jnp.array(x)))
+            slope = gain.P @ A - gain.coupling * low * gain.P @ g @ gain.R_inverse @ g.T @ gain.P
+            worst = max(worst, np.linalg.eigvalsh(root @ (slope + slope.T) @ root.T)[-1])
+    return -0.5 * worst
+
+
+@pytest.mark.parametrize("tilt", [0.2, 0.35])
+def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
+    model, bounds = ech.PlanarQuadrotor(), {"roll": tilt, "thrust": 1.0}
+    region = (gain := ech.synthesize(model, LINE, ech.RobustLQR(bounds))).certificate.region
+    seen = with_its_own_map(
+        model, gain, ech.Domain.about(model, bounds), float(LINE.grounded_spectrum()[0])
+    )
+    assert region is None or (region.theorem == "T2" and 0.0 < region.rate <= seen + 1e-12)
+    assert tilt > 0.3 or region is not None
+
+
+def test_nothing_is_promised_on_a_domain_where_the_turning_thrust_expands_the_metric():
+    # With the input map of the trim alone it would seem to contract at 0.5 1/s.
+    model = ech.QuadrotorEuler()
+    gain = ech.synthesize(model, LINE, ech.RobustLQR(TILT))
+    low = float(LINE.grounded_spectrum()[0])
+    assert with_its_own_map(model, gain, ech.Domain.about(model, TILT), low) < 0.0
+    assert gain.certificate.region is None and gain.certificate.stable
+
+
+def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():
+    model, bounds = ech.Pendulum(damping=0.1), {"angle": 0.5}
+    full = ech.synthesize(model, LINE, ech.Contraction(bounds, rate=0.5, exact=False))
+    half = ech.Contraction(bounds, rate=0.5, exact=False, coupling=0.5 * full.coupling)
+    gain = ech.synthesize(model, LINE, half)
+    seen = with_its_own_map(
+        model, gain, ech.Domain.about(model, bounds), float(LINE.grounded_spectrum()[0])
+    )
+    assert full.certificate.region.rate >= 0.5 * (1 - 1e-5)
+    assert gain.certificate.edge == full.certificate.edge
+    region = gain.certificate.region
+    assert seen < 0.45 and (region is None or region.rate <= seen + 1e-12)
 
 
 def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from echelon._disturbance import Disturbance
     from echelon._domain import Domain
     from echelon._errors import EchelonError, Outcome
+    from echelon._finite_condition import FiniteCondition, finite_condition
     from echelon._formation import Formation
     from echelon._gain_file import load_gain, save_gain
     from echelon._graph import Graph
@@ -75,6 +76,7 @@ _HOMES = {
     "_disturbance": ("Disturbance",),
     "_domain": ("Domain",),
     "_errors": ("EchelonError", "Outcome"),
+    "_finite_condition": ("FiniteCondition", "finite_condition"),
     "_formation": ("Formation",),
     "_gain_file": ("load_gain", "save_gain"),
     "_graph": ("Graph",),
@@ -143,6 +145,7 @@ __all__ = [
     "DoubleIntegrator",
     "EchelonError",
     "FigureEight",
+    "FiniteCondition",
     "Formation",
     "Gain",
     "Given",
@@ -187,6 +190,7 @@ __all__ = [
     "bundled_scenarios",
     "dataset",
     "figures",
+    "finite_condition",
     "load_gain",
     "load_scenario",
     "lyapunov",

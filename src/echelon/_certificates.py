@@ -5,6 +5,7 @@ from typing import Literal, TypeAlias
 import equinox as eqx
 import numpy as np
 
+from echelon._domain import Domain
 from echelon._graph import Graph
 from echelon._linearization import Linearization
 from echelon._numerics import observability_rank
@@ -23,16 +24,24 @@ class Region(eqx.Module):
             does not grow.
         theorem: `T1`, nonlocal on the region since g is constant; `T2`, local about the leader's
             path; `A5`, the paper's Assumption 5 for the drift alone.
-        domain: what the states and inputs must respect, in words.
+        domain: what the states and inputs must respect.
         radius: r of the set {sum_i delta_i'P delta_i <= r^2} that cannot leave the domain while the
             leader stays at the trim; None where the domain bounds nothing.
+        strength: 2 c lambda_min, the weight of the feedback in the inequality; 0 for `A5`.
+        hull: (K, n, n), matrices that the rate was looked at on: by kind, the corners of a hull of
+            all Jacobians A, or samples of them. For `T2`, whose g varies, it is (K, n, 2n): each A
+            with its g S R^-1 (g S)' to the right.
+        error: one such matrix, what floats may have moved a corner by, entry by entry.
     """
 
     kind: Kind = eqx.field(static=True)
     rate: float
     theorem: str = eqx.field(static=True)
-    domain: str = eqx.field(static=True)
+    domain: Domain = eqx.field(static=True)
     radius: float | None
+    strength: float
+    hull: Matrix
+    error: Matrix
 
 
 class Certificate(eqx.Module):

@@ -70,6 +70,18 @@ class Domain:
             self.input_lower, self.input_upper, (count, len(self.input_lower))
         )
 
+    def in_words(self, model: ControlAffine) -> str:
+        """Return the bounds as text, deviations from the trim."""
+        names = (*model.state_names, *model.input_names)
+        lower = np.concatenate([self.lower, self.input_lower])
+        upper = np.concatenate([self.upper, self.input_upper])
+        told = [
+            f"{name} in [{low:.4g}, {high:.4g}]"
+            for name, low, high in zip(names, lower, upper, strict=True)
+            if np.isfinite([low, high]).all() and low < high
+        ]
+        return ", ".join(told) or "all states"
+
     def margins(self) -> Matrix:
         """Return (n,) how far each state may deviate from the trim to both sides."""
         return np.minimum(self.upper, -self.lower)

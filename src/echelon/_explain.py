@@ -13,6 +13,7 @@ from echelon._metrics import Metrics, formation_errors
 from echelon._numerics import held_radius, precision
 from echelon._result import Result
 from echelon.gains.gain import Gain
+from echelon.models.model import ControlAffine
 
 _LAG = 1e-6
 """A steady error above this, in the result's unit, is told as a lag."""
@@ -144,22 +145,23 @@ def _promises(result: Result) -> Iterator[str]:
         yield (
             f"Promise of the gain, by linearization at the trim: the disagreement is {verdict}, "
             f"slowest mode {certificate.abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
-            f"{_region(certificate)}."
+            f"{_region(certificate, result.model)}."
         )
     needs = ", ".join(result.follower.needs) or "nothing from others"
     yield f"Each follower is told: {needs}."
 
 
-def _region(certificate: Certificate) -> str:
+def _region(certificate: Certificate, model: ControlAffine) -> str:
     """Return what is promised on a domain, with the kind of argument."""
     region = certificate.region
     if region is None:
         return "no region is proved"
+    where = region.domain.in_words(model)
     if region.theorem == "A5":
-        return f"the drift does not expand P for {region.domain} ({region.kind})"
+        return f"the drift does not expand P for {where} ({region.kind})"
     scope = "everywhere there" if region.theorem == "T1" else "near the leader's path there"
     return (
-        f"for {region.domain} it contracts at {region.rate:.3g} 1/s {scope} "
+        f"for {where} it contracts at {region.rate:.3g} 1/s {scope} "
         f"({region.kind}, {region.theorem})"
     )
 

@@ -47,7 +47,7 @@ class Graph:
         agents: int | None = None,
     ) -> None:
         """Check and keep the graph; an edge is (i, j) or (i, j, weight)."""
-        pairs, weights = _split([tuple(edge) for edge in edges])
+        pairs, weights = _split(edges)
         self.agents = _count_agents(pairs, agents)
         self.edges, self.weights = _checked_edges(pairs, weights, self.agents)
         self.leaders = _checked_leaders(leaders, self.agents)
@@ -55,6 +55,7 @@ class Graph:
         if not self.followers:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         self._check_connected()
+        self._spectrum: Matrix | None = None
         for array in (self.edges, self.weights):
             array.setflags(write=False)
 
@@ -112,7 +113,7 @@ class Graph:
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the graph with every edge."""
         _at_least(agents, 2, "complete")
-        return cls(np.stack(np.triu_indices(agents, 1), axis=1).tolist(), leaders, agents)
+        return cls(np.stack(np.triu_indices(agents, 1), axis=1), leaders, agents)
 
     @classmethod
     def grid(cls, rows: int, columns: int, leaders: Iterable[int] = (0,)) -> "Graph":
@@ -121,7 +122,7 @@ class Graph:
         number = np.arange(rows * columns).reshape(rows, columns)
         across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
         down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
-        return cls(np.concatenate([across, down]).tolist(), leaders, rows * columns)
+        return cls(np.concatenate([across, down]), leaders, rows * columns)
 
     @classmethod
     def geometric(
@@ -137,7 +138,7 @@ class Graph:
         _at_least(agents, 2, "geometric")
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
         pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
-        return cls(pairs[np.lexsort(pairs.T[::-1])].tolist(), leaders, agents)
+        return cls(pairs[np.lexsort(pairs.T[::-1])], leaders, agents)
 
     def adjacency(self) -> sp.csr_array:
         """Return the symmetric adjacency matrix (N, N), sparse."""
@@ -163,16 +164,16 @@ class Graph:
         return np.linalg.inv(self.grounded_laplacian().toarray())
 
     def grounded_spectrum(self) -> Matrix:
-        """Return the eigenvalues of the grounded Laplacian, ascending.
+        """Return the eigenvalues of the grounded Laplacian, ascending; computed once, read-only.
 
         All of them up to 400 followers, beyond that the smallest and the largest.
         """
-        L = self.grounded_laplacian()
-        if len(self.followers) <= _DENSE:
-            return np.linalg.eigvalsh(L.toarray())
-        smallest = spla.eigsh(sp.csc_array(L), k=1, sigma=0.0, return_eigenvectors=False)
-        largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
-        return np.concatenate([smallest, largest])
+        if self._spectrum is None:
+            L = self.grounded_laplacian()
+            small = len(self.followers) <= _DENSE
+            self._spectrum = np.linalg.eigvalsh(L.toarray()) if small else _extremes(L)
+            self._spectrum.setflags(write=False)
+        return self._spectrum
 
     def neighbours(self, agent: int) -> tuple[int, ...]:
         """Return the agents linked to `agent`, sorted."""
@@ -272,8 +273,22 @@ class Exchange(eqx.Module):
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
 
 
-def _split(edges: list[tuple[float, ...]]) -> tuple[Matrix, Matrix]:
+def _extremes(L: sp.csr_array) -> Matrix:
+    """Return the smallest and the largest eigenvalue of a sparse positive definite matrix."""
+    # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
+    symmetric = {"SymmetricMode": True}
+    factor = spla.splu(sp.csc_array(L), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    inverse = spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
+    smallest = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
+    largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
+    return np.concatenate([smallest, largest])
+
+
+def _split(edges: Iterable[Sequence[float]]) -> tuple[Matrix, Matrix]:
     """Return pairs (E, 2) of whole numbers and weights (E,)."""
+    if isinstance(edges, np.ndarray) and edges.ndim == 2 and edges.shape[1] == 2:
+        return _whole(edges, "an edge is"), np.ones(len(edges))
+    edges = [tuple(edge) for edge in edges]
     for edge in edges:
         if len(edge) not in (2, 3):
             raise GraphError(f"an edge is {list(edge)}, and must be [i, j] or [i, j, weight].")
@@ -281,18 +296,22 @@ def _split(edges: list[tuple[float, ...]]) -> tuple[Matrix, Matrix]:
     return _whole([edge[:2] for edge in edges], "an edge is").reshape(-1, 2), weights
 
 
-def _whole(values: Sequence[Any], what: str) -> Matrix:
+def _whole(values: Sequence[Any] | Matrix, what: str) -> Matrix:
     """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
-    for value in values:
-        try:
-            numbers = np.asarray(value, dtype=np.float64)
-            fine = bool((numbers == np.round(numbers)).all() and np.isfinite(numbers).all())
-        except (TypeError, ValueError):
-            fine = False
-        if not fine:
-            shown = list(value) if isinstance(value, tuple) else value
-            raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
+    if not _are_whole(values):
+        for value in values:
+            if not _are_whole(value):
+                shown = list(value) if isinstance(value, tuple) else value
+                raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
     return np.array(values, dtype=np.float64).astype(np.int64)
+
+
+def _are_whole(values: object) -> bool:
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return bool((numbers == np.round(numbers)).all() and np.isfinite(numbers).all())
 
 
 def _count_agents(pairs: Matrix, agents: int | None) -> int:

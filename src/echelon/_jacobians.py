@@ -1,8 +1,8 @@
 """The Jacobians of a model on a domain: a hull that holds them all, or else samples of them."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,13 +15,14 @@ from echelon._types import Matrix
 from echelon.models.model import ControlAffine
 
 _SAMPLES = 400
+_OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class Jacobians(NamedTuple):
     """Matrices A with xdot = A x near each state of a domain.
 
     `kind` says what they stand for: `vertices` of a polytope that holds every Jacobian, up to
-    `error` (n, n) entry by entry, or `samples` taken at random.
+    `error` (n, n) entry by entry, or `samples` taken at random in the domain and at its corners.
     """
 
     matrices: Matrix
@@ -38,10 +39,34 @@ def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     Raises:
         GainError: the Jacobian depends on a state that the domain leaves unbounded.
     """
+    return _over(model_jacobian(model), model, domain)
+
+
+def weighted_jacobians(model: ControlAffine, domain: Domain, R: Matrix) -> Jacobians:
+    """Return the same with g S R^-1 (g S)' to the right of each Jacobian: (K, n, 2n).
+
+    They are enclosed together, as the two turn with the same angles.
+
+    Raises:
+        GainError: either depends on a state that the domain leaves unbounded.
+    """
+    jacobian, inverse = model_jacobian(model), np.linalg.inv(R)
+
+    def pair(x: jax.Array, v: jax.Array) -> jax.Array:
+        g = model.normalized_input_map(x)
+        return jnp.concatenate([jacobian(x, v), g @ jnp.asarray(inverse, x.dtype) @ g.T], axis=1)
+
+    return _over(pair, model, domain)
+
+
+def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians:
+    """Return a matrix function of state and normalized input over a domain."""
+    names = [*model.state_names, *model.input_names]
     try:
-        hull = _hull(model, domain)
+        hull = jacobian_hull(function, *_boxes(model, domain), names)
     except GainError:
-        return Jacobians(_sampled(model, domain), np.zeros((len(domain.lower),) * 2), "samples")
+        samples = _sampled(function, model, domain)
+        return Jacobians(samples, np.zeros(samples.shape[1:]), "samples")
     _check_bounded(model, domain, hull)
     return Jacobians(hull.vertices, hull.error, "vertices")
 
@@ -68,11 +93,6 @@ def _boxes(model: ControlAffine, domain: Domain) -> tuple[Box, Box]:
     return Box(trim + low, trim + high), Box(domain.input_lower, domain.input_upper)
 
 
-def _hull(model: ControlAffine, domain: Domain) -> Hull:
-    names = [*model.state_names, *model.input_names]
-    return jacobian_hull(model_jacobian(model), *_boxes(model, domain), names)
-
-
 def _check_bounded(model: ControlAffine, domain: Domain, hull: Hull) -> None:
     """Refuse a domain that leaves open a state on which the Jacobian depends."""
     used = {atom.name for atom in hull.atoms}
@@ -84,12 +104,19 @@ def _check_bounded(model: ControlAffine, domain: Domain, hull: Hull) -> None:
             )
 
 
-def _sampled(model: ControlAffine, domain: Domain) -> Matrix:
+def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Matrix:
+    """Return the matrices at random corners of the domain and inside it."""
     states, inputs = domain.sample(_SAMPLES)
+    random = np.random.default_rng(1)
+    corners = [
+        np.where(random.integers(0, 2, some.shape), low, high)
+        for some, low, high in (
+            (states, domain.lower, domain.upper),
+            (inputs, domain.input_lower, domain.input_upper),
+        )
+    ]
+    states = np.concatenate([states, np.where(np.isfinite(corners[0]), corners[0], states)])
+    inputs = np.concatenate([inputs, corners[1]])
     base = np.asarray(model.trim[0], float)
-    return np.asarray(_at(model, jnp.asarray(base + states), jnp.asarray(inputs)))
-
-
-@eqx.filter_jit
-def _at(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> jax.Array:
-    return jax.vmap(model_jacobian(model))(states, inputs)
+    at = jax.jit(jax.vmap(function))
+    return np.asarray(at(jnp.asarray(base + states), jnp.asarray(inputs)))

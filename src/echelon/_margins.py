@@ -20,6 +20,27 @@ _FAR = 1e6  # factors on the coupling beyond this count as infinite
 _HIDDEN = 1e-9  # relative size below which a singular value or a damping counts as zero
 
 
+class ClosedLoop(NamedTuple):
+    """What every margin is of: the modes A - c lambda B R^-1 B'P for lambda in `eigenvalues`."""
+
+    A: Matrix
+    B: Matrix
+    P: Matrix
+    R: Matrix
+    coupling: float
+    eigenvalues: Matrix
+
+    @property
+    def K(self) -> Matrix:
+        """R^-1 B'P, (m, n)."""
+        return np.linalg.solve(self.R, self.B.T @ self.P)
+
+    @property
+    def strengths(self) -> Matrix:
+        """The distinct c lambda, ascending."""
+        return self.coupling * np.unique(np.asarray(self.eigenvalues, dtype=np.float64))
+
+
 class GainMargin(NamedTuple):
     """Every mode decays for the factors on the coupling low < factor < high."""
 
@@ -57,29 +78,25 @@ class HiddenMode(NamedTuple):
     direction: Matrix
 
 
-def modes(
-    A: Matrix, B: Matrix, P: Matrix, R: Matrix, coupling: float, eigenvalues: Matrix
-) -> Matrix:
-    """Return the matrices A - c lambda B R^-1 B'P, (K, n, n), for lambda in `eigenvalues` (K,).
+def modes(loop: ClosedLoop) -> Matrix:
+    """Return the matrices A - c lambda B R^-1 B'P, (K, n, n), for the distinct eigenvalues.
 
     Raises:
         GainError: one of them does not decay, so that there is no margin to speak of.
     """
-    strengths = coupling * np.atleast_1d(np.asarray(eigenvalues, dtype=np.float64))
-    closed = A - strengths[:, None, None] * (B @ np.linalg.solve(R, B.T @ P))
+    strengths = loop.strengths
+    closed = loop.A - strengths[:, None, None] * (loop.B @ loop.K)
     abscissas = np.linalg.eigvals(closed).real.max(1)
     worst = int(abscissas.argmax())
     if not abscissas[worst] < 0.0:
         raise GainError(
             f"margins need a loop that decays, and the mode of eigenvalue "
-            f"{strengths[worst] / coupling:.6g} has abscissa {abscissas[worst]:.3g} 1/s."
+            f"{strengths[worst] / loop.coupling:.6g} has abscissa {abscissas[worst]:.3g} 1/s."
         )
     return closed
 
 
-def gain_margin(
-    A: Matrix, B: Matrix, P: Matrix, R: Matrix, coupling: float, eigenvalues: Matrix
-) -> GainMargin:
+def gain_margin(loop: ClosedLoop) -> GainMargin:
     """Return the interval of factors on the coupling, around 1, for which every mode decays.
 
     At an edge two eigenvalues of A - k B K add to zero, k = factor c lambda, so that the pencil of
@@ -90,22 +107,33 @@ def gain_margin(
     Raises:
         GainError: a mode does not decay at factor 1.
     """
-    modes(A, B, P, R, coupling, eigenvalues)
-    G = B @ np.linalg.solve(R, B.T @ P)
-    strengths = coupling * np.unique(eigenvalues)
-    edges = _crossings(A, G, _FAR * strengths[-1])
+    modes(loop)
+    G, strengths = loop.B @ loop.K, loop.strengths
+    edges = _crossings(loop.A, G, _FAR * strengths[-1])
 
     def decays(k: float) -> bool:
-        return bool(np.linalg.eigvals(A - k * G).real.max() < 0.0)
+        return bool(np.linalg.eigvals(loop.A - k * G).real.max() < 0.0)
 
     low = max(float(_edge(decays, k, edges[edges < k][::-1], 0.0) / k) for k in strengths)
     high = min(float(_edge(decays, k, edges[edges > k], _FAR * k) / k) for k in strengths)
-    return GainMargin(low, high if high < _FAR else np.inf)
+    return GainMargin(low, high if high < 0.999 * _FAR else np.inf)
 
 
-def delay_margin(
-    A: Matrix, B: Matrix, P: Matrix, R: Matrix, coupling: float, eigenvalues: Matrix
-) -> DelayMargin:
+def decays_between(loop: ClosedLoop) -> bool:
+    """Tell whether a mode decays for every lambda from the least eigenvalue to the largest.
+
+    So the extremes of a large graph's spectrum speak for all of it: between the candidates of
+    `gain_margin` nothing can change, and one sample decides.
+    """
+    G, strengths = loop.B @ loop.K, loop.strengths
+    edges = _crossings(loop.A, G, strengths[-1])
+    ends = np.union1d(strengths, edges[edges > strengths[0]])
+    probes = np.union1d(ends, 0.5 * (ends[:-1] + ends[1:]))
+    closed = loop.A - probes[:, None, None] * G
+    return bool(np.linalg.eigvals(closed).real.max() < 0.0)
+
+
+def delay_margin(loop: ClosedLoop) -> DelayMargin:
     """Return the largest delay tau of all z, u = -c R^-1 B'P z(t - tau), that every mode survives.
 
     A root of det(s I - A + c lambda B K e^{-s tau}) reaches the axis at s = i w only where an
@@ -115,21 +143,20 @@ def delay_margin(
     Raises:
         GainError: a mode does not decay without delay.
     """
-    closed = modes(A, B, P, R, coupling, eigenvalues)
-    K, strengths = np.linalg.solve(R, B.T @ P), coupling * np.unique(eigenvalues)
+    closed, K, strengths = modes(loop), loop.K, loop.strengths
 
     def loci(w: Matrix) -> Matrix:
-        mu = np.linalg.eigvals(K @ _resolvent(A, w, B))
+        mu = np.linalg.eigvals(K @ _resolvent(loop.A, w, loop.B))
         return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
 
     def size(w: float, i: int, at: float = 0.0) -> float:
         return float(np.abs(loci(np.array([w]))[0, i])) - at
 
-    grid = _frequencies([A, *closed])
+    grid = _frequencies([loop.A, *closed])
     columns = enumerate(np.abs(loci(grid)).T)
     peaks = [_peaks(lambda w, i=i: size(w, i), grid, column) for i, column in columns]
     grid = np.union1d(grid, np.concatenate(peaks))
-    sizes, best = np.abs(loci(grid)), DelayMargin(np.inf, 0.0, float(strengths[0] / coupling))
+    sizes, best = np.abs(loci(grid)), DelayMargin(np.inf, 0.0, float(strengths[0] / loop.coupling))
     for k in strengths:
         for at, i in np.argwhere(np.diff(sizes > 1.0 / k, axis=0)):
             ends, sharp = (grid[at], grid[at + 1]), 1e-13 * grid[at]
@@ -137,19 +164,13 @@ def delay_margin(
             mu = loci(np.array([w]))[0]
             # Loci that cross together share the size and differ in phase: the first one counts.
             phases = np.angle(-mu[np.abs(np.abs(mu) * k - 1.0) < 1e-6]) % (2.0 * np.pi)
-            best = min(best, DelayMargin(float(phases.min() / w), float(w), float(k / coupling)))
+            delay, eigenvalue = float(phases.min() / w), float(k / loop.coupling)
+            best = min(best, DelayMargin(delay, float(w), eigenvalue))
     return best
 
 
 def input_scaling(
-    A: Matrix,
-    B: Matrix,
-    P: Matrix,
-    R: Matrix,
-    coupling: float,
-    eigenvalues: Matrix,
-    spread: float = 0.3,
-    slopes: Matrix | None = None,
+    loop: ClosedLoop, spread: float = 0.3, slopes: Matrix | None = None
 ) -> InputScaling:
     """Return the worst mode when every input acts 1 +- spread as strongly as the law believes.
 
@@ -161,83 +182,23 @@ def input_scaling(
     Raises:
         GainError: `spread` is not in [0, 1), or there are more than 12 inputs.
     """
-    m = B.shape[1]
+    A, B, m = loop.A, loop.B, loop.B.shape[1]
     if not 0.0 <= spread < 1.0 or m > 12:
         raise GainError(f"`spread` is {spread} on {m} inputs; allowed are [0, 1) and 12 inputs.")
-    K, values = np.linalg.solve(R, B.T @ P), np.unique(eigenvalues)
+    K, values = loop.K, np.unique(loop.eigenvalues)
     slopes = np.zeros((m, *A.shape)) if slopes is None else slopes
     worst = InputScaling(-np.inf, (), 0.0)
     for scales in itertools.product((1.0 - spread, 1.0 + spread), repeat=m):
         plant = A + np.tensordot(np.array(scales) - 1.0, slopes, 1)
-        closed = plant - coupling * values[:, None, None] * (B * np.array(scales) @ K)
+        closed = plant - loop.coupling * values[:, None, None] * (B * np.array(scales) @ K)
         abscissas = np.linalg.eigvals(closed).real.max(1)
         at = int(abscissas.argmax())
         worst = max(worst, InputScaling(float(abscissas[at]), scales, float(values[at])))
     return worst
 
 
-def disturbance_ellipsoid(
-    A: Matrix,
-    B: Matrix,
-    P: Matrix,
-    R: Matrix,
-    coupling: float,
-    eigenvalues: Matrix,
-    E: Matrix,
-    bound: float = 1.0,
-) -> Matrix:
-    """Return for each state (n,) a bound that no disturbance of norm up to `bound` makes it leave.
-
-    From rest, delta obeys a mode plus E w, E (n, q). For each alpha the ellipsoid X with
-    (A + alpha/2 I) X + X (.)' + E E'/alpha = 0 cannot be left, so |delta_j| <= bound sqrt(X_jj);
-    each state takes its best alpha (X_jj is log-convex in alpha), and the worst mode at that alpha.
-    So it holds for each follower if the disturbances of all together have norm up to `bound`.
-
-    Raises:
-        GainError: a mode does not decay.
-    """
-    closed, n = modes(A, B, P, R, coupling, eigenvalues), len(A)
-    forms = [scipy.linalg.schur(mode)[:2] for mode in closed]
-    (solve,) = scipy.linalg.get_lapack_funcs(("trsyl",), (A,))
-    limit = -2.0 * float(np.linalg.eigvals(closed).real.max())
-
-    def squares(alpha: float) -> Matrix:
-        found = np.zeros(n)
-        for T, Q in forms:
-            S, F = T + 0.5 * alpha * np.eye(n), Q.T @ E
-            Y, scale, _ = solve(S, S, -(F @ F.T) / alpha, tranb="T")
-            found = np.maximum(found, np.einsum("ij,jk,ik->i", Q, Y / scale, Q))
-        return found
-
-    ends = (1e-9 * limit, (1.0 - 1e-9) * limit)
-    return bound * np.sqrt([_lowest(lambda a, j=j: squares(a)[j], *ends).fun for j in range(n)])
-
-
-def disturbance_l1(
-    A: Matrix,
-    B: Matrix,
-    P: Matrix,
-    R: Matrix,
-    coupling: float,
-    eigenvalues: Matrix,
-    E: Matrix,
-    bound: float = 1.0,
-) -> Matrix:
-    """Return for each state (n,) the largest value that a disturbance of norm `bound` gives it.
-
-    In one mode, from rest, this is exactly bound times the integral of |e_j' exp(A t) E|, to a
-    relative 1e-6; the worst mode is taken, so that it is what a disturbance shaped like one
-    eigenvector of the grounded Laplacian can do.
-
-    Raises:
-        GainError: a mode does not decay.
-    """
-    closed = modes(A, B, P, R, coupling, eigenvalues)
-    return bound * np.max([_impulse_norms(mode, E) for mode in closed], axis=0)
-
-
-def string_gain(A: Matrix, B: Matrix, P: Matrix, R: Matrix, coupling: float) -> StringGain:
-    """Return ||T||_inf, T(s) = c K (s I - A + c B K)^-1 B, K = R^-1 B'P.
+def string_gain(loop: ClosedLoop) -> StringGain:
+    """Return ||T||_inf, T(s) = c K (s I - A + c B K)^-1 B, whatever the eigenvalues are.
 
     By so much can one link of a chain amplify its parent's input when that is fed forward (theory
     page, T4), and d links by the d-th power. The norm is Euclidean in normalized inputs.
@@ -245,13 +206,13 @@ def string_gain(A: Matrix, B: Matrix, P: Matrix, R: Matrix, coupling: float) -> 
     Raises:
         GainError: A - c B K does not decay.
     """
-    closed = modes(A, B, P, R, coupling, np.ones(1))[0]
-    K = coupling * np.linalg.solve(R, B.T @ P)
+    closed = modes(loop._replace(eigenvalues=np.ones(1)))[0]
+    K = loop.coupling * loop.K
 
     def sizes(w: Matrix) -> Matrix:
-        return np.linalg.norm(K @ _resolvent(closed, w, B), ord=2, axis=(-2, -1))
+        return np.linalg.norm(K @ _resolvent(closed, w, loop.B), ord=2, axis=(-2, -1))
 
-    grid = np.append(0.0, _frequencies([A, closed]))
+    grid = np.append(0.0, _frequencies([loop.A, closed]))
     grid = np.union1d(grid, _peaks(lambda w: float(sizes(np.array([w]))[0]), grid, sizes(grid)))
     at = int(sizes(grid).argmax())
     return StringGain(float(sizes(grid)[at]), float(grid[at]))
@@ -327,45 +288,13 @@ def _peaks(f: Callable[[float], float], grid: Matrix, values: Matrix) -> Matrix:
     # A flat stretch has maxima by rounding, which are no peaks.
     tops = (middle >= left) & (middle >= right) & (middle > (1.0 + 1e-9) * np.minimum(left, right))
     around = [(grid[k - 1], grid[k + 1]) for k in np.flatnonzero(tops) + 1]
-    return np.array([_lowest(lambda w: -f(w), *ends).x for ends in around])
+    return np.array([lowest(lambda w: -f(w), *ends).x for ends in around])
 
 
-def _lowest(f: Callable[[float], float], low: float, high: float) -> Any:
+def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
+    """Return SciPy's account of the least f between two points, where it has one minimum."""
     sharp = {"xatol": 1e-7 * (high - low)}
     return scipy.optimize.minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
-
-
-def _impulse_norms(A: Matrix, E: Matrix) -> Matrix:
-    """Return the integrals over t >= 0 of the norms of the rows of exp(A t) E, (n,).
-
-    Gauss's rule of 8 nodes on panels that are halved until the halves agree with the whole, all
-    open panels of one length at a time; the first is halved until it resolves the fastest mode.
-    """
-    A, (d, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
-    h, fast = -1.0 / float(np.linalg.eigvals(A).real.max()), 0.1 / float(np.linalg.norm(A, 2))
-    while np.linalg.norm(scipy.linalg.expm(A * h), 1) > 1e-12:
-        h *= 2.0
-    nodes, weights = np.polynomial.legendre.leggauss(8)
-    starts, wholes = (E / d[:, None])[None], np.full((1, len(A)), np.inf)
-    closed, first = np.zeros(len(A)), True
-    for _ in range(40):
-        h *= 0.5
-        starts = np.concatenate([starts, scipy.linalg.expm(A * h) @ starts])
-        steps = scipy.linalg.expm(A * (0.5 * h * (nodes + 1.0))[:, None, None])
-        few = np.array_split(starts[:, None], 1 + len(starts) // 4096)
-        rows = np.concatenate([np.linalg.norm(steps @ some, axis=-1) for some in few])
-        parts = 0.5 * h * np.einsum("pij,i->pj", rows, weights)
-        total, halves = closed + parts.sum(0), parts.reshape(2, -1, len(A)).sum(0)
-        still = (np.abs(halves - wholes) > 1e-8 * total + 1e-13 * total.max()).any(1)
-        if first:
-            still[0] |= h > fast
-            first = bool(still[0])
-        closed += halves[~still].sum(0)
-        both = np.tile(still, 2)
-        starts, wholes = starts[both], parts[both]
-        if not still.any():
-            break
-    return d * (closed + wholes.sum(0))
 
 
 def _unobservable(A: Matrix, C: Matrix) -> Matrix:

@@ -4,7 +4,7 @@ Precision, integrators and linear systems theory.
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, TypeAlias
 
 import jax
@@ -74,6 +74,30 @@ def held_radius(A: np.ndarray, B: np.ndarray, K: np.ndarray, dt: float) -> float
     block[:n, :n], block[:n, n:] = A, B
     flow = scipy.linalg.expm(block * dt)
     return float(np.abs(np.linalg.eigvals(flow[:n, :n] - flow[:n, n:] @ K)).max())
+
+
+def longest_step(A: np.ndarray, B: np.ndarray, gains: Sequence[np.ndarray]) -> float:
+    """Return the longest dt (s) with which every loop xdot = A x - B K x(t_k) still decays.
+
+    The step is lengthened by tenths from a thousandth of the fastest mode's time until a loop
+    grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
+    slowest mode's.
+    """
+    poles = np.concatenate([np.linalg.eigvals(A - B @ K) for K in gains])
+    dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
+
+    def decays(dt: float) -> bool:
+        return all(held_radius(A, B, K, dt) < 1.0 for K in gains)
+
+    while decays(1.1 * dt):
+        dt *= 1.1
+        if dt > end:
+            return float("inf")
+    low, high = dt, 1.1 * dt
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if decays(middle) else (low, middle)
+    return float(low)
 
 
 def in_words(eigenvalue: complex) -> str:

@@ -47,8 +47,8 @@ class Contraction(Method):
         coupling = edge if self.coupling is None else float(self.coupling)
         check_coupling(coupling)
         R, strength = np.eye(len(model.input_names)), 2.0 * coupling * low
-        region, _ = contracting_region(
-            model, domain, found, metric.P, linear.B, R, strength, metric.rate, self.exact
+        region = contracting_region(
+            model, domain, found, metric.P, linear.B, R, strength, self.exact
         )
         certificate = certify(linear, graph, metric.P, R, coupling, edge=edge, region=region)
         return Gain(metric.P, R, coupling, "contraction", certificate)

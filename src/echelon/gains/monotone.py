@@ -11,7 +11,7 @@ from echelon._jacobians import jacobians
 from echelon._linearization import linearize
 from echelon._lmi import monotone
 from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.gains.regional import in_words, radius, the_domain
+from echelon.gains.regional import radius, the_domain
 from echelon.models.model import ControlAffine
 
 
@@ -42,6 +42,15 @@ class Monotone(Method):
         found = jacobians(model, domain)
         P = monotone(found.matrices, names=model.state_names).P
         R = np.eye(len(model.input_names))
-        region = Region(found.kind, 0.0, "A5", in_words(model, domain), radius(domain, P))
+        region = Region(
+            kind=found.kind,
+            rate=0.0,
+            theorem="A5",
+            domain=domain,
+            radius=radius(domain, P),
+            strength=0.0,
+            hull=found.matrices,
+            error=found.error,
+        )
         certificate = certify(linear, graph, P, R, self.coupling, edge=0.0, region=region)
         return Gain(P, R, self.coupling, "monotone", certificate)

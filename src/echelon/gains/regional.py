@@ -9,7 +9,8 @@ from echelon._certificates import Region
 from echelon._domain import Bound, Domain
 from echelon._errors import GainError
 from echelon._exact import prove_contraction
-from echelon._jacobians import Jacobians, has_constant_input_map
+from echelon._jacobians import Jacobians, has_constant_input_map, weighted_jacobians
+from echelon._lmi import rate_of
 from echelon._types import Matrix
 from echelon.models.model import ControlAffine
 
@@ -39,10 +40,9 @@ def contracting_region(
     B: Matrix,
     R: Matrix,
     strength: float,
-    rate: float,
     exact: bool,
-) -> tuple[Region, float]:
-    """Return what a metric promises on a domain, and its rate there.
+) -> Region | None:
+    """Return what a metric promises on a domain; None where it contracts at no rate there.
 
     Args:
         model: the agents.
@@ -52,24 +52,43 @@ def contracting_region(
         B: input matrix at the trim (n, m).
         R: weight of the normalized input (m, m).
         strength: 2 c lambda_min.
-        rate: alpha by eigenvalues, 1/s.
-        exact: whether to prove it in rational arithmetic (seconds), where a hull is at hand.
+        exact: whether to prove it in rational arithmetic (seconds), where a hull is at hand and g
+            is constant.
     """
     constant = has_constant_input_map(model, domain)
-    kind, shown = found.kind, rate
-    if exact and constant and found.kind == "vertices" and rate > 0.0:
+    found = found if constant else weighted_jacobians(model, domain, R)
+    rate = (
+        rate_of(P, found.matrices, B, R, strength)
+        if constant
+        else _rate_where_g_varies(P, found.matrices, strength)
+    )
+    if rate <= 0.0:
+        return None
+    kind = found.kind
+    if exact and constant and kind == "vertices":
         shown = float(Fraction(rate * _SAFE).limit_denominator(10**6))
         weighted = B @ np.linalg.cholesky(np.linalg.inv(R))
         proof = prove_contraction(found.matrices, found.error, weighted, P, strength, shown)
-        kind, shown = ("proof", shown) if proof.holds else (kind, rate)
-    region = Region(
+        kind, rate = ("proof", shown) if proof.holds else (kind, rate)
+    return Region(
         kind=kind,
-        rate=shown,
+        rate=rate,
         theorem="T1" if constant else "T2",
-        domain=in_words(model, domain),
+        domain=domain,
         radius=radius(domain, P),
+        strength=strength,
+        hull=found.matrices,
+        error=found.error,
     )
-    return region, shown
+
+
+def _rate_where_g_varies(P: Matrix, pairs: Matrix, strength: float) -> float:
+    """Return the rate over pairs [A, W] with W = g S R^-1 (g S)', (K, n, 2n).
+
+    P A + A'P - strength P W P is affine in the pair, so the corners of its hull suffice.
+    """
+    A, W = np.split(pairs, 2, axis=2)
+    return rate_of(P, A - 0.5 * strength * W @ P)
 
 
 def radius(domain: Domain, P: Matrix) -> float | None:
@@ -79,16 +98,3 @@ def radius(domain: Domain, P: Matrix) -> float | None:
     if not bounded.any():
         return None
     return float(np.sqrt((margins[bounded] ** 2 / np.diag(W)[bounded]).min()))
-
-
-def in_words(model: ControlAffine, domain: Domain) -> str:
-    """Return the domain's bounds as text, deviations from the trim."""
-    names = (*model.state_names, *model.input_names)
-    lower = np.concatenate([domain.lower, domain.input_lower])
-    upper = np.concatenate([domain.upper, domain.input_upper])
-    told = [
-        f"{name} in [{low:.4g}, {high:.4g}]"
-        for name, low, high in zip(names, lower, upper, strict=True)
-        if np.isfinite([low, high]).all() and low < high
-    ]
-    return ", ".join(told) or "all states"

@@ -7,7 +7,7 @@ from echelon._domain import Bound, Domain
 from echelon._graph import Graph
 from echelon._jacobians import jacobians
 from echelon._linearization import linearize
-from echelon._lmi import rate_of, robust_lqr
+from echelon._lmi import robust_lqr
 from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
 from echelon.gains.regional import contracting_region, the_domain
 from echelon.models.model import ControlAffine
@@ -49,9 +49,6 @@ class RobustLQR(Method):
         coupling = 1.0 / low if self.coupling is None else float(self.coupling)
         check_coupling(coupling)
         strength = 2.0 * coupling * low
-        rate = rate_of(P, found.matrices, linear.B, R, strength)
-        region, _ = contracting_region(
-            model, domain, found, P, linear.B, R, strength, rate, self.exact
-        )
+        region = contracting_region(model, domain, found, P, linear.B, R, strength, self.exact)
         certificate = certify(linear, graph, P, R, coupling, edge=0.5 / low, region=region)
         return Gain(P, R, coupling, "robust-lqr", certificate)

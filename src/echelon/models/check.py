@@ -41,8 +41,16 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     _check_names(model, name)
     x, u = _trim(model, name, n, m)
     _check_values(model, name, x, u)
-    _check_trim(model, name, x, u)
-    return (*_low_precision(model, name), *_weak_actuators(model, name, u))
+    # Step by step each operation would be compiled for itself, which takes seconds.
+    residual, delivered = _at_trim(model, jnp.asarray(x), jnp.asarray(u))
+    _check_trim(model, name, np.asarray(residual))
+    return (*_low_precision(model, name), *_weak_actuators(model, name, u, np.asarray(delivered)))
+
+
+@eqx.filter_jit
+def _at_trim(model: ControlAffine, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return f(x) + g(x) u and what the actuators deliver of u."""
+    return model.velocity(x, u), model.limit(u)
 
 
 def _check_names(model: ControlAffine, name: str) -> None:
@@ -149,9 +157,8 @@ def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, .
         raise ModelError(f"`{what}` of `{name}` has shape {got}, and must have shape {shape}.")
 
 
-def _check_trim(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
+def _check_trim(model: ControlAffine, name: str, residual: np.ndarray) -> None:
     """Check |f(x*) + g(x*) u*| <= 1e-9 in the model's units."""
-    residual = np.asarray(model.velocity(jnp.asarray(x), jnp.asarray(u)))
     worst = int(np.argmax(np.abs(residual)))
     if abs(residual[worst]) > _TRIM_TOLERANCE:
         raise ModelError(
@@ -161,9 +168,10 @@ def _check_trim(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -
         )
 
 
-def _weak_actuators(model: ControlAffine, name: str, u: np.ndarray) -> tuple[str, ...]:
+def _weak_actuators(
+    model: ControlAffine, name: str, u: np.ndarray, delivered: np.ndarray
+) -> tuple[str, ...]:
     """Warn of a trim that the actuators cannot hold."""
-    delivered = np.asarray(model.limit(jnp.asarray(u)))
     short = [
         f"`{what}` {got:.4g} of {asked:.4g}"
         for what, got, asked in zip(model.input_names, delivered, u, strict=True)
