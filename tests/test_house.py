@@ -43,8 +43,11 @@ FLOORS = [
     ["laws.*", "_simulate", "_synthesize", "_gain_file"],
     ["_build", "_metrics", "_lyapunov"],
     ["_archive", "_check_loop", "_design"],
-    ["_explain", "_plots", "_check_paper", "_check_margins", "_check_region"],
-    ["_output", "_report", "_doctor", "_tables", "_check"],
+    ["_compare"],
+    ["_explain", "_plots", "_check_paper", "_check_margins", "_check_region"]
+    + ["_comparison_plots"],
+    ["_report", "_doctor", "_tables", "_check"],
+    ["_output", "_comparison_report"],
     ["cli"],
     ["__main__", ""],
 ]

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from echelon._archive import dataset, save_dataset, summary
     from echelon._build import build, run
     from echelon._disturbance import Disturbance
+    from echelon._compare import Comparison, compare
+    from echelon._comparison_report import comparison_report
     from echelon._domain import Domain
     from echelon._errors import EchelonError, Outcome
     from echelon._finite_condition import FiniteCondition, finite_condition
@@ -74,6 +76,8 @@ _HOMES = {
     "_archive": ("dataset", "save_dataset", "summary"),
     "_build": ("build", "run"),
     "_disturbance": ("Disturbance",),
+    "_compare": ("Comparison", "compare"),
+    "_comparison_report": ("comparison_report",),
     "_domain": ("Domain",),
     "_errors": ("EchelonError", "Outcome"),
     "_finite_condition": ("FiniteCondition", "finite_condition"),
@@ -136,6 +140,7 @@ __all__ = [
     "Agreement",
     "Certificate",
     "Circle",
+    "Comparison",
     "Consensus",
     "Constraint",
     "Contraction",
@@ -188,6 +193,8 @@ __all__ = [
     "Waypoints",
     "build",
     "bundled_scenarios",
+    "compare",
+    "comparison_report",
     "dataset",
     "figures",
     "finite_condition",

@@ -6,17 +6,22 @@ It is checked before the run, so that nothing is lost.
 import json
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from echelon._archive import save_dataset, summary
+from echelon._compare import Comparison
 from echelon._errors import OutputError
 from echelon._lyapunov import lyapunov
 from echelon._metrics import Metrics
 from echelon._result import Result
 
-_OURS = ("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures")
-"""What a run writes, and all that `--force` may remove."""
+_OURS = (
+    *("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures"),
+    *("comparison.json", "comparison.txt", "runs"),
+)
+"""What a run or a comparison writes, and all that `--force` may remove."""
 
 
 def claim_folder(name: str, out: Path | None, force: bool) -> Path:
@@ -31,6 +36,22 @@ def claim_folder(name: str, out: Path | None, force: bool) -> Path:
         return _named_folder(out, force) if out is not None else _new_folder(Path("runs"), name)
     except OSError as error:
         raise _unwritable(out if out is not None else Path("runs"), error) from error
+
+
+def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[Path]:
+    """Return a folder for the comparison of each named scenario: `out` itself where there is one.
+
+    Raises:
+        OutputError: two scenarios have one name, or as in `claim_folder`.
+    """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise OutputError(f"two scenarios have the name `{twice}`, and each needs its own folder.")
+    if out is None:
+        return [claim_folder(f"compare-{name}", None, force) for name in names]
+    if len(names) == 1:
+        return [claim_folder(names[0], out, force)]
+    return [claim_folder(name, out / name, force) for name in names]
 
 
 def _new_folder(parent: Path, name: str) -> Path:
@@ -101,6 +122,30 @@ def write_run(
     except OSError as error:
         raise _unwritable(folder, error) from error
     return told
+
+
+def write_comparison(
+    comparison: Comparison, told: dict[str, Any], text: str, folder: Path, figures: bool = True
+) -> None:
+    """Write a comparison: numbers, text, each run's dataset under `runs`, and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    try:
+        (folder / "runs").mkdir(parents=True, exist_ok=True)
+        for row in comparison.rows:
+            if row.flight is not None:
+                save_dataset(row.flight.result, folder / "runs" / f"{row.label}.nc")
+        content = json.dumps(told, indent=2, allow_nan=False)
+        (folder / "comparison.json").write_text(content + "\n", "utf-8")
+        (folder / "comparison.txt").write_text(text + "\n", "utf-8")
+        if figures:
+            from echelon._comparison_plots import save_comparison_figures
+
+            save_comparison_figures(comparison, folder)
+    except OSError as error:
+        raise _unwritable(folder, error) from error
 
 
 def _unwritable(folder: Path, error: OSError) -> OutputError:

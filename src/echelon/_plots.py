@@ -63,16 +63,7 @@ def save_figures(
     Raises:
         OSError: the folder or a file cannot be written.
     """
-    paths = []
-    (folder / "figures").mkdir(parents=True, exist_ok=True)
-    for name, figure in figures(result, lyapunov).items():
-        png, pdf = (folder / "figures" / f"{name}.{kind}" for kind in ("png", "pdf"))
-        with draw.style():
-            figure.savefig(png)
-            # Without its date, the same run writes the same file.
-            figure.savefig(pdf, metadata={"CreationDate": None})
-        paths += [png, pdf]
-    return paths
+    return draw.save(figures(result, lyapunov), folder / "figures")
 
 
 # ---- in space ---------------------------------------------------------------------------------

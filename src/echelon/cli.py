@@ -3,7 +3,7 @@
 import contextlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -162,6 +162,52 @@ def design(
     raise typer.Exit(0 if best is not None else 1)
 
 
+@app.command()
+def compare(
+    scenarios: Annotated[
+        list[str],
+        typer.Argument(help="Bundled scenarios' names, or YAML files.", metavar="SCENARIO..."),
+    ],
+    horizon: Annotated[float, typer.Option(help="Length of every run, s.")] = 10.0,
+    method: Annotated[
+        list[str] | None, typer.Option(help="Only this method; may be given several times.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a value in every scenario."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Output folder; default runs/compare-NAME-TIME.")
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace an earlier comparison in --out.")
+    ] = False,
+    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    as_json: _Json = False,
+) -> None:
+    """Fly the consensus laws and an optimization-based method from the same starts."""
+    from echelon._scenario import load_scenario
+
+    changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
+    checked = [load_scenario(each, changes) for each in scenarios]
+    from echelon import _build, _compare, _comparison_report, _output
+
+    labels = _compare.known_labels(method)
+    parts = [_build.build(each) for each in checked]
+    folders = _output.claim_folders([each.name for each in checked], out, force)
+    told = []
+    for scenario, built, folder in zip(checked, parts, folders, strict=True):
+        found = _compare.compare(scenario, built, labels, _announce(quiet=as_json))
+        told.append(_comparison_report.comparison_mapping(found))
+        text = _comparison_report.comparison_report(found)
+        _output.write_comparison(found, told[-1], text, folder, figures)
+        if not as_json:
+            _comparison_report.print_comparison(_tables.console(), found)
+            print(f"- Written to {folder}: {_written(folder)}.")
+    if as_json:
+        print(json.dumps(told[0] if len(told) == 1 else told, indent=2))
+
+
 @app.command("list")
 def list_(as_json: _Json = False) -> None:
     """List scenarios, models, references, laws, gain methods, graphs, formations, integrators."""
@@ -256,6 +302,13 @@ def _progress(quiet: bool) -> "Iterator[Progress | None]":
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("simulating", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _announce(quiet: bool) -> "Callable[[str], None]":
+    """Return what tells on standard error which method is flying, where someone watches."""
+    if quiet or not sys.stderr.isatty():
+        return lambda label: None
+    return lambda label: print(f"flying {label} ...", file=sys.stderr)
 
 
 def _written(folder: Path) -> str:
