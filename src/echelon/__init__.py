@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from echelon._archive import dataset, save_dataset, summary
     from echelon._build import build, run
-    from echelon._disturbance import Disturbance
     from echelon._compare import Comparison, compare
     from echelon._comparison_report import comparison_report
+    from echelon._disturbance import Disturbance
     from echelon._domain import Domain
     from echelon._errors import EchelonError, Outcome
     from echelon._finite_condition import FiniteCondition, finite_condition
