@@ -141,6 +141,7 @@ FUNCTIONS = {
     "norms": lambda x: x / jnp.linalg.norm(x) + jnp.cross(x, jnp.array([1.0, 2.0, 3.0])),
     "a slope": lambda x: jax.jvp(lambda y: jnp.sin(y) * y, (x,), (jnp.cos(x),))[1],
     "gradients": lambda x: jax.grad(lambda y: jnp.sum(jnp.sin(y) ** 2))(x) + jax.lax.square(x),
+    "no entries": lambda x: jnp.sum(x[3:]) + jnp.prod(x[3:]) * x + jnp.all(x[:0] > 0.0),
     "constants": lambda x: x + jnp.linalg.inv(A) @ jnp.arange(3.0),
     "nothing": lambda x: jnp.array([1.0, 2.0]),
 }

@@ -25,16 +25,14 @@ PACKAGE = ROOT / "src" / "echelon"
 # `__init__`, which loads lazily and so stands on top.
 FLOORS = [
     ["_types", "_errors", "_registry", "_paper", "_provenance"],
-    ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact"],
-    ["_scenario_values", "models.model", "references.reference", "_graph", "_hull_curves", "_lmi"]
-    + ["_casadi"],
-    ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors", "_hull_algebra"]
-    + ["_optimal_control"],
-    ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"]
-    + ["_transcription"],
-    ["_disturbance", "_domain", "_plant", "models.quadrotor_euler", "_hull_trace", "_infeasible"]
-    + ["_margins"],
-    ["_hull", "_demand", "_plan", "_certificates", "_disturbance_bounds"],
+    ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact", "_jaxpr"],
+    ["_scenario_values", "models.model", "references.reference", "_graph", "_hull_curves", "_lmi"],
+    ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors", "_hull_algebra"],
+    ["_casadi", "_optimal_control"],
+    ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"],
+    ["_disturbance", "_domain", "_plant", "models.quadrotor_euler", "_hull_trace", "_transcription"],
+    ["_margins", "_infeasible", "_demand"],
+    ["_hull", "_plan", "_certificates", "_disturbance_bounds"],
     ["_jacobians", "_planar_baseline"],
     ["gains.gain", "laws.law"],
     ["_initial", "_result", "laws.consensus", "gains.riccati", "gains.regional"],

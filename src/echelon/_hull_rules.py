@@ -6,7 +6,7 @@ A comparison that the box does not decide is None.
 import functools
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any, TypeAlias
 
@@ -15,23 +15,15 @@ import numpy as np
 from echelon._errors import GainError
 from echelon._hull_algebra import Atoms, Polynomial, constant
 from echelon._hull_enclosure import ELEMENTARY, Interval
+from echelon._jaxpr import dot, each
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(atoms, parameters of the primitive, operands) -> result."""
 
 
-def each(function: Callable[..., object], *arrays: np.ndarray) -> np.ndarray:
-    """Return a function of one entry of each array, entry by entry."""
-    return np.asarray(np.frompyfunc(function, len(arrays), 1)(*arrays), dtype=object)
-
-
 def number(p: object) -> Fraction | None:
     """Return the number that an entry is, else None."""
     return p.value() if isinstance(p, Polynomial) else None
-
-
-def _same(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
-    return x
 
 
 def _arithmetic(function: Callable[..., object]) -> Rule:
@@ -187,58 +179,14 @@ def _as_number(atoms: Atoms, answer: bool | None) -> Polynomial:
     return constant(int(answer))
 
 
-def _dot(atoms: Atoms, params: Mapping[str, Any], a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the sum of products over contracted axes, batch axes first."""
-    (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
-    left, batch, rows = _matrix_form(a, batch_a, contract_a)
-    right, _, columns = _matrix_form(b, batch_b, contract_b)
-    shape = (left.shape[0], left.shape[1], right.shape[1])
-    found = np.empty(shape, object)
-    for i, j, k in np.ndindex(*shape):
-        found[i, j, k] = sum(left[i, j] * right[i, k], start=constant(0))
-    return found.reshape(batch + rows + columns)
-
-
-def _matrix_form(
-    x: np.ndarray, batch: Sequence[int], contracted: Sequence[int]
-) -> tuple[np.ndarray, tuple[int, ...], tuple[int, ...]]:
-    """Return x as (batch, free, contracted), with the shapes of the first two."""
-    free = [axis for axis in range(x.ndim) if axis not in (*batch, *contracted)]
-    batch_shape = tuple(x.shape[axis] for axis in batch)
-    free_shape = tuple(x.shape[axis] for axis in free)
-    inner = math.prod(x.shape[axis] for axis in contracted)
-    moved = x.transpose([*batch, *free, *contracted])
-    return (
-        moved.reshape(math.prod(batch_shape), math.prod(free_shape), inner),
-        batch_shape,
-        free_shape,
-    )
-
-
 def _reduction(function: np.ufunc, start: int) -> Rule:
     return lambda atoms, params, x: np.asarray(
         function.reduce(x, axis=tuple(params["axes"]), initial=constant(start)), object
     )
 
 
-def _broadcast(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray, *_: Any) -> np.ndarray:
-    shape = [1] * len(params["shape"])
-    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
-        shape[axis] = size
-    return np.broadcast_to(x.reshape(shape), params["shape"])
-
-
-def _slice(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
-    starts, ends = params["start_indices"], params["limit_indices"]
-    steps = params["strides"] or [1] * x.ndim
-    return x[
-        tuple(slice(*ends_and_step) for ends_and_step in zip(starts, ends, steps, strict=True))
-    ]
-
-
 RULES: dict[str, Rule] = {
     **{name: _elementary(name) for name in ELEMENTARY if name not in ("reciprocal", "abs")},
-    **{name: _same for name in ("copy", "copy_p", "reduce_precision", "stop_gradient")},
     "add": _arithmetic(operator.add),
     "add_any": _arithmetic(operator.add),
     "sub": _arithmetic(operator.sub),
@@ -267,15 +215,8 @@ RULES: dict[str, Rule] = {
     "not": _logic(_not),
     "select_n": _function(_chosen),
     "convert_element_type": _convert,
-    "dot_general": _dot,
+    "dot_general": lambda atoms, params, a, b: dot(params, a, b, constant(0)),
     "reduce_sum": _reduction(np.add, 0),
     "reduce_prod": _reduction(np.multiply, 1),
-    "broadcast_in_dim": _broadcast,
-    "slice": _slice,
-    "reshape": lambda atoms, params, x: x.reshape(params["new_sizes"]),
-    "squeeze": lambda atoms, params, x: np.squeeze(x, tuple(params["dimensions"])),
-    "transpose": lambda atoms, params, x: x.transpose(params["permutation"]),
-    "concatenate": lambda atoms, params, *xs: np.concatenate(xs, axis=params["dimension"]),
-    "stack": lambda atoms, params, *xs: np.stack(xs, axis=params["axis"]),
 }
 """What each primitive of JAX means for polynomials."""

@@ -25,10 +25,10 @@ def violations(program: Program, g: Matrix) -> tuple[Violation, ...]:
     sizes = np.array([row.size for row in program.rows])
     amounts = sizes * np.maximum(program.low - g, g - program.high)
     worst: dict[str, Violation] = {}
-    for row, amount in zip(program.rows, amounts.tolist(), strict=True):
-        known = worst.get(row.name)
-        if not amount <= FELT * row.size and (known is None or not amount <= known.amount):
-            worst[row.name] = Violation(row.name, amount, row.time)
+    for k in np.flatnonzero(~(amounts <= FELT * sizes)):
+        name, amount = program.rows[k].name, float(amounts[k])
+        if name not in worst or not amount <= worst[name].amount:
+            worst[name] = Violation(name, amount, program.rows[k].time)
     return tuple(sorted(worst.values(), key=lambda v: -v.amount))
 
 

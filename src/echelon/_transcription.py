@@ -29,7 +29,7 @@ class Row(NamedTuple):
     """
 
     name: str
-    time: float
+    time: float = 0.0
     size: float = 1.0
     own: bool = False
 
@@ -166,15 +166,15 @@ def _scalar(name: str, function: Any) -> Any:
 
 def _rows(problem: OptimalControl) -> tuple[Matrix, Matrix, tuple[Row, ...]]:
     """Return the bounds of g and what each row says, in the order of `transcribe`."""
-    motion = [(0.0, 0.0, f"motion of {name}") for name in problem.model.state_names]
-    begin = [(0.0, 0.0, f"start of {name}") for name in problem.model.state_names]
+    motion = [(0.0, 0.0, Row(f"motion of {name}")) for name in problem.model.state_names]
+    begin = [(0.0, 0.0, Row(f"start of {name}")) for name in problem.model.state_names]
     limits = [
-        (low / size, high / size, f"actuator limit {j + 1}", size)
+        (low / size, high / size, Row(f"actuator limit {j + 1}", size=size))
         for j, (low, high, size) in enumerate(_limits(problem))
     ]
     kept, ending = (
         [
-            (low, high, one.name, 1.0, True)
+            (low, high, Row(one.name, own=True))
             for one, f in _constraints(problem)
             if one.end is end
             for low, high in _bounds(one, f.numel_out())
@@ -185,9 +185,9 @@ def _rows(problem: OptimalControl) -> tuple[Matrix, Matrix, tuple[Row, ...]]:
     steps += [motion + limits + kept for _ in range(problem.steps - 1)]
     steps += [(limits if problem.nodes > problem.steps else []) + kept + ending]
     table = [
-        (row[0], row[1], Row(row[2], step * problem.dt, *row[3:]))
+        (low, high, row._replace(time=step * problem.dt))
         for step, rows in enumerate(steps)
-        for row in rows
+        for low, high, row in rows
     ]
     low, high, rows = zip(*table, strict=True)
     return np.array(low, float), np.array(high, float), tuple(rows)
