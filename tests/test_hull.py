@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from echelon import _hull
+from echelon import _hull_algebra
 from echelon._errors import GainError
 from echelon._hull import Box, jacobian_hull, model_jacobian
 from echelon._hull_algebra import Atoms, constant, corner_values
@@ -253,6 +253,25 @@ def test_jacobians_of_any_drift_lie_in_the_hull(system, seed):
         assert "vertices" in str(error)
         assume(False)
     assert_supported(hull, values(jacobian, box, NO_INPUTS, points_of(box, NO_INPUTS, seed)), seed)
+
+
+@pytest.mark.parametrize("frequencies", [(0.7, 1.3), (1.0, 40.0), (0.3, 0.9, np.pi)])
+def test_waves_without_a_low_common_frequency_are_enclosed_apart(frequencies):
+    def jacobian(x, v):
+        waves = [jnp.cos(w * x[0]) + x[1] * jnp.sin(w * x[0]) for w in frequencies]
+        return jnp.stack([jnp.stack([sum(waves), waves[0] * waves[-1]]), x])
+
+    box = Box(np.array([-0.4, 0.0]), np.array([0.9, 0.5]))
+    hull = jacobian_hull(jacobian, box, NO_INPUTS)
+    assert_supported(hull, values(jacobian, box, NO_INPUTS, points_of(box, NO_INPUTS, 0)), 0)
+
+
+def test_too_many_waves_are_refused_and_not_counted_out():
+    def jacobian(x, v):
+        return sum(jnp.cos(w * x[0]) + jnp.sin(w * x[0]) for w in np.sqrt(np.arange(2.0, 20.0)))
+
+    with pytest.raises(GainError, match="has 65536 vertices"):
+        jacobian_hull(lambda x, v: jacobian(x, v)[None, None], Box([0.1], [0.5]), NO_INPUTS)
 
 
 # --- a smaller box has a smaller hull ---------------------------------------------------------
@@ -591,6 +610,6 @@ def test_other_faults_of_a_call_are_refused(monkeypatch):
         jacobian_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
     with pytest.raises(GainError, match="one matrix of floats"):
         jacobian_hull(lambda x, v: x, box, NO_INPUTS)
-    monkeypatch.setattr(_hull, "MOST_VERTICES", 100)
+    monkeypatch.setattr(_hull_algebra, "MOST_VERTICES", 100)
     with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
         jacobian_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)

@@ -16,15 +16,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon._errors import GainError
-from echelon._hull_algebra import Atoms, Corners, CornerValues, Polynomial, corner_values
+from echelon._hull_algebra import (
+    Atoms,
+    Corners,
+    CornerValues,
+    Polynomial,
+    check_count,
+    corner_values,
+)
 from echelon._hull_enclosure import Interval
 from echelon._hull_trace import evaluate
 from echelon._numerics import precision
 from echelon._types import Matrix
 from echelon.models.model import ControlAffine
-
-MOST_VERTICES = 16384
-"""A hull with more vertices is refused; no solver could use it."""
 
 
 class Box(NamedTuple):
@@ -138,11 +142,7 @@ def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
             used.setdefault(atom, set()).update(exponents)
     corners = {atom: atoms.corners(atom, used[atom]) for atom in sorted(used)}
     counts = {atom: len(c.points) for atom, c in corners.items()}
-    if math.prod(counts.values()) > MOST_VERTICES:
-        raise GainError(
-            f"the hull of Jacobians has {math.prod(counts.values())} vertices, and may have "
-            f"{MOST_VERTICES}; fix some states or inputs of the domain at one value."
-        )
+    check_count(math.prod(counts.values()))
     parts = [_floats(p, corners) for p in entries.flat]
     vertices = np.stack([_spread(values, array, counts) for values, array, _ in parts], axis=-1)
     error = np.array([bound for _, _, bound in parts]).reshape(entries.shape)

@@ -27,6 +27,10 @@ Monomial: TypeAlias = tuple[tuple[int, Exponent], ...]
 """Numbers of atoms, rising, each with its power or its wave."""
 
 _HALF = Fraction(1, 2)
+MOST_VERTICES = 16384
+"""A hull with more vertices is refused; no solver could use it."""
+
+_MOST_ORDER = 16  # of the waves that share a polygon
 _FEW = 64  # a range is sharpened at the corners where there are no more than these
 _THIN = Fraction(1, 1 << 64)  # relative width of what is a number in all but name
 
@@ -254,16 +258,57 @@ class Atoms:
         """Return points whose hull holds the used powers or waves of an atom, jointly."""
         wanted = list(used)
         if len(wanted) == 1:
-            reached = self.factor_range(atom, wanted[0])
-            return _gathered([{wanted[0]: end} for end in (reached.lo, reached.hi)])
+            return _gathered(self._ends(atom, wanted[0]))
         powers = [e for e in wanted if isinstance(e, int)]
         if powers:
             return _gathered([{**p} for p in power_points(self.known[atom].interval, powers)])
-        waves = [e for e in wanted if isinstance(e, tuple)]
-        unit = common_unit(w for w, _ in waves)
-        orders = {w: int(w / unit) for w, _ in waves}
-        around = wave_points(self.known[atom].interval.scaled(unit), set(orders.values()))
-        return _gathered([{(w, s): p[orders[w], s] for w, s in waves} for p in around])
+        arc, found = self.known[atom].interval, [dict[Exponent, Fraction]()]
+        for group in _harmonics(e for e in wanted if isinstance(e, tuple)):
+            around = _wave_corners(arc, group) if len(group) > 1 else self._ends(atom, group[0])
+            check_count(len(found) * len(around))
+            found = [{**p, **q} for p in found for q in around]
+        return _gathered(found)
+
+    def _ends(self, atom: int, exponent: Exponent) -> list[dict[Exponent, Fraction]]:
+        reached = self.factor_range(atom, exponent)
+        return [{exponent: end} for end in (reached.lo, reached.hi)]
+
+
+def _harmonics(waves: Iterable[Wave]) -> list[list[Wave]]:
+    """Return waves in groups that are low multiples of one frequency each.
+
+    A group gets one polygon, whose corners grow with the highest multiple: 0.7 and 1.3 as floats
+    are multiples of 2^-53. Groups are enclosed apart, and the products of their corners hold all.
+    """
+    groups = list[list[Wave]]()
+    for w in sorted(waves):
+        fitting = (
+            g for g in groups if w[0] <= _MOST_ORDER * common_unit([w[0], *(v for v, _ in g)])
+        )
+        group = next(fitting, None)
+        groups.append([w]) if group is None else group.append(w)
+    return groups
+
+
+def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fraction]]:
+    """Return points around the waves of a group, jointly."""
+    unit = common_unit(w for w, _ in waves)
+    orders = {w: int(w / unit) for w, _ in waves}
+    around = wave_points(arc.scaled(unit), set(orders.values()))
+    return [{(w, s): p[orders[w], s] for w, s in waves} for p in around]
+
+
+def check_count(count: int) -> None:
+    """Refuse a hull of too many vertices.
+
+    Raises:
+        GainError: there are more than `MOST_VERTICES`.
+    """
+    if count > MOST_VERTICES:
+        raise GainError(
+            f"the hull of Jacobians has {count} vertices, and may have {MOST_VERTICES}; "
+            "fix some states or inputs of the domain at one value."
+        )
 
 
 class Corners(NamedTuple):
