@@ -194,7 +194,7 @@ def _certified_set(
     certified, observed = certified_at_rest(loop), observed_radius(run, plane)
     named = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(named, certified, observed, plane.largest, run.horizon)
-    wide = np.minimum(plane.reach, plane.extents(2.2 * max(observed, 1e-2 * plane.largest)))
+    wide = np.minimum(plane.reach, plane.extents(1.8 * max(observed, 1e-2 * plane.largest)))
     panels = [wide]
     if certified and certified < np.inf and (plane.extents(certified) < 0.3 * wide).all():
         panels.append(plane.extents(1.5 * certified))
