@@ -37,7 +37,9 @@ def main() -> None:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     print(done.stdout or done.stderr)
     print(f"{agents} agents, exit code {done.returncode}: {seconds:.1f} s of wall time,")
-    print(f"{used.ru_utime + used.ru_stime:.1f} s of CPU time, peak {used.ru_maxrss / 2**20:.2f} GB")
+    print(
+        f"{used.ru_utime + used.ru_stime:.1f} s of CPU time, peak {used.ru_maxrss / 2**20:.2f} GB"
+    )
 
 
 if __name__ == "__main__":

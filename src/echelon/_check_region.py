@@ -82,26 +82,43 @@ def certified_set(loop: CheckedLoop) -> CertifiedSet | None:
     what cannot rise is V = delta'(L kron P) delta, which costs the factor lambda_min / lambda_max.
     """
     region = loop.region
-    if region is None or region.theorem == "T2" or not (region.rate > 0.0 or _only_drift(region)):
+    if region is None or not _certifies(region):
         return None
-    if _only_drift(region) and loop.moving and not _constant(loop, region.domain):
+    if region.theorem == "A5" and loop.moving and not _constant(loop, region.domain):
         text = "g varies, and a leader that moves then adds to V; needs a constant g"
         return CertifiedSet(0.0, region.kind, text)
     kind, excursion, why = _excursion(loop)
     if excursion is None:
         return CertifiedSet(0.0, region.kind, why)
-    kind = region.kind if kind is None else kind
-    room = np.maximum(region.domain.margins() - excursion, 0.0)
-    radii = room / np.sqrt(np.diag(np.linalg.inv(loop.closed.P)))
+    return _less(loop, region, region.kind if kind is None else kind, excursion)
+
+
+def certified_at_rest(loop: CheckedLoop) -> float | None:
+    """Return the radius of the certified set for a leader that rests at the trim."""
+    region = loop.region
+    if region is None or not _certifies(region):
+        return None
+    nowhere = np.zeros(len(loop.parts.model.state_names))
+    return _less(loop, region, region.kind, nowhere).radius
+
+
+def _certifies(region: Region) -> bool:
+    return region.theorem == "A5" or region.theorem == "T1" and region.rate > 0.0
+
+
+def _less(loop: CheckedLoop, region: Region, kind: Kind, excursion: Matrix) -> CertifiedSet:
+    """Return the set that is left when the leader goes so far from the trim, (n,)."""
+    margins = region.domain.margins()
+    radii = np.maximum(margins - excursion, 0.0) / np.sqrt(np.diag(np.linalg.inv(loop.closed.P)))
     if not np.isfinite(radii).any():
         return CertifiedSet(np.inf, region.kind, "everywhere: the domain bounds no state")
     j = int(np.argmin(radii))
-    name, wide = loop.parts.model.state_names[j], region.domain.margins()[j]
+    name, wide = loop.parts.model.state_names[j], margins[j]
     if radii[j] == 0.0:
         text = f"the leader alone reaches {excursion[j]:.3g} in `{name}`, and the domain {wide:.3g}"
         return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
     shrink = 1.0
-    if _only_drift(region):
+    if region.theorem == "A5":
         shrink = np.sqrt(loop.certificate.lambda_min / loop.certificate.lambda_max)
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
     text += f" less {excursion[j]:.3g} of the leader" if excursion.any() else ", leader at the trim"
@@ -110,10 +127,6 @@ def certified_set(loop: CheckedLoop) -> CertifiedSet | None:
 
 def _constant(loop: CheckedLoop, domain: Domain) -> bool:
     return has_constant_input_map(loop.parts.model, domain)
-
-
-def _only_drift(region: Region) -> bool:
-    return region.theorem == "A5"
 
 
 def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Matrix | None, str]:

@@ -5,29 +5,50 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from echelon import _registry
+from echelon import _margins, _registry
 from echelon._build import Parts, resolve
-from echelon._errors import EchelonError, MissingExtraError
-from echelon._linearization import linearize
-from echelon._numerics import precision
+from echelon._certificates import Kind
+from echelon._check_loop import CheckedLoop, checked_loop
+from echelon._check_region import CertifiedSet, certified_set
+from echelon._errors import EchelonError
+from echelon._numerics import longest_step, precision
 from echelon._scenario import Scenario
 from echelon._synthesize import synthesize
 from echelon.gains.gain import Gain
+from echelon.laws.consensus import Consensus
 
 _NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
 _RATE = 0.1
 """Rate that `contraction` is asked for where the scenario names none, 1/s."""
-_ORDER = {"proof": 3, "vertices": 2, "samples": 1}
+_STRENGTH: dict[Kind, int] = {"proof": 3, "vertices": 2, "samples": 1, "linearization": 0}
 
 
 class Design(NamedTuple):
-    """One method on the scenario: its gain, or why there is none."""
+    """One method on the scenario: its gain and what is known of it, or why there is none.
+
+    Attributes:
+        method: its name.
+        gain: None where there is none, and then `reason` says why.
+        reason: empty where there is a gain.
+        fastest: largest modulus of a pole of the loop, 1/s.
+        step: the longest step (s) with inputs held with which every mode looked at decays.
+        factors: the interval of factors on the coupling that it bears; None if unstable.
+        delay: of all disagreements that it bears, s; None if unstable.
+        certified: the certified set, less the leader's excursion; None without one.
+        advice: what else a user of the method should know.
+        seconds: what the synthesis took.
+    """
 
     method: str
     gain: Gain | None
-    reason: str
-    fastest: float | None
-    seconds: float
+    reason: str = ""
+    fastest: float | None = None
+    step: float | None = None
+    factors: _margins.GainMargin | None = None
+    delay: float | None = None
+    certified: CertifiedSet | None = None
+    advice: str = ""
+    seconds: float = 0.0
 
 
 def designs(scenario: Scenario, parts: Parts, only: str | None = None) -> tuple[Design, ...]:
@@ -36,33 +57,87 @@ def designs(scenario: Scenario, parts: Parts, only: str | None = None) -> tuple[
     return tuple(_design(name, scenario, parts) for name in names)
 
 
-def recommended(tried: tuple[Design, ...]) -> Design | None:
-    """Return the stable design with the strongest promise, the fastest decay deciding a tie."""
+def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
+    """Return the stable design with the strongest promise, the fastest decay deciding a tie.
+
+    One that needs a step shorter than `dt` comes after those that do not.
+    """
     stable = [d for d in tried if d.gain is not None and d.gain.certificate.stable]
-    return max(stable, key=_merit) if stable else None
+    return max(stable, key=lambda d: _merit(d, dt)) if stable else None
 
 
-def _merit(design: Design) -> tuple[int, float]:
-    assert design.gain is not None
+def because(best: Design, tried: tuple[Design, ...], dt: float) -> str:
+    """Return why a design is recommended, in a sentence."""
+    assert best.gain is not None and best.step is not None
+    certificate, region = best.gain.certificate, best.gain.certificate.region
+    stable = sum(d.gain is not None and d.gain.certificate.stable for d in tried)
+    why = "it is the only one whose loop is stable"
+    if stable > 1 and _merit(best, dt)[1]:
+        assert region is not None
+        why = f"it promises most: {region.rate:.3g} 1/s on its domain ({region.kind}, "
+        why += f"{region.theorem})"
+    elif stable > 1:
+        why = f"of {stable} stable loops, none with more than a promise at the trim, its slowest "
+        why += f"mode is the fastest, {certificate.abscissa:.3g} 1/s"
+    step = f"the scenario's step of {dt:g} s is short enough for it"
+    if best.step <= dt:
+        step = f"it needs a step below {best.step:.3g} s, and the scenario's is {dt:g} s"
+    return f"Recommended: {best.method}, because {why}; {step}."
+
+
+def _merit(design: Design, dt: float) -> tuple[bool, int, float]:
+    assert design.gain is not None and design.step is not None
     certificate = design.gain.certificate
     region = certificate.region
-    strength = _ORDER.get(region.kind, 0) if region is not None and region.rate > 0.0 else 0
-    return strength, -certificate.abscissa
+    strength = _STRENGTH[region.kind] if region is not None and region.rate > 0.0 else 0
+    return design.step > dt, strength, -certificate.abscissa
 
 
 def _design(name: str, scenario: Scenario, parts: Parts) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
-    began = time.perf_counter()
     options = _options(name, scenario)
     if name in _NEEDS_DOMAIN and "domain" not in options:
-        return Design(name, None, "give `follower.gain.domain` to try it", None, 0.0)
+        return Design(name, None, "give `follower.gain.domain` to try it")
+    began = time.perf_counter()
     try:
         gain = synthesize(parts.model, parts.graph, resolve(_registry.METHODS[name])(**options))
-    except MissingExtraError as error:
-        return Design(name, None, str(error), None, time.perf_counter() - began)
     except EchelonError as error:
-        return Design(name, None, str(error), None, time.perf_counter() - began)
-    return Design(name, gain, "", _fastest(parts, gain), time.perf_counter() - began)
+        return Design(name, None, str(error), seconds=time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    with precision("float64"):
+        return _known(name, with_gain(parts, gain))._replace(seconds=seconds)
+
+
+def with_gain(parts: Parts, gain: Gain) -> CheckedLoop:
+    """Return the closed loop of the scenario under another gain, the feed-forward kept."""
+    asked = parts.follower.asks()
+    trim = getattr(parts.follower, "trim", True)
+    law = Consensus(gain, feedforward=asked, trim=trim)
+    with precision("float64"):
+        return checked_loop(parts._replace(follower=law))
+
+
+def _known(name: str, loop: CheckedLoop) -> Design:
+    """Return what is known of a gain."""
+    closed, (A, B) = loop.closed, loop.linear
+    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
+    found = Design(name, loop.gain, fastest=float(np.abs(poles).max()))
+    if not loop.every:
+        return found._replace(step=0.0)
+    ends = closed.strengths[[0, -1]]
+    gains = loop.inner + ends[:, None, None] * closed.K
+    return found._replace(
+        step=longest_step(A + B @ loop.inner, B, list(gains)),
+        factors=_margins.gain_margin(closed),
+        delay=_margins.delay_margin(closed).delay,
+        certified=certified_set(loop),
+        advice=_advice(name, loop),
+    )
+
+
+def _advice(name: str, loop: CheckedLoop) -> str:
+    """Return what else to know: for `inner-loop`, a graph or leaders that make it faster."""
+    return ""
 
 
 def _options(name: str, scenario: Scenario) -> dict[str, Any]:
@@ -77,13 +152,3 @@ def _options(name: str, scenario: Scenario) -> dict[str, Any]:
     if name == "contraction":
         given.setdefault("rate", _RATE)
     return given
-
-
-def _fastest(parts: Parts, gain: Gain) -> float:
-    """Return the largest modulus of an eigenvalue of the linearized loop, 1/s."""
-    with precision("float64"):
-        A, B = linearize(parts.model)
-    A = A if gain.inner is None else A - B @ gain.inner
-    strength = gain.coupling * gain.certificate.lambda_max
-    closed = A - strength * B @ np.linalg.solve(gain.R, B.T @ gain.P)
-    return float(np.abs(np.linalg.eigvals(closed)).max())

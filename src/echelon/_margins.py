@@ -102,7 +102,7 @@ def gain_margin(loop: ClosedLoop) -> GainMargin:
     At an edge two eigenvalues of A - k B K add to zero, k = factor c lambda, so that the pencil of
     X -> A X + X A' and X -> B K X + X (B K)' is singular: its real eigenvalues are candidates.
     Between two of them one sample decides, and bisection sharpens the edge. `high` is infinite
-    where no edge lies below a factor of 1e6.
+    where no edge lies below a factor of 1e6, `low` is 0 where none lies above 1e-6.
 
     Raises:
         GainError: a mode does not decay at factor 1.
@@ -116,7 +116,7 @@ def gain_margin(loop: ClosedLoop) -> GainMargin:
 
     low = max(float(_edge(decays, k, edges[edges < k][::-1], 0.0) / k) for k in strengths)
     high = min(float(_edge(decays, k, edges[edges > k], _FAR * k) / k) for k in strengths)
-    return GainMargin(low, high if high < 0.999 * _FAR else np.inf)
+    return GainMargin(low if low > 1.0 / _FAR else 0.0, high if high < 0.999 * _FAR else np.inf)
 
 
 def decays_between(loop: ClosedLoop) -> bool:

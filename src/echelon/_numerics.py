@@ -146,6 +146,8 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     Raises:
         GainError: the equation has no stabilizing solution.
     """
+    if not len(A):
+        return np.zeros((0, 0))
     try:
         P = scipy.linalg.solve_continuous_are(A, B, Q, R)
     except (np.linalg.LinAlgError, ValueError) as error:

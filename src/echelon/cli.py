@@ -13,7 +13,9 @@ from echelon import _tables
 from echelon._errors import EchelonError
 
 if TYPE_CHECKING:
+    from echelon._build import Parts
     from echelon._simulate import Progress
+    from echelon.gains.gain import Gain
 
 _EPILOG = (
     "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, "
@@ -139,9 +141,15 @@ def design(
     ] = None,
     method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
     out: Annotated[Path | None, typer.Option(help="Save the gain to this file.")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="Draw modes and certified set into this folder.")
+    ] = None,
+    slice_: Annotated[
+        str | None, typer.Option("--slice", metavar="STATE,STATE", help="What the set is drawn in.")
+    ] = None,
     as_json: _Json = False,
 ) -> None:
-    """Try all gain methods on a scenario, recommend one, and save its gain."""
+    """Try all gain methods on a scenario, recommend one, save its gain, draw what it promises."""
     from echelon._scenario import load_scenario
 
     checked = load_scenario(scenario, set_ or [])
@@ -149,16 +157,25 @@ def design(
 
     _known_method(method)
     parts = _build.build(checked)
+    dt = checked.simulation.dt
     tried = _design.designs(checked, parts, method)
-    best = _design.recommended(tried)
-    rows = [_tables.design_row(each) for each in tried]
+    best = _design.recommended(tried, dt)
+    sentence = "No method gives a stable loop here."
+    told: dict[str, Any] = {"recommended": None}
+    if best is not None and best.gain is not None:
+        sentence = _design.because(best, tried, dt)
+        told = {"recommended": best.method, "because": sentence}
+        if out is not None:
+            _gain_file.save_gain(best.gain, parts.model, parts.graph, out)
+        if figures is not None:
+            radii = _design_figures(parts, best.gain, figures, slice_)
+            sentence += f"\n{radii}" if radii else ""
+            told["radii"] = radii
+    told["methods"] = [_tables.design_row(each) for each in tried]
     if as_json:
-        chosen = best.method if best else None
-        print(json.dumps({"recommended": chosen, "methods": rows}, indent=2))
+        print(json.dumps(told, indent=2))
     else:
-        _tables.print_designs(rows, best.method if best else None)
-    if out is not None and best is not None and best.gain is not None:
-        _gain_file.save_gain(best.gain, parts.model, parts.graph, out)
+        _tables.print_designs(told["methods"], sentence)
     raise typer.Exit(0 if best is not None else 1)
 
 
@@ -264,6 +281,19 @@ def schema() -> None:
     from echelon._scenario import json_schema
 
     print(json.dumps(json_schema(), indent=2))
+
+
+def _design_figures(parts: "Parts", gain: "Gain", folder: Path, asked: str | None) -> str | None:
+    """Draw a design's figures, and return a sentence on its radii if it has any."""
+    from echelon._design import with_gain
+    from echelon._design_plots import save_design_figures
+    from echelon._errors import OutputError
+
+    try:
+        _, radii = save_design_figures(with_gain(parts, gain), folder, asked)
+    except OSError as error:
+        raise OutputError(f"`{folder}` cannot be written: {error.strerror or error}.") from error
+    return None if radii is None else radii.sentence()
 
 
 def _known_method(method: str | None) -> None:

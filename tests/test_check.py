@@ -1,0 +1,426 @@
+"""`check`: the finite condition, the region's lines, and a promise no larger than its argument."""
+
+import dataclasses
+import json
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import echelon as ech
+from echelon import cli
+from echelon._check import check
+from echelon._check_region import killing_residual
+from echelon._finite_condition import pair_values
+from echelon._numerics import longest_step, precision
+
+PATH = ech.Graph.path(4)
+LOW, _, HIGH = PATH.grounded_spectrum()
+
+
+class Line1(ech.ControlAffine):
+    """x' = slope x + u."""
+
+    slope: float = -1.0
+    state_names = ("x",)
+    input_names = ("u",)
+
+    def drift(self, x):
+        return self.slope * x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+
+def scenario(follower, **sections):
+    told = {
+        "name": "mine",
+        "model": {"name": "pendulum"},
+        "graph": {"name": "path", "agents": 4},
+        "leader": {"law": "passive"},
+        "follower": follower,
+        "simulation": {"horizon": 2.0, "dt": 0.01},
+    }
+    return ech.scenario_from_mapping(told | sections)
+
+
+def checked(follower, **sections):
+    found = check(ech.build(scenario(follower, **sections)))
+    return {line.statement: line for line in found.lines}, found
+
+
+ROBUST = {"gain": {"method": "robust-lqr", "domain": {"angle": 0.5}}}
+
+
+@pytest.fixture(scope="module")
+def robust():
+    """The parts of a pendulum with a region, its leader at rest."""
+    return ech.build(scenario(ROBUST))
+
+
+def lines_of(parts):
+    found = check(parts)
+    return {line.statement: line for line in found.lines}, found
+
+
+def with_region(parts, **changes):
+    """Parts whose gain carries another region."""
+    gain = parts.follower.gain
+    region = dataclasses.replace(gain.certificate.region, **changes)
+    certificate = dataclasses.replace(gain.certificate, region=region)
+    other = ech.Gain(gain.P, gain.R, gain.coupling, gain.method, certificate)
+    return parts._replace(follower=dataclasses.replace(parts.follower, gain=other))
+
+
+def number(line):
+    return float(line.number.split()[1])
+
+
+# ---- the finite condition ----
+
+
+def goals(*offsets):
+    return ech.Formation([[offset] for offset in offsets])
+
+
+def test_the_sign_is_that_of_goals_that_pull_together():
+    # f = -x: (1 - 0) P (-1 - 0) = -P; the paper's d_ij = xi_j - xi_i would turn it.
+    good = ech.finite_condition(np.eye(1) * 2.0, Line1(-1.0), goals(0.0, 1.0))
+    assert (good.verdict, good.largest, good.least) == ("holds", pytest.approx(-2.0), 2.0)
+    bad = ech.finite_condition(np.eye(1) * 2.0, Line1(0.5), goals(0.0, 1.0, 3.0))
+    assert (bad.verdict, bad.largest) == ("fails", pytest.approx(9.0))
+    assert set(bad.pair) == {0, 2} and bad.agents == 3
+
+
+def test_goals_that_f_does_not_tell_apart_make_it_empty():
+    agent = ech.Quadrotor()
+    formation = ech.Formation.from_offsets(agent, PATH, {1: (1, 0, 0), 2: (0, 3, 0)})
+    assert ech.finite_condition(np.eye(12), agent, formation).verdict == "vacuous"
+    # Smaller than I it is refused even then, and a multiple of it is not.
+    assert ech.finite_condition(0.5 * np.eye(12), agent, formation).verdict == "fails"
+
+
+@given(st.integers(0, 10**6), st.floats(0.1, 10.0))
+@settings(max_examples=20, deadline=None)
+def test_the_condition_is_linear_in_p(seed, factor):
+    rng = np.random.default_rng(seed)
+    A, d = rng.normal(size=(3, 3)), rng.normal(size=(5, 5, 3))
+    f = d @ A.T
+    P, Q = ((M @ M.T) + np.eye(3) for M in rng.normal(size=(2, 3, 3)))
+    both = pair_values(P, d, f) + factor * pair_values(Q, d, f)
+    assert pair_values(P + factor * Q, d, f) == pytest.approx(both, rel=1e-9, abs=1e-9)
+    model = ech.Linear(A=A.tolist(), B=np.eye(3).tolist())
+    formation = ech.Formation(rng.normal(size=(5, 3)))
+    verdicts = [ech.finite_condition(M, model, formation).verdict for M in (P, Q, P + Q)]
+    # What two pass, their sum passes.
+    assert "holds" not in verdicts[:2] or verdicts[:2] != ["holds"] * 2 or verdicts[2] == "holds"
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=10, deadline=None)
+def test_the_largest_pair_is_the_largest(seed):
+    rng = np.random.default_rng(seed)
+    A, xi = rng.normal(size=(2, 2)), rng.normal(size=(150, 2))
+    found = ech.finite_condition(
+        np.eye(2), ech.Linear(A=A.tolist(), B=[[0.0], [1.0]]), ech.Formation(xi)
+    )
+    pairs = [(xi[i] - xi[j]) @ A @ (xi[i] - xi[j]) for i in range(150) for j in range(i)]
+    assert found.largest == pytest.approx(max(pairs), rel=1e-9)
+    i, j = found.pair
+    assert (xi[i] - xi[j]) @ A @ (xi[i] - xi[j]) == pytest.approx(max(pairs), rel=1e-9)
+
+
+def test_a_swarm_is_compared_by_a_thousand_of_its_agents():
+    found = ech.finite_condition(np.eye(1), Line1(-1.0), goals(*np.linspace(0.0, 1.0, 5000)))
+    assert (found.verdict, found.agents) == ("holds", 1000)
+
+
+def test_a_p_of_another_size_or_sign_is_refused():
+    with pytest.raises(ech.EchelonError, match=r"^`P` has shape \(2, 2\), and `Line1` needs"):
+        ech.finite_condition(np.eye(2), Line1(), goals(0.0, 1.0))
+    with pytest.raises(ech.EchelonError, match="not positive definite"):
+        ech.finite_condition(-np.eye(1), Line1(), goals(0.0, 1.0))
+
+
+# ---- the region and the set ----
+
+
+def test_the_region_is_told_and_the_promise_says_it(robust):
+    lines, found = lines_of(robust)
+    region = robust.follower.gain.certificate.region
+    assert lines["region of the gain"].verdict == "holds"
+    assert lines["region of the gain"].kind == region.kind == "vertices"
+    assert lines["region of the gain"].number == f"{region.rate:.3g} 1/s"
+    assert found.promised and "corners of a hull" in found.promise
+    assert f"{region.rate:.3g} 1/s or faster" in found.promise and "(T1)" in found.promise
+    assert f"<= {region.radius:.3g}^2" in found.promise
+
+
+def test_no_point_of_the_certified_set_leaves_the_domain(robust):
+    lines, _ = lines_of(robust)
+    radius, P = number(lines["certified set"]), robust.follower.gain.P
+    angles = np.linspace(0.0, 2.0 * np.pi, 4001)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    edge = radius * np.linalg.solve(np.linalg.cholesky(P).T, circle.T)
+    assert np.abs(edge[0]).max() == pytest.approx(0.5, rel=5e-3)
+
+
+def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
+    error = {"angle": 0.1, "rate": 0.3}
+    lines, found = checked(ROBUST, leader={"law": "passive", "start_error": error})
+    model = robust.model
+    solved = scipy.integrate.solve_ivp(
+        lambda t, x: np.asarray(model.drift(jnp.asarray(x))),
+        (0.0, 2.0),
+        [0.1, 0.3],
+        rtol=1e-8,
+        t_eval=np.linspace(0.0, 2.0, 201),
+    )
+    reach = np.abs(solved.y[0]).max()
+    assert 0.1 < reach < 0.5
+    alone, _ = lines_of(robust)
+    share = number(lines["certified set"]) / number(alone["certified set"])
+    assert share == pytest.approx((0.5 - reach) / 0.5, rel=2e-2)
+    assert lines["certified set"].kind == "samples"
+    assert "as in a run of its own" in found.promise
+
+
+def test_a_leader_that_leaves_the_domain_leaves_no_set():
+    lines, found = checked(ROBUST, leader={"law": "passive", "start_error": {"angle": 0.6}})
+    line = lines["certified set"]
+    assert (line.verdict, line.number) == ("fails", "empty")
+    assert "the leader alone reaches 0.6 in `angle`, and the domain 0.5" in line.text
+    assert "no start is certified" in found.promise
+
+
+@pytest.mark.parametrize(
+    ("changes", "told", "untold"),
+    [
+        ({"kind": "proof"}, "Proved in exact arithmetic", "samples"),
+        ({"kind": "samples"}, "Seen at samples, which is no proof", "Proved"),
+        ({"theorem": "T2"}, "small errors shrink", "from any start"),
+        ({"rate": 0.0}, "no region is proved", "errors shrink"),
+        ({"theorem": "A5", "rate": 0.0}, "V does not rise", "errors shrink"),
+    ],
+)
+def test_the_promise_is_as_strong_as_its_argument(robust, changes, told, untold):
+    _, found = lines_of(with_region(robust, **changes))
+    assert found.promised and told in found.promise and untold not in found.promise
+
+
+def test_where_only_the_drift_is_known_the_set_pays_for_the_graph(robust):
+    whole, _ = lines_of(robust)
+    drift, _ = lines_of(with_region(robust, theorem="A5", rate=0.0))
+    share = number(drift["certified set"]) / number(whole["certified set"])
+    assert share == pytest.approx(np.sqrt(LOW / HIGH), rel=5e-3)
+
+
+def test_a_linear_agent_is_certified_everywhere():
+    model = {"name": "linear", "parameters": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}
+    gain = {"method": "contraction", "domain": {}, "rate": 0.2}
+    lines, found = checked({"gain": gain}, model=model)
+    assert lines["certified set"].number == "radius inf" and "from everywhere" in found.promise
+
+
+# ---- what g does ----
+
+
+def test_turning_the_input_stretches_distances_by_half():
+    # g = (cos, -l sin; sin, l cos; 0, 1): P = I, dg/dtheta has size 1 and l, whatever theta is.
+    for reach in (0.3, 2.0):
+        agent = ech.UnicyclePoint(offset=reach)
+        domain = ech.Domain.about(agent, {"heading": 1.0})
+        with precision("float64"):
+            found, kind = killing_residual(agent, np.eye(3), domain)
+        assert (found, kind) == (pytest.approx(0.5 * max(1.0, reach)), "samples")
+
+
+def test_a_constant_input_map_is_a_proof():
+    agent = ech.QuadrotorThrust()
+    domain = ech.Domain.about(agent, {"attitude": 0.3, "thrust": 1.0})
+    with precision("float64"):
+        assert killing_residual(agent, np.eye(13), domain) == (0.0, "proof")
+
+
+def test_a_skew_input_is_killing_in_the_metric_that_it_turns():
+    class Turning(ech.ControlAffine):
+        state_names = ("x", "y")
+        input_names = ("spin",)
+
+        def drift(self, x):
+            return -x
+
+        def input_map(self, x):
+            return jnp.stack([-2.0 * x[1], x[0]])[:, None]
+
+    domain = ech.Domain.about(Turning(), {"x": 1.0, "y": 1.0})
+    with precision("float64"):
+        assert killing_residual(Turning(), np.diag([1.0, 2.0]), domain)[0] == pytest.approx(0.0)
+        assert killing_residual(Turning(), np.eye(2), domain)[0] == pytest.approx(0.5)
+
+
+# ---- the step ----
+
+
+def test_a_held_integrator_bears_two_time_constants():
+    one = np.eye(1)
+    for k in (0.5, 3.0):
+        assert longest_step(0.0 * one, one, [k * one, 0.1 * k * one]) == pytest.approx(2.0 / k)
+    # x' = -x - k x(t_k): e^-h - k (1 - e^-h) > -1, h < log((k + 1) / (k - 1)).
+    assert longest_step(-one, one, [3.0 * one]) == pytest.approx(np.log(2.0), rel=1e-4)
+    assert longest_step(-one, one, [0.5 * one]) == np.inf
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.99, "holds"), (1.01, "fails")])
+def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
+    gain = {"method": "given", "P": "identity", "coupling": 1.0}
+    dt = share * 2.0 / float(HIGH)
+    lines, found = checked(
+        {"gain": gain},
+        model={"name": "single-integrator"},
+        simulation={"horizon": 10.0, "dt": dt},
+    )
+    assert lines["step, input held"].verdict == verdict
+    assert found.promised is (verdict == "holds")
+    if not found.promised:
+        assert "with the input held over the step `dt` it grows" in found.promise
+
+
+# ---- who is promised nothing ----
+
+
+def test_followers_that_ignore_each_other_are_promised_nothing():
+    _, found = checked({"law": "passive"})
+    assert not found.promised
+    assert found.promise == (
+        "Nothing is promised: the followers' law does not act on the disagreement."
+    )
+
+
+def test_a_law_without_its_trim_input_is_promised_nothing():
+    quadrotor = {"model": {"name": "planar-quadrotor"}}
+    lines, found = checked({"trim": False}, **quadrotor)
+    assert lines["Definition 1, f(0) = 0"].verdict == "fails" and not found.promised
+    assert "leaves out the trim input" in found.promise
+    lines, found = checked({}, **quadrotor)
+    assert lines["Definition 1, f(0) = 0"].verdict == "holds" and found.promised
+
+
+def test_every_failure_says_what_to_change():
+    for name in ("paper-literal", "paper"):
+        found = check(ech.build(ech.load_scenario(name)))
+        for line in found.lines:
+            assert (
+                line.statement
+                and line.kind
+                and line.verdict
+                in (
+                    "holds",
+                    "fails",
+                    "vacuous",
+                    "not needed",
+                )
+            )
+            assert line.text, line.statement
+
+
+# ---- other lines ----
+
+
+def test_a_long_path_says_which_eigenvalues_it_looked_at():
+    graph = {"name": "path", "agents": 601}
+    lines, found = checked({"gain": {"method": "riccati"}}, graph=graph,
+                           model={"name": "single-integrator"},
+                           simulation={"horizon": 1.0, "dt": 1e-6})  # fmt: skip
+    assert lines["disagreement decays"].text == "at lambda_min and lambda_max; all between decay"
+    assert lines["delay margin"].text.endswith("lambda_min, lambda_max and 30 values between them")
+    assert found.promised
+
+
+def test_a_pushed_integrator_lags_by_its_slowest_mode():
+    gain = {"method": "given", "P": "identity", "coupling": 3.0}
+    lines, _ = checked({"gain": gain}, model={"name": "single-integrator"})
+    for statement in ("disturbance, network", "disturbance, one mode"):
+        values = [float(part.split()[1]) for part in lines[statement].number.split(", ")]
+        assert values == pytest.approx([1.0 / (3.0 * LOW)] * len(values), rel=5e-3)
+
+
+def test_a_chain_of_integrators_passes_on_what_it_gets():
+    gain = {"method": "given", "P": "identity", "coupling": 2.0}
+    model = {"name": "single-integrator"}
+    lines, _ = checked({"gain": gain}, model=model)
+    assert lines["string gain"].number == "1, 1 over 3 links"
+    assert lines["string gain"].verdict == "not needed"
+    lines, _ = checked({"gain": gain}, model=model, graph={"name": "ring", "agents": 4})
+    assert "string gain" not in lines
+
+
+# ---- bad input ----
+
+
+@pytest.fixture
+def echelon(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        told = capsys.readouterr()
+        return left.value.code or 0, told.out, told.err
+
+    return call
+
+
+def written(gain, model="planar-quadrotor"):
+    with open("mine.yaml", "w") as mine:
+        mine.write(
+            f"name: mine\nmodel: {{name: {model}}}\ngraph: {{name: path, agents: 3}}\n"
+            f"follower: {{gain: {{{gain}}}}}\nsimulation: {{horizon: 1.0, dt: 0.001}}\n"
+        )
+
+
+@pytest.mark.parametrize(
+    ("model", "gain", "sentence"),
+    [
+        ("quadrotor", "method: robust-lqr, domain: {pitch: 1.6}", "holds only inside (-1.571"),
+        ("pendulum", "method: robust-lqr, domain: {angle: [0.5, 0.2]}", "lower end below its up"),
+        ("pendulum", "method: robust-lqr, domain: {angle: [0.0, 0.0]}", "lower end below its up"),
+        ("pendulum", "method: given, P: [1.0, .nan]", "allowed is a finite"),
+        ("pendulum", "method: robust-lqr, domain: {angle: .inf}", "allowed is a finite"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "design"])
+def test_bad_input_is_one_sentence(echelon, command, model, gain, sentence):
+    written(gain, model)
+    code, out, err = echelon(command, "mine.yaml")
+    assert code == 2 and out == ""
+    assert err.count("\n") == 1 and err.startswith("echelon: ") and sentence in err
+
+
+def test_a_gain_file_of_another_model_or_graph_is_refused_by_check(echelon):
+    written("method: riccati", "pendulum")
+    assert echelon("design", "mine.yaml", "--method", "riccati", "--out", "gain.json")[0] == 0
+    written("file: gain.json", "pendulum")
+    code, out, _ = echelon("check", "mine.yaml", "--json")
+    assert code == 0 and json.loads(out)["promised"] is True
+    for change, sentence in (("agents: 5", "made for a graph of 3 agents"),
+                             ("agents: 3", "was made for `Pendulum` with state_names")):  # fmt: skip
+        written("file: gain.json", "van-der-pol" if change == "agents: 3" else "pendulum")
+        with open("mine.yaml") as mine:
+            text = mine.read().replace("agents: 3", change)
+        with open("mine.yaml", "w") as mine:
+            mine.write(text)
+        code, _, err = echelon("check", "mine.yaml")
+        assert code == 2 and sentence in err and err.count("\n") == 1
+
+
+def test_a_missing_solver_names_its_pip_line(echelon, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    written("method: robust-lqr, domain: {angle: 0.5}", "pendulum")
+    code, _, err = echelon("check", "mine.yaml")
+    assert code == 4 and "pip install" in err and err.count("\n") == 1
