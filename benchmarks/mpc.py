@@ -1,8 +1,8 @@
 """Time the solvers that CasADi brings on one agent's receding horizon.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/mpc.py` (a few minutes). A quadrotor 1 m and 0.3 rad off the
-paper's lemniscate plans 1 s ahead at 50 Hz, 50 steps of 20 ms within its motors' limits. Seconds are
-those of the process, which other work on the machine disturbs less than those of the clock.
+Run `OMP_NUM_THREADS=1 python benchmarks/mpc.py` (a few minutes). A quadrotor 1 m and 0.3 rad off
+the paper's lemniscate plans 1 s ahead at 50 Hz, 50 steps of 20 ms within its motors' limits. Times
+are those of the process, which other work on the machine disturbs less than those of the clock.
 """
 
 import argparse
@@ -120,9 +120,7 @@ def main() -> None:
     parser.add_argument("--periods", type=int, default=150)
     parser.add_argument("solvers", nargs="*", default=[*QUADRATIC, *NONLINEAR])
     asked = parser.parse_args()
-    print(
-        "| solver | median ms | p99 ms | worst ms | iterations | failures | error at the end, m |"
-    )
+    print("| solver | median ms | p99 ms | worst ms | iterations | failures | last error, m |")
     print("|---|---|---|---|---|---|---|")
     for name in asked.solvers:
         kind = "one linearization, " if name in QUADRATIC else "nonlinear, "

@@ -1,6 +1,6 @@
 """Measure the optimization-based method on the paper's agents: errors, the least possible, times.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/optimization.py` (some minutes). It prints a Markdown table.
+Run `OMP_NUM_THREADS=1 python benchmarks/optimization.py` (some minutes); it prints a table.
 """
 
 import dataclasses
@@ -145,7 +145,7 @@ def leader(free: ech.Result, within: ech.Result) -> Iterator[Row]:
     times = grid(10.0, 0.005, 0.02)
     best = least(starts()[0], reference_targets(MODEL, LOOP, times.times), times, range(4))
     yield (
-        "leader, motor limits: least RMSE found (no input cost, 20 ms, 4 starts), and excess over it",
+        "leader, motor limits: least whole-run RMSE found (4 starts), and excess over it",
         f"{best:.4f} m, {100 * (whole(e) / best - 1):.1f} %",
         "within 5 %",
     )
