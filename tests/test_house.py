@@ -26,8 +26,11 @@ PACKAGE = ROOT / "src" / "echelon"
 FLOORS = [
     ["_types", "_errors", "_registry", "_paper", "_provenance"],
     ["_yaml", "_numerics", "_drawing", "_hull_enclosure", "_exact"],
+    ["_verify_file", "_verify_exact"],
     ["_scenario_values", "models.model", "references.reference", "_graph", "_hull_curves", "_lmi"]
     + ["_casadi"],
+    ["_verify_algebra", "_verify_model"],
+    ["_verify"],
     ["_scenario_checks", "_scenario_parts", "models.rigid_body", "models.rotors", "_hull_algebra"]
     + ["_optimal_control"],
     ["_scenario", "models.*", "references.*", "_formation", "_linearization", "_hull_rules"]
