@@ -145,6 +145,39 @@ def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():
     assert "no constant metric" in told
 
 
+class Turned(ech.ControlAffine):
+    """A decaying drift and an input that pushes along a direction which the state turns."""
+
+    state_names = ("east", "north")
+    input_names = ("push",)
+
+    def drift(self, x):
+        return -x
+
+    def input_map(self, x):
+        return jnp.stack([jnp.cos(x[0]), jnp.sin(x[0])])[:, None]
+
+
+def test_where_g_varies_a_monotone_drift_is_certified_a_smaller_set(tmp_path):
+    gain = ech.synthesize(Turned(), LINE, ech.Monotone({"east": 1.0, "north": 2.0}))
+    region, ends = gain.certificate.region, LINE.grounded_spectrum()[[0, -1]]
+    assert region.theorem == "A5"
+    assert region.radius == pytest.approx(
+        radius(region.domain, gain.P) * np.sqrt(ends[0] / ends[1]), rel=1e-12
+    )
+    # V = delta'(L kron P) delta does not rise: on its set no agent leaves the domain.
+    L = LINE.grounded_laplacian().toarray()
+    reach = np.sqrt(ends[1]) * region.radius * np.sqrt(np.diag(np.linalg.inv(np.kron(L, gain.P))))
+    assert (reach.reshape(3, 2) <= np.array([1.0, 2.0]) * (1 + 1e-9)).all()
+    ech.save_gain(gain, Turned(), LINE, tmp_path / "gain.json")
+    assert ech.verify(tmp_path / "gain.json", Turned()).holds
+    told = json.loads((tmp_path / "gain.json").read_text())
+    told["certificate"]["region"]["radius"] *= float(np.sqrt(ends[1] / ends[0]))
+    (tmp_path / "gain.json").write_text(json.dumps(told))
+    found = ech.verify(tmp_path / "gain.json", Turned())
+    assert found.sentence == "Refused: g is constant (A5) does not hold as stored."
+
+
 @pytest.mark.parametrize("model", [ech.DoubleIntegrator(3), ech.PrintedQuadrotor()])
 def test_nilpotent_drifts_have_no_monotone_metric_and_the_block_is_named(model):
     told = sentence(

@@ -213,21 +213,39 @@ def _regional(facts: _Facts) -> Iterator[Finding]:
     inside = (region.lower <= 0.0) & (region.upper >= 0.0)
     held = (region.input_lower <= 0.0) & (region.input_upper >= 0.0)
     yield _said("the domain holds the trim", bool(inside.all() and held.all()))
-    yield _radius(saved.P, region)
+    yield _radius(facts, region)
     yield from _rate(facts, region)
 
 
-def _radius(P: Matrix, region: SavedRegion) -> Finding:
+def _spread(facts: _Facts) -> float:
+    """Return what it costs the radius of a monotone drift that g may vary."""
+    return float(np.sqrt(facts.eigenvalues[0] / facts.eigenvalues[-1]))
+
+
+def _needs_constant(facts: _Facts, region: SavedRegion) -> bool:
+    """Tell whether a promise holds for a constant g only."""
+    widest = _widest(facts.saved.P, region)
+    cut = region.radius is not None and region.radius <= (1.0 + _TIGHT) * _spread(facts) * widest
+    return region.theorem == "T1" or region.theorem == "A5" and not cut
+
+
+def _radius(facts: _Facts, region: SavedRegion) -> Finding:
     """Compare with the largest r of which {x'P x <= r^2} stays inside the bounds."""
-    claim, margins = "radius", np.minimum(region.upper, -region.lower)
-    bounded = np.isfinite(margins)
-    if region.radius is None or not bounded.any():
-        return _said(claim, region.radius is None and not bounded.any(), str(region.radius))
-    # A row of L^-1 for P = L L' has the length that state reaches on x'P x = 1.
+    widest = _widest(facts.saved.P, region)
+    if region.radius is None or np.isinf(widest):
+        return _said("radius", region.radius is None and np.isinf(widest), str(region.radius))
+    if region.theorem == "A5" and not _needs_constant(facts, region):
+        widest *= _spread(facts)
+    return _same("radius", region.radius, widest)
+
+
+def _widest(P: Matrix, region: SavedRegion) -> float:
+    margins = np.minimum(region.upper, -region.lower)
+    # A column of L^-1 for P = L L' has the length that its state reaches on x'P x = 1.
     reach = np.linalg.norm(
         scipy.linalg.solve_triangular(np.linalg.cholesky(P), np.eye(len(P)), lower=True), axis=0
     )
-    return _same(claim, region.radius, float((margins[bounded] / reach[bounded]).min()))
+    return float((margins / reach).min())
 
 
 def _rate(facts: _Facts, region: SavedRegion) -> Iterator[Finding]:
@@ -323,10 +341,10 @@ def _on_the_domain(facts: _Facts, region: SavedRegion, model: ControlAffine) -> 
     found = equations.slopes(model, saved.model, points.states, points.inputs)
     count = f"{len(found.jacobians)} states"
     weighted = found.maps @ np.linalg.solve(saved.R, found.maps.swapaxes(1, 2))
-    if region.theorem == "T1":
+    if _needs_constant(facts, region):
         gap = float(np.abs(found.maps - saved.model.B).max())
         fine = gap <= _ROUNDING * float(np.abs(saved.model.B).max())
-        yield _said("g is constant (T1)", fine, "", f"{gap:.3g} apart", count)
+        yield _said(f"g is constant ({region.theorem})", fine, "", f"{gap:.3g} apart", count)
     pairs = [found.jacobians, weighted] if region.theorem == "T2" else [found.jacobians]
     if region.kind == "samples":
         gap = equations.farthest_from_all(region.hull, np.dstack(pairs)[: points.corners])
