@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
     from echelon._simulate import simulate
     from echelon._synthesize import synthesize
+    from echelon._verify import Verified, verify
     from echelon.gains import (
         Certificate,
         Contraction,
@@ -95,6 +96,7 @@ _HOMES = {
     "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
     "_simulate": ("simulate",),
     "_synthesize": ("synthesize",),
+    "_verify": ("Verified", "verify"),
     "gains": (
         "Certificate",
         "Contraction",
@@ -190,6 +192,7 @@ __all__ = [
     "Unicycle",
     "UnicyclePoint",
     "VanDerPol",
+    "Verified",
     "Waypoints",
     "build",
     "bundled_scenarios",
@@ -212,6 +215,7 @@ __all__ = [
     "simulate",
     "summary",
     "synthesize",
+    "verify",
 ]
 
 
