@@ -20,16 +20,20 @@ if TYPE_CHECKING:
     from echelon._formation import Formation
     from echelon._gain_file import load_gain, save_gain
     from echelon._graph import Graph
+    from echelon._horizon import MPC
     from echelon._lyapunov import Lyapunov, lyapunov
     from echelon._metrics import Metrics, metrics
     from echelon._optimal_control import Constraint, OptimalControl
+    from echelon._optimization import simulate_mpc, simulate_plans
     from echelon._plan import Plan, Planner, plan
     from echelon._planar_baseline import PlanarBaseline
     from echelon._plots import figures, save_figures
+    from echelon._posing import Planning
     from echelon._report import report
     from echelon._result import Result
     from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
     from echelon._simulate import simulate
+    from echelon._solver_figures import SolverFigures, solver_figures
     from echelon._synthesize import synthesize
     from echelon._verify import Verified, verify
     from echelon.gains import (
@@ -44,7 +48,15 @@ if TYPE_CHECKING:
         Riccati,
         RobustLQR,
     )
-    from echelon.laws import Agreement, Consensus, Law, LocalView, Passive, Tracking
+    from echelon.laws import (
+        Agreement,
+        Consensus,
+        Law,
+        LocalView,
+        OptimalTracking,
+        Passive,
+        Tracking,
+    )
     from echelon.models import (
         ControlAffine,
         DoubleIntegrator,
@@ -85,16 +97,20 @@ _HOMES = {
     "_formation": ("Formation",),
     "_gain_file": ("load_gain", "save_gain"),
     "_graph": ("Graph",),
+    "_horizon": ("MPC",),
     "_lyapunov": ("Lyapunov", "lyapunov"),
     "_metrics": ("Metrics", "metrics"),
     "_optimal_control": ("Constraint", "OptimalControl"),
+    "_optimization": ("simulate_mpc", "simulate_plans"),
     "_plan": ("Plan", "Planner", "plan"),
     "_planar_baseline": ("PlanarBaseline",),
     "_plots": ("figures", "save_figures"),
+    "_posing": ("Planning",),
     "_report": ("report",),
     "_result": ("Result",),
     "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
     "_simulate": ("simulate",),
+    "_solver_figures": ("SolverFigures", "solver_figures"),
     "_synthesize": ("synthesize",),
     "_verify": ("Verified", "verify"),
     "gains": (
@@ -109,7 +125,15 @@ _HOMES = {
         "Riccati",
         "RobustLQR",
     ),
-    "laws": ("Agreement", "Consensus", "Law", "LocalView", "Passive", "Tracking"),
+    "laws": (
+        "Agreement",
+        "Consensus",
+        "Law",
+        "LocalView",
+        "OptimalTracking",
+        "Passive",
+        "Tracking",
+    ),
     "models": (
         "ControlAffine",
         "DoubleIntegrator",
@@ -166,10 +190,12 @@ __all__ = [
     "Linear",
     "LocalView",
     "Lyapunov",
+    "MPC",
     "Method",
     "Metrics",
     "Monotone",
     "OptimalControl",
+    "OptimalTracking",
     "Outcome",
     "Passive",
     "Pendulum",
@@ -177,6 +203,7 @@ __all__ = [
     "PlanarBaseline",
     "PlanarQuadrotor",
     "Planner",
+    "Planning",
     "PrintedQuadrotor",
     "Quadrotor",
     "QuadrotorEuler",
@@ -188,6 +215,7 @@ __all__ = [
     "RobustLQR",
     "Scenario",
     "SingleIntegrator",
+    "SolverFigures",
     "Tracking",
     "Unicycle",
     "UnicyclePoint",
@@ -213,6 +241,9 @@ __all__ = [
     "save_gain",
     "scenario_from_mapping",
     "simulate",
+    "simulate_mpc",
+    "simulate_plans",
+    "solver_figures",
     "summary",
     "synthesize",
     "verify",

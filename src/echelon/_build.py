@@ -342,7 +342,13 @@ def _leader(
         raise ScenarioError(
             f"`reacts` needs a follower law with a gain, and `{scenario.follower.law}` has none."
         )
-    offers: dict[str, Any] = {"reference": reference, "reaction": reaction}
+    offers: dict[str, Any] = {
+        "reference": reference,
+        "reaction": reaction,
+        "start_error": spec.start_error,
+        "horizon": scenario.simulation.horizon,
+        "limits": scenario.simulation.limits,
+    }
     if spec.gain is not None:
         with faults.at("leader", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)

@@ -24,7 +24,7 @@ def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
     return jax.enable_x64(name == "float64")
 
 
-def rk4(field: Field, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
+def rk4(field: Field, x: jax.Array, u: jax.Array, dt: float | jax.Array) -> jax.Array:
     """Advance one step by the classical Runge-Kutta method with the input held; error O(dt^4)."""
     k1 = field(x, u)
     k2 = field(x + 0.5 * dt * k1, u)

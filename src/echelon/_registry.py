@@ -80,6 +80,9 @@ LEADER_LAWS = {
     "tracking": Entry(
         "echelon.laws:Tracking", "flatness feed-forward and Riccati feedback on the reference"
     ),
+    "optimal-tracking": Entry(
+        "echelon.laws:OptimalTracking", "a plan of least tracking error, and feedback about it"
+    ),
     "agreement": FOLLOWER_LAWS["agreement"],
     "passive": FOLLOWER_LAWS["passive"],
 }

@@ -14,6 +14,9 @@ Fault = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
 # Of these two keys a section has one at most; True where it must have one.
+_TRACKS = ("tracking", "optimal-tracking")
+"""The leader laws that follow a reference."""
+
 _SOURCES: dict[str, tuple[str, str, bool]] = {
     "model": ("name", "python", True),
     "graph": ("edges", "name", True),
@@ -229,14 +232,15 @@ def _members(data: Part) -> Iterator[Fault]:
 def _following(data: Part) -> Iterator[Fault]:
     """Yield a leader that tracks nothing, and a reference that nobody tracks."""
     law, given = _section(data, "leader").get("law"), data.get("reference") is not None
-    if law == "tracking" and not given:
+    if law in _TRACKS and not given:
         yield (
             ("leader", "law"),
-            "got `tracking` without a `reference`, a leader that tracks needs one.",
+            f"got `{law}` without a `reference`, a leader that tracks needs one.",
         )
-    if given and isinstance(law, str) and law in LEADER_LAWS and law != "tracking":
+    if given and isinstance(law, str) and law in LEADER_LAWS and law not in _TRACKS:
         said = f"got a reference for a leader whose law is `{law}`"
-        yield ("reference",), f"{said}, allowed is one only with the law `tracking`."
+        allowed = " or ".join(f"`{name}`" for name in _TRACKS)
+        yield ("reference",), f"{said}, allowed is one only with the law {allowed}."
 
 
 def _changed(data: Part) -> Iterator[Fault]:
