@@ -20,7 +20,7 @@ import scipy.fft
 import scipy.linalg
 
 from echelon._errors import GainError, MissingExtraError, listing
-from echelon._numerics import riccati, symmetric_part
+from echelon._numerics import in_words, riccati, symmetric_part
 from echelon._types import Matrix
 
 _AXIS = 1e-9  # eigenvalues closer to the imaginary axis, in units of the norm, count as on it
@@ -125,7 +125,9 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
     if found is not None:
         along = listing(names[i] if names else f"x{i + 1}" for i in found.states)
         kind = "a Jordan block on the imaginary axis" if found.defective else "an unstable mode"
-        what = f"matrix {found.vertex} has {kind}, at {found.eigenvalue:.3g} 1/s along {along}"
+        what = (
+            f"matrix {found.vertex} has {kind}, at {in_words(found.eigenvalue)} 1/s along {along}"
+        )
         raise GainError(
             f"no P > 0 keeps this drift from expanding: {what}; damp it by an inner loop, shrink "
             "the domain, or take a method with feedback."
