@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from echelon._planar_baseline import PlanarBaseline
     from echelon._plots import figures, save_figures
     from echelon._posing import Planning
+    from echelon._recommend import Shorter, recommend_edges, recommend_leaders, shorter
     from echelon._report import report
     from echelon._result import Result
     from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
@@ -106,6 +107,7 @@ _HOMES = {
     "_planar_baseline": ("PlanarBaseline",),
     "_plots": ("figures", "save_figures"),
     "_posing": ("Planning",),
+    "_recommend": ("Shorter", "recommend_edges", "recommend_leaders", "shorter"),
     "_report": ("report",),
     "_result": ("Result",),
     "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
@@ -214,6 +216,7 @@ __all__ = [
     "Riccati",
     "RobustLQR",
     "Scenario",
+    "Shorter",
     "SingleIntegrator",
     "SolverFigures",
     "Tracking",
@@ -234,12 +237,15 @@ __all__ = [
     "lyapunov",
     "metrics",
     "plan",
+    "recommend_edges",
+    "recommend_leaders",
     "report",
     "run",
     "save_dataset",
     "save_figures",
     "save_gain",
     "scenario_from_mapping",
+    "shorter",
     "simulate",
     "simulate_mpc",
     "simulate_plans",
