@@ -217,7 +217,9 @@ def contraction(As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4) 
     solved = _least(cp, rho, [W - unit >> 0, 0.999 * condition_max * unit - W >> 0], gaps)
     P = _unscaled(W.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
-    tried = [float(rho.value) * part for part in (1.0, 1.0001, 1.01, 1.1)] if solved else []
+    tried = (
+        [max(0.0, float(rho.value)) * part for part in (1.0, 1.0001, 1.01, 1.1)] if solved else []
+    )
     enough = [s for s in tried if P is not None and rate_of(P, As, B, None, s) >= rate]
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(

@@ -232,6 +232,9 @@ def _needs_constant(facts: _Facts, region: SavedRegion) -> bool:
 def _radius(facts: _Facts, region: SavedRegion) -> Finding:
     """Compare with the largest r of which {x'P x <= r^2} stays inside the bounds."""
     widest = _widest(facts.saved.P, region)
+    if region.theorem == "T2":
+        text = "a local promise certifies no set"
+        return _said("radius", region.radius is None, str(region.radius), text=text)
     if region.radius is None or np.isinf(widest):
         return _said("radius", region.radius is None and np.isinf(widest), str(region.radius))
     if region.theorem == "A5" and not _needs_constant(facts, region):
