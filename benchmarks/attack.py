@@ -252,7 +252,7 @@ def _pace(promise: Promise, size: float) -> float:
     """Return a step that resolves the fastest mode, or a third of the slowest time constant."""
     p, G = promise, promise.plant.B
     feedback = np.abs(np.linalg.eigvals(G @ np.linalg.solve(p.R, G.T @ p.P))).max()
-    fastest = size + p.coupling * np.linalg.eigvalsh(p.grounded)[-1] * feedback
+    fastest = size + abs(p.coupling) * np.linalg.eigvalsh(p.grounded)[-1] * feedback
     return min(0.25 / (fastest + 1e-9), 3.0 / (_STEPS * max(p.rate, 1e-3)))
 
 
@@ -277,17 +277,21 @@ def _runge_kutta(
 
 def _loop(promise: Promise) -> Field:
     """Return xdot of leader and followers (S, 1 + N, n), the leader's input w (S, m) relayed."""
-    p, plant = promise, promise.plant
+    p, plant, R_inverse = promise, promise.plant, np.linalg.inv(promise.R)
+    L = np.zeros((len(p.grounded) + 1, len(p.grounded) + 1))
+    L[1:, 1:] = p.grounded
+    # The disagreement is that of deviations from the leader, whose own is none.
+    L[1:, 0] = -p.grounded.sum(axis=1)
+    fixed = p.coupling * p.P @ plant.B @ R_inverse @ plant.B.T
 
     def field(x: np.ndarray, w: np.ndarray) -> np.ndarray:
-        flat = x.reshape(-1, x.shape[-1])
-        drift, G = plant.drift(flat).reshape(x.shape), plant.input_map(flat)
-        z = np.einsum("ij,sja->sia", p.grounded, x[:, 1:] - x[:, :1])
-        G = np.broadcast_to(G, (len(flat), *plant.B.shape)).reshape(*x.shape, -1)
-        pull = np.einsum("siam,sia->sim", G[:, 1:], z @ p.P)
-        fed = -p.coupling * np.linalg.solve(p.R, pull[..., None])[..., 0]
-        u = np.concatenate([np.zeros_like(fed[:, :1]), fed], axis=1) + w[:, None]
-        return drift + np.einsum("siam,sim->sia", G, u)
+        flat, z = x.reshape(-1, x.shape[-1]), L @ x
+        drift = plant.drift(flat).reshape(x.shape)
+        if plant.constant:
+            return drift - z @ fixed + (w @ plant.B.T)[:, None]
+        G = plant.input_map(flat).reshape(*x.shape, -1)
+        pull = ((z @ p.P)[..., None, :] @ G) @ (p.coupling * R_inverse)
+        return drift + (G @ (w[:, None] - pull[..., 0, :])[..., None])[..., 0]
 
     return field
 
@@ -334,7 +338,8 @@ def _compare(
     rough_v, v = (_energy(path[:, :, 1:] - path[:, :, :1], weight, p.P) for path in (rough, fine))
     inside = ((fine >= p.low) & (fine <= p.high)).all(axis=(2, 3))
     if stays:
-        slack = np.abs(fine - rough) + 64.0 * EPS * np.abs(x).max()
+        # The set's own width comes of the inverse of P.
+        slack = np.abs(fine - rough) + 64.0 * EPS * np.linalg.cond(p.P) * np.abs(x).max()
         left = ~((fine >= p.low - slack) & (fine <= p.high + slack)).all(axis=(2, 3))
         if p.radius is not None and left.any():
             found.violations.append("set: a run that began in the certified set left the domain")

@@ -6,6 +6,7 @@ echelon or JAX.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -52,6 +53,11 @@ class Terms:
             np.array(quarter, int),
         )
 
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """What puts terms in their places, (T, size)."""
+        return np.eye(int(np.prod(self.shape)))[self.place]
+
     def rows(self) -> list[tuple[Any, ...]]:
         """Return what `of` takes."""
         return list(
@@ -68,15 +74,15 @@ class Terms:
 
     def at(self, x: np.ndarray) -> np.ndarray:
         """Return the sums at points (K, n), (K, *shape)."""
-        size = int(np.prod(self.shape))
         if not len(self.weight):
             return np.zeros((len(x), *self.shape))
         one = np.concatenate([np.ones((len(x), 1)), x], axis=1)
-        values = self.weight * one[:, self.factors].prod(axis=2)
-        waves = self.frequency != 0.0
-        angle = self.frequency[waves] * x[:, self.along[waves]]
-        values[:, waves] *= np.cos(angle + 0.5 * np.pi * self.quarter[waves])
-        return (values @ np.eye(size)[self.place]).reshape(len(x), *self.shape)
+        a, b, d = self.factors.T
+        values = self.weight * one[:, a] * one[:, b] * one[:, d]
+        if self.frequency.any():  # where it is 0, so is the quarter
+            angle = self.frequency * x[:, self.along] + 0.5 * np.pi * self.quarter
+            values = values * np.cos(angle)
+        return (values @ self.spread).reshape(len(x), *self.shape)
 
     def slope(self, n: int) -> "Terms":
         """Return the derivatives along all n states, of shape (*shape, n), by the product rule."""

@@ -391,7 +391,8 @@ GAINS = {
 LAWS = {
     "unknown feed-forward": (
         lambda: Consensus(gain_of(CART), feedforward="relai"),
-        "`feedforward` is `relai`, allowed are `none` and `relay`.",
+        "`feedforward` is `relai`, allowed are `none`, `relay`, `relay-velocity`, `parent` "
+        "(did you mean `relay`?).",
     ),
     "a gain for another model": (
         lambda: run(follower=Consensus(gain_of(CART))),

@@ -36,6 +36,13 @@ class Line1(ech.ControlAffine):
         return jnp.ones((1, 1), x.dtype)
 
 
+class Weakening(ech.Pendulum):
+    """A pendulum whose input loses strength away from the trim."""
+
+    def input_map(self, x):
+        return jnp.stack([0.0 * x[0], jnp.cos(x[0])])[:, None]
+
+
 def scenario(follower, **sections):
     told = {
         "name": "mine",
@@ -212,11 +219,14 @@ def test_the_promise_is_as_strong_as_its_argument(robust, changes, told, untold)
     assert found.promised and told in found.promise and untold not in found.promise
 
 
-def test_where_only_the_drift_is_known_the_set_pays_for_the_graph(robust):
+def test_where_only_the_drift_is_known_the_set_pays_for_the_graph_if_g_varies(robust):
     whole, _ = lines_of(robust)
+    radius = number(whole["certified set"])
     drift, _ = lines_of(with_region(robust, theorem="A5", rate=0.0))
-    share = number(drift["certified set"]) / number(whole["certified set"])
-    assert share == pytest.approx(np.sqrt(LOW / HIGH), rel=5e-3)
+    assert number(drift["certified set"]) == radius
+    varying = with_region(robust, theorem="A5", rate=0.0)._replace(model=Weakening())
+    drift, _ = lines_of(varying)
+    assert number(drift["certified set"]) == pytest.approx(radius * np.sqrt(LOW / HIGH), rel=5e-3)
 
 
 def test_a_linear_agent_is_certified_everywhere():
@@ -230,13 +240,14 @@ def test_a_linear_agent_is_certified_everywhere():
 
 
 def test_turning_the_input_stretches_distances_by_half():
-    # g = (cos, -l sin; sin, l cos; 0, 1): P = I, dg/dtheta has size 1 and l, whatever theta is.
-    for reach in (0.3, 2.0):
-        agent = ech.UnicyclePoint(offset=reach)
-        domain = ech.Domain.about(agent, {"heading": 1.0})
+    # g S = (cos, -sin; sin, cos; 0, 1/l): dg_k/dheading is a unit vector, so in P = diag(1, 1, w)
+    # it stretches by half of 1 / sqrt(w), whatever the heading is.
+    agent = ech.UnicyclePoint()
+    domain = ech.Domain.about(agent, {"heading": 1.0})
+    for weight in (0.25, 1.0, 9.0):
         with precision("float64"):
-            found, kind = killing_residual(agent, np.eye(3), domain)
-        assert (found, kind) == (pytest.approx(0.5 * max(1.0, reach)), "samples")
+            found, kind = killing_residual(agent, np.diag([1.0, 1.0, weight]), domain)
+        assert (found, kind) == (pytest.approx(0.5 / np.sqrt(weight)), "samples")
 
 
 def test_a_constant_input_map_is_a_proof():
@@ -302,12 +313,25 @@ def test_followers_that_ignore_each_other_are_promised_nothing():
 
 
 def test_a_law_without_its_trim_input_is_promised_nothing():
-    quadrotor = {"model": {"name": "planar-quadrotor"}}
+    step = {"horizon": 1.0, "dt": 0.002}
+    quadrotor = {"model": {"name": "planar-quadrotor"}, "simulation": step}
     lines, found = checked({"trim": False}, **quadrotor)
     assert lines["Definition 1, f(0) = 0"].verdict == "fails" and not found.promised
     assert "leaves out the trim input" in found.promise
     lines, found = checked({}, **quadrotor)
     assert lines["Definition 1, f(0) = 0"].verdict == "holds" and found.promised
+
+
+def test_wind_and_another_plant_are_left_out_of_the_promise_and_said_to_be():
+    wind = {"disturbance": {"rms": {"rate": 0.1}}}
+    plant = {"plant": {"scale": {"damping": 1.1}}}
+    lines, calm = checked({})
+    assert lines["Assumption 3, exact states"].verdict == "holds"
+    assert "without" not in calm.promise
+    for sections, told in ((wind, "wind or noise acts"), (plant, "differ from the model")):
+        lines, found = checked({}, **sections)
+        assert lines["Assumption 3, exact states"].verdict == "fails"
+        assert found.promised and told in found.promise
 
 
 def test_every_failure_says_what_to_change():
@@ -408,8 +432,10 @@ def test_a_gain_file_of_another_model_or_graph_is_refused_by_check(echelon):
     written("file: gain.json", "pendulum")
     code, out, _ = echelon("check", "mine.yaml", "--json")
     assert code == 0 and json.loads(out)["promised"] is True
-    for change, sentence in (("agents: 5", "made for a graph of 3 agents"),
-                             ("agents: 3", "was made for `Pendulum` with state_names")):  # fmt: skip
+    for change, sentence in (
+        ("agents: 5", "made for a graph of 3 agents"),
+        ("agents: 3", "was made for `Pendulum` with state_names"),
+    ):
         written("file: gain.json", "van-der-pol" if change == "agents: 3" else "pendulum")
         with open("mine.yaml") as mine:
             text = mine.read().replace("agents: 3", change)
@@ -417,6 +443,16 @@ def test_a_gain_file_of_another_model_or_graph_is_refused_by_check(echelon):
             mine.write(text)
         code, _, err = echelon("check", "mine.yaml")
         assert code == 2 and sentence in err and err.count("\n") == 1
+
+
+def test_a_gain_from_a_file_keeps_its_region(echelon):
+    domain = "method: robust-lqr, domain: {angle: 0.5}"
+    written(domain, "pendulum")
+    before = json.loads(echelon("check", "mine.yaml", "--json")[1])
+    assert echelon("design", "mine.yaml", "--method", "robust-lqr", "--out", "gain.json")[0] == 0
+    written("file: gain.json", "pendulum")
+    after = json.loads(echelon("check", "mine.yaml", "--json")[1])
+    assert after == before and "(T1)" in after["promise"]
 
 
 def test_a_missing_solver_names_its_pip_line(echelon, monkeypatch):

@@ -75,7 +75,7 @@ def test_a_double_integrator_has_no_metric_and_the_mode_is_named_at_once():
     assert time.perf_counter() - start < 1.0
     assert str(caught.value) == (
         "no P > 0 keeps this drift from expanding: matrix 0 has a Jordan block on the imaginary "
-        "axis, at 0+0j 1/s along `position`, `velocity`; damp it by an inner loop, shrink the "
+        "axis, at 0 1/s along `position`, `velocity`; damp it by an inner loop, shrink the "
         "domain, or take a method with feedback."
     )
 
@@ -94,9 +94,7 @@ def test_the_vertex_with_the_unstable_mode_is_named():
     found = obstacle(As)
     assert (found.vertex, found.defective, found.states) == (1, False, (1,))
     assert found.eigenvalue == pytest.approx(0.3)
-    with pytest.raises(
-        GainError, match=r"matrix 1 has an unstable mode, at 0\.3\+0j 1/s along `x2`"
-    ):
+    with pytest.raises(GainError, match=r"matrix 1 has an unstable mode, at 0\.3 1/s along `x2`"):
         monotone(As)
 
 

@@ -145,6 +145,39 @@ def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():
     assert "no constant metric" in told
 
 
+class Turned(ech.ControlAffine):
+    """A decaying drift and an input that pushes along a direction which the state turns."""
+
+    state_names = ("east", "north")
+    input_names = ("push",)
+
+    def drift(self, x):
+        return -x
+
+    def input_map(self, x):
+        return jnp.stack([jnp.cos(x[0]), jnp.sin(x[0])])[:, None]
+
+
+def test_where_g_varies_a_monotone_drift_is_certified_a_smaller_set(tmp_path):
+    gain = ech.synthesize(Turned(), LINE, ech.Monotone({"east": 1.0, "north": 2.0}))
+    region, ends = gain.certificate.region, LINE.grounded_spectrum()[[0, -1]]
+    assert region.theorem == "A5"
+    assert region.radius == pytest.approx(
+        radius(region.domain, gain.P) * np.sqrt(ends[0] / ends[1]), rel=1e-12
+    )
+    # V = delta'(L kron P) delta does not rise: on its set no agent leaves the domain.
+    L = LINE.grounded_laplacian().toarray()
+    reach = np.sqrt(ends[1]) * region.radius * np.sqrt(np.diag(np.linalg.inv(np.kron(L, gain.P))))
+    assert (reach.reshape(3, 2) <= np.array([1.0, 2.0]) * (1 + 1e-9)).all()
+    ech.save_gain(gain, Turned(), LINE, tmp_path / "gain.json")
+    assert ech.verify(tmp_path / "gain.json", Turned()).holds
+    told = json.loads((tmp_path / "gain.json").read_text())
+    told["certificate"]["region"]["radius"] *= float(np.sqrt(ends[1] / ends[0]))
+    (tmp_path / "gain.json").write_text(json.dumps(told))
+    found = ech.verify(tmp_path / "gain.json", Turned())
+    assert found.sentence == "Refused: g is constant (A5) does not hold as stored."
+
+
 @pytest.mark.parametrize("model", [ech.DoubleIntegrator(3), ech.PrintedQuadrotor()])
 def test_nilpotent_drifts_have_no_monotone_metric_and_the_block_is_named(model):
     told = sentence(
@@ -218,6 +251,62 @@ def test_a_gain_comes_back_to_the_bit(saved):
         assert getattr(again, name).tobytes() == getattr(gain, name).tobytes()
     assert again.coupling == gain.coupling and again.method == "inner-loop"
     assert again.certificate.abscissa == gain.certificate.abscissa
+
+
+def test_a_promise_on_a_domain_comes_back_whole(tmp_path):
+    # A domain with two sides, one unbounded state, and a hull of many corners.
+    model, bounds = ech.PlanarQuadrotor(), {"roll": (-0.1, 0.2), "thrust": 1.0}
+    gain = ech.synthesize(model, LINE, ech.RobustLQR(bounds))
+    ech.save_gain(gain, model, LINE, tmp_path / "gain.json")
+    saved, again = gain.certificate, ech.load_gain(tmp_path / "gain.json", model, LINE).certificate
+    for name in ("kind", "lambda_min", "lambda_max", "abscissa", "modes", "edge", "observable"):
+        assert getattr(again, name) == getattr(saved, name)
+    ours, theirs = again.region, saved.region
+    for name in ("kind", "rate", "theorem", "radius", "strength"):
+        assert getattr(ours, name) == getattr(theirs, name)
+    for name in ("hull", "error"):
+        assert getattr(ours, name).tobytes() == getattr(theirs, name).tobytes()
+    for name in ("lower", "upper", "input_lower", "input_upper"):
+        assert np.array_equal(getattr(ours.domain, name), getattr(theirs.domain, name))
+    text = (tmp_path / "gain.json").read_text()
+    assert "Infinity" not in text and ours.domain.in_words(model) == (
+        "roll in [-0.1, 0.2], thrust in [-1, 1]"
+    )
+
+
+def test_a_gain_file_of_an_older_echelon_is_refused(saved):
+    model, _, file = saved
+    file.write_text(file.read_text().replace("echelon gain 2", "echelon gain 1"))
+    assert sentence(lambda: ech.load_gain(file, model, LINE)) == (
+        f"`{file}` is no gain file that this echelon reads: its `format` must be "
+        "`echelon gain 2`, and is `echelon gain 1`; make it again with `echelon design`."
+    )
+
+
+class Yielding(ech.ControlAffine):
+    """A spring that gives way, by a function that has no enclosure."""
+
+    state_names = ("place", "speed")
+    input_names = ("force",)
+
+    def drift(self, x):
+        return jnp.stack([x[1], -jax.scipy.special.erf(x[0]) - 0.3 * x[1]])
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]], x.dtype)
+
+
+def test_samples_stand_at_all_corners_and_need_the_bounds_that_matter():
+    domain = ech.Domain.about(Yielding(), {"place": (-1.0, 0.5)})
+    with precision("float64"):
+        found = jacobians(Yielding(), domain)
+    assert found.kind == "samples" and not found.error.any()
+    slopes = 2.0 / np.sqrt(np.pi) * np.exp(-(np.array([-1.0, 0.5]) ** 2))
+    for slope in slopes:
+        assert np.abs(found.matrices[:, 1, 0] + slope).min() < 1e-14
+    assert found.matrices[:, 1, 0].max() <= -slopes.min() + 1e-14
+    told = sentence(lambda: ech.synthesize(Yielding(), LINE, ech.RobustLQR({"speed": 1.0})))
+    assert told.startswith("the domain leaves `place` unbounded")
 
 
 def test_a_gain_for_another_model_or_graph_is_refused_with_the_reason(saved, tmp_path):

@@ -29,12 +29,14 @@ if TYPE_CHECKING:
     from echelon._planar_baseline import PlanarBaseline
     from echelon._plots import figures, save_figures
     from echelon._posing import Planning
+    from echelon._recommend import Shorter, recommend_edges, recommend_leaders, shorter
     from echelon._report import report
     from echelon._result import Result
     from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
     from echelon._simulate import simulate
     from echelon._solver_figures import SolverFigures, solver_figures
     from echelon._synthesize import synthesize
+    from echelon._verify import Verified, verify
     from echelon.gains import (
         Certificate,
         Contraction,
@@ -105,12 +107,14 @@ _HOMES = {
     "_planar_baseline": ("PlanarBaseline",),
     "_plots": ("figures", "save_figures"),
     "_posing": ("Planning",),
+    "_recommend": ("Shorter", "recommend_edges", "recommend_leaders", "shorter"),
     "_report": ("report",),
     "_result": ("Result",),
     "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
     "_simulate": ("simulate",),
     "_solver_figures": ("SolverFigures", "solver_figures"),
     "_synthesize": ("synthesize",),
+    "_verify": ("Verified", "verify"),
     "gains": (
         "Certificate",
         "Contraction",
@@ -212,12 +216,14 @@ __all__ = [
     "Riccati",
     "RobustLQR",
     "Scenario",
+    "Shorter",
     "SingleIntegrator",
     "SolverFigures",
     "Tracking",
     "Unicycle",
     "UnicyclePoint",
     "VanDerPol",
+    "Verified",
     "Waypoints",
     "build",
     "bundled_scenarios",
@@ -231,18 +237,22 @@ __all__ = [
     "lyapunov",
     "metrics",
     "plan",
+    "recommend_edges",
+    "recommend_leaders",
     "report",
     "run",
     "save_dataset",
     "save_figures",
     "save_gain",
     "scenario_from_mapping",
+    "shorter",
     "simulate",
     "simulate_mpc",
     "simulate_plans",
     "solver_figures",
     "summary",
     "synthesize",
+    "verify",
 ]
 
 

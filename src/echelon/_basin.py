@@ -12,7 +12,7 @@ import numpy as np
 
 from echelon._graph import Graph
 from echelon._numerics import precision, rk4
-from echelon._types import Input, Matrix, State, States
+from echelon._types import Input, Matrix, State
 from echelon.gains.gain import Gain
 from echelon.laws.consensus import feedback
 from echelon.models.model import ControlAffine
@@ -153,13 +153,13 @@ def _ratio(
         u = model.physical(v)
         return model.limit(u) if limits else u
 
-    def step(_: int, x: States) -> States:
+    def step(_: jax.Array, x: jax.Array) -> jax.Array:
         z = jnp.einsum("fg,sgn->sfn", L, x - trim[None, None])
         u = jax.vmap(jax.vmap(control))(x, z)
         move = jax.vmap(jax.vmap(lambda x, u: rk4(model.velocity, x, u, dt)))
         return move(x, u)
 
-    def size(x: States) -> jax.Array:
+    def size(x: jax.Array) -> jax.Array:
         y = x - trim[None, None]
         return jnp.sqrt(jnp.einsum("sfi,ij,sfj->s", y, P, y))
 

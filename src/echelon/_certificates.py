@@ -26,7 +26,7 @@ class Region(eqx.Module):
             path; `A5`, the paper's Assumption 5 for the drift alone.
         domain: what the states and inputs must respect.
         radius: r of the set {sum_i delta_i'P delta_i <= r^2} that cannot leave the domain while the
-            leader stays at the trim; None where the domain bounds nothing.
+            leader stays at the trim; None where the domain bounds nothing, and for `T2`.
         strength: 2 c lambda_min, the weight of the feedback in the inequality; 0 for `A5`.
         hull: (K, n, n), matrices that the rate was looked at on: by kind, the corners of a hull of
             all Jacobians A, or samples of them. For `T2`, whose g varies, it is (K, n, 2n): each A

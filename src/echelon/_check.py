@@ -27,7 +27,9 @@ def check(parts: Parts) -> Checked:
         reasons = list(_reasons(loop))
     if reasons:
         return Checked(lines, False, f"Nothing is promised: {'; '.join(reasons)}.")
-    return Checked(lines, True, _promise(loop, found))
+    without = f" This is said without what the scenario adds: {loop.disturbed}."
+    promise = _promise(loop, found) + (without if loop.disturbed else "")
+    return Checked(lines, True, promise)
 
 
 def _reasons(loop: CheckedLoop) -> Iterator[str]:

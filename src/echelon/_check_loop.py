@@ -85,6 +85,16 @@ class CheckedLoop(NamedTuple):
         return getattr(self.parts.follower, "trim", True) or not trim.any()
 
     @property
+    def disturbed(self) -> str:
+        """What the scenario adds that no promise covers, in words; empty without any."""
+        told = []
+        if self.parts.settings.get("disturbance") is not None:
+            told.append("wind or noise acts on the agents")
+        if self.parts.settings.get("plant") is not None:
+            told.append("the agents differ from the model")
+        return " and ".join(told)
+
+    @property
     def moving(self) -> bool:
         """Whether the leader has a reference to follow."""
         leader, model = self.parts.leader, self.parts.model

@@ -23,7 +23,7 @@ def graph_lines(loop: CheckedLoop) -> Iterator[Line]:
     yield Line("Assumption 1, autonomous", "holds", "proof", "", "f and g depend on x alone")
     text = "connected and static" + ("" if unit else "; weights need not be 1")
     yield Line("Assumption 2, graph", "holds", "proof", edges, text)
-    yield Line("Assumption 3, exact states", "holds", "proof", "", "no noise is simulated")
+    yield _exact_line(loop)
     yield _leader_line(loop)
     number = f"lambda_min {low:.6g}, lambda_max {loop.certificate.lambda_max:.6g}"
     yield Line("Assumption 6, M L = I", "holds", "proof", number, "for the grounded Laplacian")
@@ -43,6 +43,15 @@ def _trim_line(loop: CheckedLoop) -> Line:
         text = "the law leaves out the trim input; set `follower.trim: true`"
     verdict = "holds" if loop.trimmed else "fails"
     return Line("Definition 1, f(0) = 0", verdict, "proof", number, text)
+
+
+def _exact_line(loop: CheckedLoop) -> Line:
+    """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
+    text = "states are known exactly, and nothing disturbs the agents"
+    if loop.disturbed:
+        text = f"{loop.disturbed}; what holds without is said, and how far it may push is below"
+    verdict = "fails" if loop.disturbed else "holds"
+    return Line("Assumption 3, exact states", verdict, "proof", "", text)
 
 
 def _leader_line(loop: CheckedLoop) -> Line:

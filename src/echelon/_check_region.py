@@ -78,8 +78,9 @@ def _set_line(loop: CheckedLoop, found: CertifiedSet | None) -> Line:
 def certified_set(loop: CheckedLoop) -> CertifiedSet | None:
     """Return the set that a region of theorem T1 or A5 certifies, less the leader's excursion.
 
-    r^2 = min_j (margin_j - excursion_j)^2 / W_jj, W = P^-1. Where only the drift is known (A5),
-    what cannot rise is V = delta'(L kron P) delta, which costs the factor lambda_min / lambda_max.
+    r^2 = min_j (margin_j - excursion_j)^2 / W_jj, W = P^-1. Where only the drift is known (A5) and
+    g varies, what cannot rise is V = delta'(L kron P) delta, which costs the factor
+    lambda_min / lambda_max.
     """
     region = loop.region
     if region is None or not _certifies(region):
@@ -118,7 +119,7 @@ def _less(loop: CheckedLoop, region: Region, kind: Kind, excursion: Matrix) -> C
         text = f"the leader alone reaches {excursion[j]:.3g} in `{name}`, and the domain {wide:.3g}"
         return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
     shrink = 1.0
-    if region.theorem == "A5":
+    if region.theorem == "A5" and not _constant(loop, region.domain):
         shrink = np.sqrt(loop.certificate.lambda_min / loop.certificate.lambda_max)
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
     text += f" less {excursion[j]:.3g} of the leader" if excursion.any() else ", leader at the trim"

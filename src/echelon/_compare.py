@@ -12,9 +12,11 @@ from echelon._errors import EchelonError, LawError, did_you_mean, listing
 from echelon._initial import initial_states
 from echelon._metrics import Metrics, metrics
 from echelon._numerics import precision
+from echelon._optimization import simulate_mpc, simulate_plans
 from echelon._result import Result
 from echelon._scenario import Scenario
 from echelon._simulate import simulate
+from echelon._solver_figures import SolverFigures, solver_figures
 from echelon._synthesize import synthesize
 from echelon.gains.gain import Gain, Method
 from echelon.gains.given import Given
@@ -23,7 +25,7 @@ from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import Consensus
 from echelon.laws.law import Feedforward
 
-LABELS = ("literal", "riccati-relay", "riccati", "inner-loop")
+LABELS = ("literal", "riccati-relay", "riccati", "inner-loop", "optimization", "mpc")
 
 
 class Flight(NamedTuple):
@@ -33,13 +35,13 @@ class Flight(NamedTuple):
         result: the run.
         told: what each agent must be told by others, in words.
         computing: seconds of computing for one agent and one second of flight, compilation apart.
-        solver: figures of the solver by name, where there is one.
+        solver: what solving took; None for a law.
     """
 
     result: Result
     told: tuple[str, ...]
     computing: float
-    solver: Mapping[str, float]
+    solver: SolverFigures | None
 
 
 class Row(NamedTuple):
@@ -190,7 +192,9 @@ def _consensus(gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bo
         result = simulate(
             *parts[:3], leader=parts.leader, follower=law, progress=watch, **parts.settings
         )
-        return Flight(result, law.needs, watch.seconds / (parts.graph.agents * _flown(result)), {})
+        return Flight(
+            result, law.needs, watch.seconds / (parts.graph.agents * result.settings.horizon), None
+        )
 
     return fly
 
@@ -209,10 +213,6 @@ class _Watch:
         """Seconds that the whole run takes at the pace of its compiled steps."""
         (first, begun, total), (last, done, _) = self.ticks[0], self.ticks[-1]
         return (last - first) * total / max(1, done - begun)
-
-
-def _flown(result: Result) -> float:
-    return result.settings.horizon
 
 
 def _synthesized(method: Method) -> Callable[[Parts], Gain]:
@@ -239,9 +239,25 @@ def _riccati(parts: Parts) -> Gain:
     return synthesize(parts.model, parts.graph, Riccati())
 
 
+def _optimized(fly: Callable[..., Result]) -> Fly:
+    """Return the flight in which every agent, the leader too, minimizes a cost of its own."""
+
+    def flight(parts: Parts) -> Flight:
+        reference = getattr(parts.leader, "reference", None)
+        result = fly(*parts[:3], reference=reference, **parts.settings)
+        figures = solver_figures(result)
+        assert figures is not None
+        seconds = figures.seconds / (parts.graph.agents * result.settings.horizon)
+        return Flight(result, result.follower.needs, seconds, figures)
+
+    return flight
+
+
 _FLY: Mapping[str, Fly] = {
     "literal": _consensus(_synthesized(Given()), "none", trim=False),
     "riccati-relay": _consensus(_riccati, "relay"),
     "riccati": _consensus(_riccati, "none"),
     "inner-loop": _consensus(_synthesized(InnerLoop()), "relay"),
+    "optimization": _optimized(simulate_plans),
+    "mpc": _optimized(simulate_mpc),
 }

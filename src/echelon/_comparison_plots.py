@@ -75,15 +75,28 @@ def _tracking_error(flown: _Flown) -> "Figure | None":
     return _over_time([(k, row) for k, row in flown if k in lines], lines, text)
 
 
+def _alike(flown: _Flown, lines: dict[int, Matrix]) -> dict[int, int]:
+    """Return how many lines each stands for: laws that share a leader draw one over the other."""
+    stands: dict[int, int] = {}
+    for k, _ in flown:
+        same = [j for j in stands if np.array_equal(lines[j], lines[k])]
+        stands[same[0] if same else k] = stands.get(same[0], 0) + 1 if same else 1
+    return stands
+
+
 def _over_time(flown: _Flown, lines: dict[int, Matrix], text: str) -> "Figure":
     """Return errors on a logarithmic axis, no lower than the rounding of a metre."""
+    stands = _alike(flown, lines)
     longest = max((_result(row) for _, row in flown), key=lambda result: result.times[-1])
     figure, (ax,) = draw.panels(longest.times, longest.settings.horizon, 1, 3.4)
     shown = []
     for k, row in flown:
+        if k not in stands:
+            continue
         values = np.maximum(lines[k], draw.FLOOR)
         keep = draw.thin(len(values))
-        draw.plot(ax, _result(row).times[keep], values[keep], label=row.label, **_pen(k))
+        name = row.label if stands[k] == 1 else f"{row.label}, and {stands[k] - 1} alike"
+        draw.plot(ax, _result(row).times[keep], values[keep], label=name, **_pen(k))
         shown.append(values)
     ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(text)
@@ -105,7 +118,7 @@ def _approach(flown: _Flown) -> "Figure | None":
     for k, row in flown:
         path, over = draw.bounded(_result(row).errors[:, follower][:, axes], start, goal)
         # One that leaves would shrink the others' ways to a dot.
-        inside = np.abs(path).max(axis=1) <= 4.0 * np.abs(start).max()
+        inside = np.abs(path).max(axis=1) <= 1.3 * np.abs(start).max()
         path, over = np.where(inside[:, None], path, np.nan), over or not inside.all()
         draw.plot(ax, path[draw.thin(len(path))], label=row.label, **_pen(k))
         drawn.append(path)

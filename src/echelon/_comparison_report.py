@@ -8,6 +8,7 @@ from echelon._compare import Comparison, Row
 from echelon._errors import Outcome
 from echelon._paper import PRINTED, ROUNDING, is_papers_experiment
 from echelon._report import say
+from echelon._solver_figures import SolverFigures
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -140,9 +141,19 @@ def _remarks(row: Row) -> Iterator[str]:
     result = row.flight.result
     if result.outcome is not Outcome.COMPLETED:
         yield result.message
-    if row.flight.solver:
-        figures = ", ".join(f"{name} {value:.4g}" for name, value in row.flight.solver.items())
-        yield f"solver: {figures}."
+    if row.flight.solver is not None:
+        yield _solving(row.flight.solver)
+    yield from row.flight.result.warnings
+
+
+def _solving(figures: SolverFigures) -> str:
+    """Return what solving took, in a sentence."""
+    return (
+        f"{figures.solver} made {figures.solves} plans with {figures.failures} failures, in "
+        f"{figures.median_ms:.3g} ms (median; 99th percentile {figures.p99_ms:.3g}, worst "
+        f"{figures.worst_ms:.3g}) each; iterations: median {figures.iterations_median:.3g}, worst "
+        f"{figures.iterations_worst}."
+    )
 
 
 # ---- the paragraph ------------------------------------------------------------------------------
@@ -222,7 +233,7 @@ def _cheapest(rows: Sequence[Row]) -> str:
     ratio = known[most] / max(known[least], 1e-12)
     if ratio < _ALIKE:
         return "All take about as long to compute."
-    return f"{least} takes the least computing, {most} {ratio:.2g} times as much."
+    return f"{least} takes the least computing, {most} {ratio:.0f} times as much."
 
 
 def _listed(labels: Sequence[str]) -> str:
@@ -263,5 +274,5 @@ def _row_mapping(row: Row) -> dict[str, Any]:
         "minimum_distance": numbers.minimum_distance,
         "computing_s_per_agent_s": row.flight.computing,
         "told": list(row.flight.told),
-        "solver": dict(row.flight.solver),
+        "solver": None if row.flight.solver is None else row.flight.solver._asdict(),
     }

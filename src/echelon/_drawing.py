@@ -242,7 +242,7 @@ def logarithmic(ax: Any, *values: Matrix) -> None:
     ax.yaxis.set_minor_locator(NullLocator())
 
 
-def save(figures: "dict[str, Figure]", folder: Path) -> list[Path]:
+def save(figures: "Mapping[str, Figure]", folder: Path) -> list[Path]:
     """Write each figure as PNG (150 dpi) and PDF into a folder, made if need be; return the paths.
 
     Raises:
@@ -283,21 +283,3 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False) -> "Figure":
             engine.execute(figure)
         figure.set_layout_engine("none")
     return figure
-
-
-def save(figures: "Mapping[str, Figure]", folder: Path) -> list[Path]:
-    """Write each figure as PNG (150 dpi) and PDF into a folder, made if need be; return the paths.
-
-    Raises:
-        OSError: the folder or a file cannot be written.
-    """
-    paths = []
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in figures.items():
-        png, pdf = (folder / f"{name}.{kind}" for kind in ("png", "pdf"))
-        with style():
-            figure.savefig(png)
-            # Without its date, the same run writes the same file.
-            figure.savefig(pdf, metadata={"CreationDate": None})
-        paths += [png, pdf]
-    return paths

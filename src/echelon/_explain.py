@@ -136,19 +136,34 @@ def _promises(result: Result) -> Iterator[str]:
     gain = gain_of(result)
     if gain is not None:
         certificate = gain.certificate
-        verdict = _verdict(certificate.abscissa)
-        edge = (
-            ""
-            if certificate.edge is None
-            else f" (guaranteed for linear agents from {certificate.edge:.4g} on)"
-        )
+        abscissa, from_on = certificate.abscissa, certificate.edge
+        if result.follower.asks() == "parent":
+            abscissa, from_on = _with_parents(result, gain)
+        verdict = _verdict(abscissa)
+        edge = "" if from_on is None else f" (guaranteed for linear agents from {from_on:.4g} on)"
         yield (
             f"Promise of the gain, by linearization at the trim: the disagreement is {verdict}, "
-            f"slowest mode {certificate.abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
+            f"slowest mode {abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
             f"{_region(certificate, result.model)}."
         )
     needs = ", ".join(result.follower.needs) or "nothing from others"
     yield f"Each follower is told: {needs}."
+
+
+def _with_parents(result: Result, gain: Gain) -> tuple[float, float | None]:
+    """Return the slowest mode and the edge where parents' inputs are fed forward.
+
+    The modes are then those of the edges' weights (theory page, T4).
+    """
+    with precision("float64"):
+        A, B = linearize(result.model)
+    A = A if gain.inner is None else A - B @ gain.inner
+    led = np.isin(result.graph.edges, result.graph.leaders).all(axis=1)
+    weights = np.unique(result.graph.weights[~led])
+    pull = gain.coupling * B @ np.linalg.solve(gain.R, B.T @ gain.P)
+    abscissa = float(np.linalg.eigvals(A - weights[:, None, None] * pull).real.max())
+    edge = gain.certificate.edge
+    return abscissa, None if edge is None else edge * gain.certificate.lambda_min / weights[0]
 
 
 def _region(certificate: Certificate, model: ControlAffine) -> str:

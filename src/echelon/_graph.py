@@ -195,13 +195,37 @@ class Graph:
         It is the order in which agents can plan when each needs the plans of those before it. Among
         the equally far the lower number comes first; a leader has no earlier neighbours.
         """
-        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
-        order = np.argsort(np.atleast_2d(hops).min(axis=0), kind="stable").tolist()
+        order = np.argsort(self.depths(), kind="stable").tolist()
         known = {agent: order[:place] for place, agent in enumerate(order)}
         return tuple(
             (i, () if i in self.leaders else tuple(j for j in self.neighbours(i) if j in known[i]))
             for i in order
         )
+
+    def depths(self) -> Matrix:
+        """Return (N,) how many edges away each agent's nearest leader is."""
+        among = {"indices": self.leaders, "unweighted": True, "min_only": True}
+        return csgraph.dijkstra(self.adjacency(), **among).astype(int)
+
+    def parents(self) -> tuple[int, ...]:
+        """Return each agent's only neighbour that is nearer to a leader; leaders are their own.
+
+        Raises:
+            GraphError: the graph is no tree (edges between leaders aside).
+        """
+        depth, parents = self.depths(), np.arange(self.agents)
+        i, j = self.edges[depth[self.edges].max(axis=1) > 0].T
+        child, parent = np.where(depth[i] > depth[j], (i, j), (j, i))
+        # An edge between two that are equally far gives both of them one more way.
+        counted = np.concatenate([child, parent[depth[i] == depth[j]]])
+        several = np.flatnonzero(np.bincount(counted, minlength=self.agents) > 1)
+        if len(several):
+            raise GraphError(
+                f"the graph is no tree: {_some(several)} more than one way to a leader, and so no "
+                "one parent; the feed-forward `relay` needs none."
+            )
+        parents[child] = parent
+        return tuple(parents.tolist())
 
     def exchange(self) -> "Exchange":
         """Return the computation of the disagreement on this graph, ready for JAX."""

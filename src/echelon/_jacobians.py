@@ -15,6 +15,8 @@ from echelon._types import Matrix
 from echelon.models.model import ControlAffine
 
 _SAMPLES = 400
+_FEW = 7
+"""Up to so many bounded states and inputs, every corner of a domain is among the samples."""
 _OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
@@ -98,25 +100,40 @@ def _check_bounded(model: ControlAffine, domain: Domain, hull: Hull) -> None:
     used = {atom.name for atom in hull.atoms}
     for k, name in enumerate(model.state_names):
         if name in used and not np.isfinite([domain.lower[k], domain.upper[k]]).all():
-            raise GainError(
-                f"the domain leaves `{name}` unbounded, and the Jacobian of "
-                f"`{type(model).__name__}` depends on it; give it a bound."
-            )
+            raise _unbounded(model, name)
+
+
+def _unbounded(model: ControlAffine, name: str) -> GainError:
+    return GainError(
+        f"the domain leaves `{name}` unbounded, and the Jacobian of "
+        f"`{type(model).__name__}` depends on it; give it a bound."
+    )
 
 
 def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Matrix:
-    """Return the matrices at random corners of the domain and inside it."""
-    states, inputs = domain.sample(_SAMPLES)
-    random = np.random.default_rng(1)
-    corners = [
-        np.where(random.integers(0, 2, some.shape), low, high)
-        for some, low, high in (
-            (states, domain.lower, domain.upper),
-            (inputs, domain.input_lower, domain.input_upper),
-        )
-    ]
-    states = np.concatenate([states, np.where(np.isfinite(corners[0]), corners[0], states)])
-    inputs = np.concatenate([inputs, corners[1]])
-    base = np.asarray(model.trim[0], float)
-    at = jax.jit(jax.vmap(function))
-    return np.asarray(at(jnp.asarray(base + states), jnp.asarray(inputs)))
+    """Return the matrices inside the domain and at its corners, all of them where they are few.
+
+    Raises:
+        GainError: they depend on a state that the domain leaves unbounded.
+    """
+    states, inputs = domain.sample(2 * _SAMPLES)
+    box = np.array([[*domain.lower, *domain.input_lower], [*domain.upper, *domain.input_upper]])
+    used = np.flatnonzero(np.isfinite(box).all(axis=0) & (box[0] < box[1]))
+    both = np.concatenate([states, inputs], axis=1)
+    sides = np.random.default_rng(1).integers(0, 2, (_SAMPLES, len(used)))
+    if len(used) <= _FEW:
+        few = np.arange(2 ** len(used))[:, None] >> np.arange(len(used)) & 1
+        sides[: len(few)] = few
+    both[_SAMPLES:, used] = np.take_along_axis(box[:, used], sides, axis=0)
+    base = np.append(np.asarray(model.trim[0], float), np.zeros(len(model.input_names)))
+    n, at = len(model.state_names), jax.jit(jax.vmap(function))
+
+    def matrices(points: Matrix) -> Matrix:
+        return np.asarray(at(jnp.asarray((base + points)[:, :n]), jnp.asarray(points[:, n:])))
+
+    found = matrices(both)
+    for k in np.flatnonzero(~np.isfinite(box).all(axis=0)):
+        far = both + np.where(np.arange(len(base)) == k, 3.0, 0.0)
+        if np.abs(matrices(far) - found).max() > 1e-12 * np.abs(found).max():
+            raise _unbounded(model, model.state_names[k])
+    return found

@@ -3,6 +3,7 @@
 This file sees only the interfaces of models and laws.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,11 +40,21 @@ class Loop(eqx.Module):
     leaders: Matrix
     followers: Matrix
     sender: Matrix
+    parents: Matrix | None
+    levels: Matrix | None
     order: Matrix
     normalizer: Matrix
     dt: float = eqx.field(static=True)
     integrator: str = eqx.field(static=True)
     limits: bool = eqx.field(static=True)
+
+
+class _Acted(NamedTuple):
+    """What some agents wanted and got, inputs (K, m), and their next memories."""
+
+    wanted: Inputs
+    inputs: Inputs
+    memory: Memory
 
 
 class Moment(NamedTuple):
@@ -79,6 +90,7 @@ def assemble(
             f"with {shape[1]} states need {shape}."
         )
     leaders, followers = np.array(graph.leaders), np.array(graph.followers)
+    by_depth = follower.asks() == "parent"
     nearest = np.array(graph.nearest_leader())
     return Loop(
         model=model,
@@ -91,12 +103,25 @@ def assemble(
         leaders=leaders,
         followers=followers,
         sender=np.searchsorted(leaders, nearest[followers]),
+        parents=np.array(graph.parents()) if by_depth else None,
+        levels=_levels(graph) if by_depth else None,
         order=np.argsort(np.concatenate([leaders, followers])),
         normalizer=np.linalg.inv(np.asarray(model.input_scale, float)),
         dt=settings.dt,
         integrator=settings.integrator,
         limits=settings.limits,
     )
+
+
+def _levels(graph: Graph) -> Matrix:
+    """Return the places of followers among the followers, (D, W), a row for each depth.
+
+    A row that is too short repeats its first.
+    """
+    depth = graph.depths()[list(graph.followers)]
+    rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
+    width = max(map(len, rows))
+    return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
 
 
 def _lean(law: Law) -> Law:
@@ -127,30 +152,53 @@ def control(loop: Loop, now: Moment) -> tuple[Inputs, jax.Array, Memory, Memory]
     z = loop.exchange(y, y)
     t = now.step.astype(x.dtype) * loop.dt
 
-    def act(law: Law, who: Matrix, said: Inputs, memory: Memory) -> tuple[Inputs, Inputs, Memory]:
+    def act(law: Law, who: Any, said: jax.Array, memory: Memory) -> _Acted:
         view = LocalView(t, x[who], offsets[who], z[who], said)
         axes = LocalView(None, 0, 0, 0, 0)  # type: ignore[arg-type]
         wanted, memory = jax.vmap(law.update, in_axes=(None, axes, 0))(loop.model, view, memory)
-        return wanted, delivered(loop, wanted), memory
+        return _Acted(wanted, delivered(loop, wanted), memory)
 
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
-    wanted_l, u_l, memory_l = act(loop.leader, loop.leaders, silence, now.leader_memory)
-    said = _relayed(loop, x[loop.leaders], u_l)
-    wanted_f, u_f, memory_f = act(loop.follower, loop.followers, said, now.follower_memory)
-    u = jnp.concatenate([u_l, u_f])[loop.order]
-    wanted = jnp.concatenate([wanted_l, wanted_f])[loop.order]
+    led = act(loop.leader, loop.leaders, silence, now.leader_memory)
+    if loop.levels is None:
+        said = _told(loop, x[loop.leaders], led.inputs)[loop.sender]
+        followed = act(loop.follower, loop.followers, said, now.follower_memory)
+    else:
+        followed = _by_depth(loop, now, led, act)
+    u = jnp.concatenate([led.inputs, followed.inputs])[loop.order]
+    wanted = jnp.concatenate([led.wanted, followed.wanted])[loop.order]
     limited = jnp.any((u != wanted) & ~jnp.isnan(wanted), axis=1)
-    return u, limited, memory_l, memory_f
+    return u, limited, led.memory, followed.memory
 
 
-def _relayed(loop: Loop, x: States, u: Inputs) -> jax.Array:
-    """Return what each follower is told of its leader, (followers, m), from its x and u."""
+def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) -> _Acted:
+    """Let the followers act level by level, each told what its parent has just done."""
+    followers, parents = jnp.asarray(loop.followers), jnp.asarray(loop.parents)
+    u = jnp.zeros((len(now.states), led.inputs.shape[1]), led.inputs.dtype)
+    u = u.at[loop.leaders].set(led.inputs)
+    nothing = jnp.zeros((len(followers), u.shape[1]), u.dtype)
+
+    def level(done: tuple[Inputs, _Acted], places: jax.Array) -> tuple[Any, None]:
+        u, all_ = done
+        who = followers[places]
+        said = _told(loop, now.states[parents[who]], u[parents[who]])
+        memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
+        acted = act(loop.follower, who, said, memory)
+        # Where a level repeats an agent, the same is written twice.
+        all_ = jax.tree.map(lambda a, b: a.at[places].set(b), all_, acted)
+        return (u.at[who].set(acted.inputs), all_), None
+
+    start = _Acted(nothing, nothing, now.follower_memory)
+    return jax.lax.scan(level, (u, start), jnp.asarray(loop.levels))[0][1]
+
+
+def _told(loop: Loop, x: States, u: Inputs) -> jax.Array:
+    """Return what is told of agents at x (K, n) with delivered inputs u (K, m)."""
     if loop.follower.asks() == "none":
-        return jnp.zeros((len(loop.followers), u.shape[1]), u.dtype)
+        return jnp.zeros_like(u)
     trim = jnp.asarray(loop.model.trim[1], u.dtype)
     v = (u - trim[None]) @ jnp.asarray(loop.normalizer, u.dtype).T
-    told = jax.vmap(loop.follower.message, in_axes=(None, 0, 0))(loop.model, x, v)
-    return told[loop.sender]
+    return jax.vmap(loop.follower.message, in_axes=(None, 0, 0))(loop.model, x, v)
 
 
 def delivered(loop: Loop, inputs: Inputs) -> Inputs:

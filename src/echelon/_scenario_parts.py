@@ -206,9 +206,11 @@ class FollowerSpec(BaseModel):
         default="consensus", description="Name of a law."
     )
     gain: GainSpec = Field(default_factory=GainSpec, description="Gain of the law `consensus`.")
-    feedforward: Literal["none", "relay"] = Field(
+    feedforward: Literal["none", "relay", "relay-velocity", "parent"] = Field(
         default="relay",
-        description="`relay` gives every follower the leader's input of the same step.",
+        description="What every follower is told of the same step: `relay`, the leader's input; "
+        "`relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer "
+        "to the leader, on a tree.",
     )
     trim: bool = Field(
         default=True, description="Whether the law starts from the trim input, or from zero."

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
     from echelon._check import Line
     from echelon._design import Design
+    from echelon._verify import Finding
 
 
 def console() -> "Console":
@@ -114,13 +115,16 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-def lines_table(lines: "Iterable[Line]") -> "Table":
-    """Return the lines of a check as a table."""
+_CHECKED = ("statement", "verdict", "kind", "number", "why, or what to change")
+
+
+def lines_table(lines: "Iterable[Line | Finding]", columns: tuple[str, ...] = _CHECKED) -> "Table":
+    """Return the lines of a check as a table, with the titles of its columns."""
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in ("statement", "verdict", "kind", "number", "why, or what to change"):
+    for column in columns:
         table.add_column(column)
     for line in lines:
         table.add_row(*(text.replace("[", "\\[") for text in line))

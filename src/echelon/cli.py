@@ -225,6 +225,28 @@ def compare(
         print(json.dumps(told[0] if len(told) == 1 else told, indent=2))
 
 
+@app.command()
+def verify(
+    gain: Annotated[Path, typer.Argument(help="A gain file, as `design --out` writes it.")],
+    as_json: _Json = False,
+) -> None:
+    """Recompute what a saved gain promises, from its file alone; exit code 0 if all of it holds."""
+    from echelon import _verify
+
+    found = _verify.verify(gain)
+    if as_json:
+        lines = [each._asdict() for each in found.findings]
+        told = {"holds": found.holds, "sentence": found.sentence, "findings": lines}
+        print(json.dumps(told, indent=2))
+    else:
+        console = _tables.console()
+        titles = ("claim", "stored", "recomputed", "verdict", "how, or why not")
+        whole = not console.is_terminal
+        console.print(_tables.lines_table(found.findings, titles), soft_wrap=whole)
+        console.print(found.sentence, highlight=False, markup=False, soft_wrap=whole)
+    raise typer.Exit(0 if found.holds else 1)
+
+
 @app.command("list")
 def list_(as_json: _Json = False) -> None:
     """List scenarios, models, references, laws, gain methods, graphs, formations, integrators."""

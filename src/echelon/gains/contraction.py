@@ -23,7 +23,7 @@ class Contraction(Method):
     Args:
         domain: half-widths, or (lower, upper), by state, group or normalized input.
         rate: alpha, 1/s.
-        coupling: c; what the inequality needs when left out.
+        coupling: c; what the inequality needs when left out, 1 where it needs none.
         exact: whether to prove the rate in exact arithmetic where g is constant (seconds).
     """
 
@@ -44,7 +44,8 @@ class Contraction(Method):
         metric = contraction(found.matrices, linear.B, self.rate)
         low = float(graph.grounded_spectrum()[0])
         edge = metric.rho / (2.0 * low)
-        coupling = edge if self.coupling is None else float(self.coupling)
+        # A drift that contracts by itself needs no feedback, and takes any.
+        coupling = (edge or 1.0) if self.coupling is None else float(self.coupling)
         check_coupling(coupling)
         R, strength = np.eye(len(model.input_names)), 2.0 * coupling * low
         region = contracting_region(

@@ -7,7 +7,7 @@ import numpy as np
 from echelon._certificates import Region, certify
 from echelon._domain import Bound, Domain
 from echelon._graph import Graph
-from echelon._jacobians import jacobians
+from echelon._jacobians import has_constant_input_map, jacobians
 from echelon._linearization import linearize
 from echelon._lmi import monotone
 from echelon.gains.gain import Gain, Method, check_coupling
@@ -41,13 +41,16 @@ class Monotone(Method):
         domain, linear = the_domain(model, self.domain), linearize(model)
         found = jacobians(model, domain)
         P = monotone(found.matrices, names=model.state_names).P
-        R = np.eye(len(model.input_names))
+        R, reach = np.eye(len(model.input_names)), radius(domain, P)
+        if reach is not None and not has_constant_input_map(model, domain):
+            # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
+            reach *= float(np.sqrt(np.divide(*graph.grounded_spectrum()[[0, -1]])))
         region = Region(
             kind=found.kind,
             rate=0.0,
             theorem="A5",
             domain=domain,
-            radius=radius(domain, P),
+            radius=reach,
             strength=0.0,
             hull=found.matrices,
             error=found.error,

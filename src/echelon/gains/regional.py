@@ -75,7 +75,8 @@ def contracting_region(
         rate=rate,
         theorem="T1" if constant else "T2",
         domain=domain,
-        radius=radius(domain, P),
+        # Where g varies the promise is of small errors, and none of a set.
+        radius=radius(domain, P) if constant else None,
         strength=strength,
         hull=found.matrices,
         error=found.error,

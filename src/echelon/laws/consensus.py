@@ -2,13 +2,24 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from echelon._errors import LawError
+from echelon._errors import GainError, LawError, did_you_mean, listing
 from echelon._graph import Graph
+from echelon._linearization import linearize
+from echelon._margins import ClosedLoop, string_gain
 from echelon._types import Input, Matrix, State
 from echelon.gains.gain import Gain
 from echelon.laws.law import Feedforward, Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
+
+_TOLD = {
+    "none": (),
+    "relay": ("the leader's input of the same step",),
+    "relay-velocity": ("the velocity that the leader's input of the same step makes",),
+    "parent": ("its parent's input of the same step",),
+}
 
 
 class Consensus(Law):
@@ -18,9 +29,11 @@ class Consensus(Law):
 
     Args:
         gain: P, R and c.
-        feedforward: `none`, or `relay`: the leader's normalized input of the same step, after its
-            limits. The paper's network does not give this to followers that are not the leader's
-            neighbours.
+        feedforward: `none`, or what is told of others' inputs of the same step, after their limits:
+            `relay`, the leader's normalized input; `relay-velocity`, the velocity g S v that it
+            makes, of which each follower takes the input nearest in P; `parent`, on a tree, the
+            normalized input of the neighbour nearer to the leader. The paper's network gives none
+            of this.
         trim: whether the trim input u* is applied; the paper's printed law has none (literal:
             False).
     """
@@ -36,16 +49,16 @@ class Consensus(Law):
                 f"`gain` of `Consensus` is {self.gain!r}, and must be a `Gain`, as `synthesize` "
                 "returns it."
             )
-        if self.feedforward not in ("none", "relay"):
+        if self.feedforward not in _TOLD:
             raise LawError(
-                f"`feedforward` is `{self.feedforward}`, allowed are `none` and `relay`."
+                f"`feedforward` is `{self.feedforward}`, allowed are {listing(_TOLD)}"
+                f"{did_you_mean(self.feedforward, _TOLD)}."
             )
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Neighbours' states; the leader's input when relayed."""
-        relayed = ("the leader's input of the same step",) if self.feedforward == "relay" else ()
-        return ("neighbours' states", *relayed)
+        """Neighbours' states, and what is fed forward."""
+        return ("neighbours' states", *_TOLD[self.feedforward])
 
     def asks(self) -> Feedforward:
         """Return the chosen feed-forward."""
@@ -56,22 +69,72 @@ class Consensus(Law):
         return self.gain.P
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Consensus":
-        """Check that the gain fits the model."""
+        """Check that the gain fits the model, and the feed-forward the graph."""
         check_gain_fits(self, model, self.gain.P.shape, self.gain.R.shape)
+        if self.feedforward == "parent":
+            graph.parents()
         return self
+
+    def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+        """Tell by how much a branch amplifies, where the parent's input is fed forward."""
+        return _string_growth(self.gain, model, graph) if self.feedforward == "parent" else ()
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
-        v = view.feedforward - feedback(self.gain, model, view.x, view.disagreement)
+        told = view.feedforward
+        if self.feedforward == "relay-velocity":
+            told = _matching(self.gain, model, view.x, told)
+        v = told - feedback(self.gain, model, view.x, view.disagreement)
         return model.physical(v + self.gain.inner_loop(model, view.x), trim=self.trim), memory
 
-    def message(self, model: ControlAffine, x: State, v: Input) -> Input:
-        """Return the leader's input beyond the inner loop, v - kappa(x)."""
-        return v - self.gain.inner_loop(model, x)
+    def message(self, model: ControlAffine, x: State, v: Input) -> Float[Array, " k"]:
+        """Return the input beyond the inner loop, v - kappa(x), or the velocity that it makes."""
+        beyond = v - self.gain.inner_loop(model, x)
+        if self.feedforward == "relay-velocity":
+            return model.normalized_input_map(x) @ beyond
+        return beyond
 
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return the drift with the inner loop closed."""
         return model.velocity(x, model.physical(self.gain.inner_loop(model, x)))
+
+
+def _matching(gain: Gain, model: ControlAffine, x: State, velocity: State) -> Input:
+    """Return the normalized input (m,) whose g(x) S v is nearest to a velocity in the metric P."""
+    G = model.normalized_input_map(x)
+    weighted = G.T @ jnp.asarray(gain.P, x.dtype)
+    return jnp.linalg.solve(weighted @ G, weighted @ velocity)
+
+
+def _string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+    """Return a sentence on ||T||_inf along the branch that amplifies most (theory page, T4)."""
+    linear = linearize(model)
+    A = linear.A if gain.inner is None else linear.A - linear.B @ gain.inner
+    depth, parents = graph.depths(), graph.parents()
+    i, j = graph.edges.T
+    weight = np.ones(graph.agents)
+    weight[np.where(depth[i] > depth[j], i, j)] = graph.weights
+    used = np.unique(weight[list(graph.followers)])
+    try:
+        gains = [
+            string_gain(ClosedLoop(A, linear.B, gain.P, gain.R, gain.coupling * w, used)).gain
+            for w in used
+        ]
+    except GainError:
+        return (
+            f"with the parent's input fed forward, coupling {gain.coupling:.4g} times an edge's "
+            f"weight, {used[0]:.4g}, is too weak: a mode of the formation does not decay.",
+        )
+    growth = np.ones(graph.agents)
+    for agent in np.argsort(depth, kind="stable"):
+        if depth[agent]:
+            growth[agent] = growth[parents[agent]] * gains[np.searchsorted(used, weight[agent])]
+    worst = int(growth.argmax())
+    return (
+        "with the parent's input fed forward, each agent of a branch amplifies a push by up to "
+        f"||T|| = {max(gains):.3g}, and the {depth[worst]} agents up from agent {worst} by up to "
+        f"{growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
+    )
 
 
 def feedback(gain: Gain, model: ControlAffine, x: State, error: State) -> Input:

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from echelon._errors import LawError
 from echelon._graph import Graph
 from echelon._types import Input, Matrix, Scalar, State
 from echelon.models.model import ControlAffine
 
-Feedforward: TypeAlias = Literal["none", "relay"]
+Feedforward: TypeAlias = Literal["none", "relay", "relay-velocity", "parent"]
 Memory: TypeAlias = Any
 
 
@@ -25,14 +26,15 @@ class LocalView(NamedTuple):
         x: own state (n,).
         offset: own goal offset xi (n,).
         disagreement: z = e + d (n,), from what the neighbours said.
-        feedforward: normalized input (m,) sent by the agent's leader, or zeros.
+        feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
+            unless the law's `message` says otherwise.
     """
 
     t: Scalar
     x: State
     offset: State
     disagreement: State
-    feedforward: Input
+    feedforward: Float[Array, " k"]
 
 
 class Law(eqx.Module):
@@ -49,7 +51,8 @@ class Law(eqx.Module):
     def asks(self) -> Feedforward:
         """Return which feed-forward the law asks for.
 
-        `none`, or `relay`: its leader's input of the same step.
+        `none`; `relay` or `relay-velocity`: its leader's message of the same step; `parent`: that
+        of its parent, the one neighbour nearer to a leader.
         """
         return "none"
 
@@ -79,13 +82,17 @@ class Law(eqx.Module):
         """Return one agent's memory before the first step; none unless replaced."""
         return None
 
-    def message(self, model: ControlAffine, x: State, v: Input) -> Input:
-        """Return what followers under this law are told of a leader at x with normalized input v.
+    def message(self, model: ControlAffine, x: State, v: Input) -> Float[Array, " k"]:
+        """Return what followers under this law are told of an agent at x with normalized input v.
 
-        The input itself unless replaced: a law with an inner loop of its own asks for what the
-        leader applies beyond that loop.
+        The input itself unless replaced: a law with an inner loop of its own asks for what is
+        applied beyond that loop.
         """
         return v
+
+    def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+        """Return what is allowed but probably not meant, a sentence each."""
+        return ()
 
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return xdot (n,) when the disagreement and the feed-forward are zero."""

@@ -1,0 +1,67 @@
+"""Count which starts converge when a parent's input is fed forward instead of the leader's.
+
+Run `python benchmarks/parents.py` (about ten minutes on two cores); `--seeds 4` is quicker. The
+table stands on the theory page, under T4.
+"""
+
+import argparse
+
+import numpy as np
+
+import echelon as ech
+from echelon._linearization import linearize
+from echelon._margins import ClosedLoop, string_gain
+from echelon._metrics import formation_errors
+from echelon._numerics import precision
+
+MODEL = ech.Quadrotor()
+LAWS = [("relay", None), ("parent", 1.0), ("parent", 2.5), ("parent", 10.0)]
+
+
+def converged(followers: int, feedforward: str, coupling: float | None, seeds: int) -> int:
+    """Return how many starts bring every follower of a line within 1 cm by 60 s."""
+    graph = ech.Graph.path(followers + 1)
+    gain = ech.synthesize(MODEL, graph, ech.Riccati(coupling=coupling))
+    count = 0
+    for seed in range(seeds):
+        run = ech.simulate(
+            MODEL,
+            graph,
+            ech.Formation.line(MODEL, graph),
+            leader=ech.Tracking(ech.Lemniscate()),
+            follower=ech.Consensus(gain, feedforward=feedforward),  # pyright: ignore
+            initial={"position": 1.0, "attitude": 0.3},
+            horizon=60.0,
+            dt=0.005,
+            store_every=200,
+            seed=seed,
+        )
+        done = run.outcome is ech.Outcome.COMPLETED
+        count += bool(done and np.all(formation_errors(run)[-1] < 0.01))
+    return count
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=20)
+    seeds = parser.parse_args().seeds
+    gain = ech.synthesize(MODEL, ech.Graph.path(2), ech.Riccati(coupling=1.0))
+    with precision("float64"):
+        A, B = linearize(MODEL)
+    lines = (3, 10, 20)
+    print("| feed-forward | c | ‖T‖ |", " | ".join(f"N = {n}" for n in lines), "|")
+    print("|---" * (3 + len(lines)) + "|")
+    for feedforward, c in LAWS:
+        size = (
+            ""
+            if c is None
+            else f"{string_gain(ClosedLoop(A, B, gain.P, gain.R, c, np.ones(1))).gain:.2f}"
+        )
+        counts = [f"{converged(n, feedforward, c, seeds)} of {seeds}" for n in lines]
+        cells = [feedforward, "1/λ_min" if c is None else f"{c:g}", size, *counts]
+        print("|", " | ".join(cells), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()

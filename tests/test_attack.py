@@ -1,0 +1,115 @@
+"""Promises for random agents, attacked by code that shares nothing with echelon."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon._hull import model_jacobian
+from echelon._numerics import precision
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+from attack import attack, promise_of, study  # noqa: E402
+from attack_systems import random_system  # noqa: E402
+
+
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_the_attacked_plant_is_the_model(number):
+    system = random_system(5, number)
+    plant, rng = system.plant, np.random.default_rng(number)
+    n, m = plant.B.shape
+    x, w = rng.uniform(-1.0, 1.0, n), rng.uniform(-1.0, 1.0, m)
+    with precision("float64"):
+        there = jnp.asarray(x + np.array(system.model.trim[0]))
+        slope = np.asarray(model_jacobian(system.model)(there, jnp.asarray(w)))
+        drift = np.asarray(system.model.normalized_drift(there))
+        G = np.asarray(system.model.normalized_input_map(there))
+    assert np.allclose(plant.drift(x[None])[0], drift, 1e-10, 1e-12)
+    assert np.allclose(np.broadcast_to(plant.input_map(x[None]), (1, n, m))[0], G, 1e-12, 1e-14)
+    bent = np.einsum("iaj,a->ij", plant.g.slope(n).at(x[None])[0], w)
+    assert np.allclose(plant.A + plant.f.slope(n).at(x[None])[0] + bent, slope, 1e-10, 1e-12)
+
+
+def test_a_plant_with_its_loop_closed_is_the_plant_under_that_input():
+    rng = np.random.default_rng(0)
+    plant = next(s.plant for s in (random_system(6, k) for k in range(99)) if not s.plant.constant)
+    n, m = plant.B.shape
+    K, x = rng.normal(size=(m, n)), rng.normal(size=(7, n))
+    wanted = plant.drift(x) - np.einsum("kia,ka->ki", plant.input_map(x), x @ K.T)
+    assert np.allclose(plant.closed(K).drift(x), wanted)
+
+
+def test_no_promise_for_random_systems_is_false():
+    # Agents of one shape compile once; the study has all.
+    numbers = [k for k in range(400) if random_system(11, k).plant.B.shape == (3, 2)][:20]
+    records = [record for number in numbers for record in study(11, number)]
+    attacked = [record for record in records if "margin" in record]
+    assert len(attacked) >= 20 and {r["theorem"] for r in attacked} == {"T1", "T2", "A5"}
+    assert {r["kind"] for r in attacked} == {"proof", "vertices"}
+    assert [(r["number"], r["method"], r["violations"]) for r in attacked if r["violations"]] == []
+
+
+@pytest.fixture(scope="module")
+def tight():
+    """A promise with little to spare: the weakest feedback that contracts, and a bent drift."""
+    for number in range(2, 99, 3):
+        system = random_system(12, number)
+        if not system.plant.constant:
+            continue
+        try:
+            gain = ech.synthesize(
+                system.model, system.graph, ech.Contraction(system.domain(), rate=1.0)
+            )
+        except ech.EchelonError:
+            continue
+        promise = promise_of(system, gain)
+        if promise is not None and gain.certificate.edge > 0.1 and len(promise.P) > 1:
+            return promise
+    raise AssertionError("no such system")
+
+
+def test_a_true_promise_survives(tight):
+    found = attack(tight, np.random.default_rng(0))
+    assert found.violations == [] and 0.0 <= found.margin < 0.5 and found.runs == 16
+
+
+FALSE = {
+    "a raised rate": lambda p, slack: replace(p, rate=p.rate + 1.2 * slack + 0.01),
+    "a shrunk coupling": lambda p, slack: replace(p, coupling=0.5 * p.coupling),
+    "a wider domain": lambda p, slack: p.widened(6.0),
+    "a missing edge": lambda p, slack: replace(p, grounded=0.3 * p.grounded),
+}
+
+
+@pytest.mark.parametrize("name", FALSE)
+def test_a_false_promise_does_not(tight, name):
+    slack = attack(tight, np.random.default_rng(0)).margin
+    found = attack(FALSE[name](tight, slack), np.random.default_rng(0))
+    assert any(told.startswith("state") for told in found.violations)
+    assert found.margin < -found.tolerance
+
+
+def test_simulation_alone_finds_a_drift_that_expands():
+    system = random_system(0, 9)
+    gain = ech.synthesize(system.model, system.graph, ech.RobustLQR(system.domain()))
+    promise = promise_of(system, gain)
+    found = attack(replace(promise, coupling=-promise.coupling), np.random.default_rng(0))
+    assert {told.partition(":")[0] for told in found.violations} == {"state", "set", "run"}
+
+
+def test_a_varying_input_map_certifies_no_set():
+    # From the boundary of {sum delta'P delta <= r^2} of this system a follower leaves the domain.
+    system = random_system(1, 50)
+    method = ech.Contraction(system.domain(), rate=0.2, exact=False)
+    region = ech.synthesize(system.model, system.graph, method).certificate.region
+    assert (region.theorem, region.radius) == ("T2", None)
+
+
+def test_a_drift_that_contracts_by_itself_takes_any_coupling():
+    model, graph = ech.Linear(-np.eye(2), np.eye(2)), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.Contraction({"x1": 1.0}, rate=0.5))
+    assert gain.coupling > 0.0 and gain.certificate.region.rate >= 0.5

@@ -1,0 +1,262 @@
+"""`design`: the table of methods, what it recommends, and pictures that claim no more than seen."""
+
+import json
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import echelon as ech
+from echelon import cli
+from echelon._basin import converged, observed_radius, side_of, slice_of, trial
+from echelon._design import because, designs, recommended, with_gain
+from echelon._design_plots import chosen_slice, save_design_figures
+
+PATH = ech.Graph.path(4)
+
+
+class Cubic(ech.ControlAffine):
+    """x' = -x + x^3, which no input moves, beside y' = -y + u: it returns from |x| < 1 alone."""
+
+    state_names = ("x", "y")
+    input_names = ("u",)
+
+    def drift(self, x):
+        return jnp.stack([-x[0] + x[0] ** 3, -x[1]])
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]], x.dtype)
+
+
+SCENARIO = """
+name: mine
+model: {name: pendulum}
+graph: {name: path, agents: 4}
+leader: {law: passive}
+follower: {gain: {method: robust-lqr, domain: {angle: 0.5}}}
+simulation: {horizon: 1.0, dt: 0.01}
+"""
+
+
+@pytest.fixture
+def echelon(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text(SCENARIO)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        told = capsys.readouterr()
+        return left.value.code or 0, told.out, told.err
+
+    return call
+
+
+def parts_of(scenario):
+    return ech.build(ech.load_scenario(scenario))
+
+
+# ---- the table ----
+
+
+def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon):
+    code, out, err = echelon("design", "mine.yaml", "--json")
+    told = json.loads(out, parse_constant=pytest.fail)
+    rows = {row["method"]: row for row in told["methods"]}
+    assert (code, err) == (0, "")
+    assert set(rows) >= {"riccati", "inner-loop", "monotone", "robust-lqr", "contraction"}
+    gain = ech.synthesize(ech.Pendulum(), PATH, ech.RobustLQR({"angle": 0.5}))
+    row, region = rows["robust-lqr"], gain.certificate.region
+    assert row["condition"] == pytest.approx(np.linalg.cond(gain.P), rel=1e-4)
+    assert row["radius"] == pytest.approx(region.radius, rel=1e-4)
+    assert (row["region_kind"], row["theorem"]) == (region.kind, region.theorem)
+    assert rows["inner-loop"]["reason"] and "coupling" not in rows["inner-loop"]
+    strongest = max(
+        ("proof", "vertices", "samples", None).index(row.get("region_kind"))
+        for row in rows.values() if row["method"] == told["recommended"]
+    )  # fmt: skip
+    assert strongest <= 1 and told["because"].startswith(f"Recommended: {told['recommended']}, ")
+
+
+def test_the_step_that_is_told_is_the_longest(echelon):
+    _, out, _ = echelon("design", "mine.yaml", "--method", "riccati", "--json")
+    (row,) = json.loads(out)["methods"]
+    gain = ech.synthesize(ech.Pendulum(), PATH, ech.Riccati())
+    A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
+    A[1, 0], A[1, 1] = -ech.Pendulum().stiffness, -ech.Pendulum().damping
+    K = np.linalg.solve(gain.R, B.T @ gain.P)
+
+    def grows(dt):
+        radii = []
+        for k in gain.coupling * PATH.grounded_spectrum():
+            flow = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((1, 3))]]))
+            radii.append(np.abs(np.linalg.eigvals(flow[:2, :2] - k * flow[:2, 2:] @ K)).max())
+        return max(radii) > 1.0
+
+    assert grows(1.001 * row["longest_step"]) and not grows(0.999 * row["longest_step"])
+
+
+def test_the_table_and_its_sentence_are_whole(echelon):
+    code, out, _ = echelon("design", "mine.yaml")
+    assert code == 0 and "dt up to" in out and "certified" in out and "delay" in out
+    assert "- inner-loop: `Pendulum` has no state that its dynamics ignore" in out
+    sentence = out.splitlines()[-1]
+    assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough for it.")
+
+
+def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelon):
+    parts = parts_of("paper")
+    tried = designs(ech.load_scenario("paper"), parts)
+    steps = {d.method: d.step for d in tried if d.gain is not None}
+    assert steps["riccati"] < steps["inner-loop"]
+    between = 0.5 * (steps["riccati"] + steps["inner-loop"])
+    assert recommended(tried, 0.005).method == "riccati"
+    assert recommended(tried, between).method == "inner-loop"
+    long = recommended(tried, 1.0)
+    assert "it needs a step below" in because(long, tried, 1.0)
+
+
+def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
+    code, out, _ = echelon("design", "integrators", "--json")
+    rows = {row["method"]: row for row in json.loads(out)["methods"]}
+    assert code == 0 and rows["inner-loop"]["reason"] == ""
+
+
+# ---- the slice ----
+
+
+@pytest.fixture(scope="module")
+def cubic():
+    gain = ech.synthesize(Cubic(), PATH, ech.Given(P=[1.0, 1.0]))
+    return trial(Cubic(), PATH, gain, 0.01, True), slice_of(Cubic(), gain, 3, (0, 1))
+
+
+def test_a_known_basin_is_observed_and_not_overstated(cubic):
+    run, plane = cubic
+    radius = observed_radius(run, plane)
+    # Three followers alike: r^2 = 3 (x^2 + y^2), and only |x| < 1 returns.
+    ratio = 10.0 ** (3.0 / (side_of(3) - 1))
+    assert 1.0 / ratio < plane.extents(radius)[0] < 1.0
+    starts = np.array([[0.9, 0.0], [-0.9, 5.0], [1.1, 0.0], [0.0, 20.0], [-3.0, 0.0], [0.0, 0.0]])
+    assert converged(run, plane, starts).tolist() == [True, True, False, True, False, True]
+
+
+def test_the_ellipse_has_the_radius_that_it_says(cubic):
+    _, plane = cubic
+    points = plane.ellipse(2.0, 90)
+    assert np.einsum("si,ij,sj->s", points, plane.form, points) == pytest.approx(4.0)
+    assert np.abs(points).max(axis=0) == pytest.approx(plane.extents(2.0), rel=2e-3)
+
+
+def test_a_slice_stays_inside_the_chart():
+    agent = ech.Quadrotor()
+    gain = ech.synthesize(agent, PATH, ech.Riccati())
+    plane = slice_of(agent, gain, 3, (0, agent.state_names.index("pitch")))
+    assert plane.reach[1] < np.pi / 2 and plane.reach[0] == 30.0
+
+
+def test_a_slice_runs_the_loop_that_simulate_runs():
+    parts = parts_of("planar-quadrotor")
+    gain, model = parts.follower.gain, parts.model
+    run = trial(model, parts.graph, gain, 0.005, True)
+    pair = chosen_slice(model, gain, "y,roll")
+    for start in ([0.5, 0.2], [25.0, 1.0]):
+        states = np.zeros((parts.graph.agents, len(model.state_names))) + np.array(model.trim[0])
+        for follower in parts.graph.followers:
+            states[follower, pair] += start
+        result = ech.simulate(
+            model,
+            parts.graph,
+            ech.Formation.from_offsets(model, parts.graph, {}),
+            leader=ech.Passive(),
+            follower=ech.Consensus(gain, feedforward="relay"),
+            initial=states,
+            horizon=run.horizon,
+            dt=0.005,
+            store_every=run.steps,
+        )
+        y = result.states[[0, -1]][:, list(parts.graph.followers)] - np.array(model.trim[0])
+        first, last = np.sqrt(np.einsum("tfi,ij,tfj->t", y, gain.P, y))
+        plane = slice_of(model, gain, 3, pair)
+        assert converged(run, plane, np.array([start]))[0] == (last <= run.fallen * first)
+
+
+def test_the_pair_is_the_one_asked_for_or_a_telling_one():
+    quad, cart = ech.Quadrotor(), ech.VanDerPol()
+    gain = ech.synthesize(quad, PATH, ech.Riccati())
+    assert chosen_slice(quad, gain, " roll , y ") == (6, 1)
+    velocity, angle = chosen_slice(quad, gain, None)
+    assert (quad.state_names[velocity], quad.state_names[angle]) in {
+        ("vx", "pitch"),
+        ("vy", "roll"),
+    }
+    assert chosen_slice(cart, ech.synthesize(cart, PATH, ech.Riccati()), None) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        ("y,rol", "did you mean `roll`?"),
+        ("y", "must be two states such as `y,roll`."),
+        ("y,y", "must be two states such as `y,roll`."),
+        ("y,z,roll", "must be two states such as `y,roll`."),
+    ],
+)
+def test_a_slice_that_is_none_is_one_sentence(asked, sentence):
+    gain = ech.synthesize(ech.Quadrotor(), PATH, ech.Riccati())
+    with pytest.raises(ech.EchelonError) as caught:
+        chosen_slice(ech.Quadrotor(), gain, asked)
+    assert sentence in str(caught.value) and "`--slice`" in str(caught.value)
+
+
+# ---- pictures ----
+
+
+def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
+    call = ("design", "mine.yaml", "--method", "robust-lqr", "--figures", "figs")
+    code, out, err = echelon(*call)
+    assert (code, err) == (0, "")
+    names = {path.name for path in (tmp_path / "figs").iterdir()}
+    assert names == {
+        f"{name}.{kind}" for name in ("modes", "certified_set") for kind in ("png", "pdf")
+    }
+    assert (tmp_path / "figs" / "modes.png").read_bytes()[:4] == b"\x89PNG"
+    said = out.splitlines()[-1]
+    gain = ech.synthesize(ech.Pendulum(), PATH, ech.RobustLQR({"angle": 0.5}))
+    assert f"certified {gain.certificate.region.radius:.3g}; observed" in said
+    code, _, err = echelon(*call, "--slice", "angle,rat")
+    assert code == 2 and "did you mean `rate`?" in err and err.count("\n") == 1
+    (tmp_path / "file").write_text("")
+    code, _, err = echelon(*call[:-1], "file")
+    assert code == 2 and "cannot be written" in err and err.count("\n") == 1
+
+
+def test_where_nothing_is_certified_the_picture_says_so(tmp_path):
+    gain = ech.synthesize(Cubic(), PATH, ech.Given(P=[1.0, 1.0]))
+    told = {"model": {"name": "van-der-pol"}, "graph": {"name": "path", "agents": 4}}
+    scenario = ech.scenario_from_mapping(
+        {"name": "n", "simulation": {"horizon": 1.0, "dt": 0.01}, "leader": {"law": "passive"}}
+        | told
+    )
+    parts = ech.build(scenario)._replace(model=Cubic())
+    _, radii = save_design_figures(with_gain(parts, gain), tmp_path)
+    assert radii.certified is None and "certified none" in radii.sentence()
+    assert radii.observed < radii.largest
+
+
+def test_one_state_has_modes_and_no_slice(tmp_path):
+    scenario = ech.scenario_from_mapping(
+        {
+            "name": "one",
+            "model": {"name": "linear", "parameters": {"A": [[0.0]], "B": [[1.0]]}},
+            "graph": {"name": "path", "agents": 3},
+            "leader": {"law": "passive"},
+            "simulation": {"horizon": 1.0, "dt": 0.01},
+        }
+    )
+    parts = ech.build(scenario)
+    paths, radii = save_design_figures(with_gain(parts, parts.follower.gain), tmp_path)
+    assert [path.name for path in paths] == ["modes.png", "modes.pdf"] and radii is None
