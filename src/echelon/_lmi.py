@@ -125,12 +125,10 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
     if found is not None:
         along = listing(names[i] if names else f"x{i + 1}" for i in found.states)
         kind = "a Jordan block on the imaginary axis" if found.defective else "an unstable mode"
-        what = (
-            f"matrix {found.vertex} has {kind}, at {in_words(found.eigenvalue)} 1/s along {along}"
-        )
+        what = f"matrix {found.vertex} has {kind}, at {in_words(found.eigenvalue)} 1/s"
         raise GainError(
-            f"no P > 0 keeps this drift from expanding: {what}; damp it by an inner loop, shrink "
-            "the domain, or take a method with feedback."
+            f"no P > 0 keeps this drift from expanding: {what} along {along}; damp it by an inner "
+            "loop, shrink the domain, or take a method with feedback."
         )
     cp = _cvxpy()
     d = scipy.linalg.matrix_balance(np.abs(As).sum(0), permute=False, separate=True)[1][0]
@@ -217,9 +215,7 @@ def contraction(As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4) 
     solved = _least(cp, rho, [W - unit >> 0, 0.999 * condition_max * unit - W >> 0], gaps)
     P = _unscaled(W.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
-    tried = (
-        [max(0.0, float(rho.value)) * part for part in (1.0, 1.0001, 1.01, 1.1)] if solved else []
-    )
+    tried = [max(0.0, float(rho.value)) * s for s in (1.0, 1.0001, 1.01, 1.1)] if solved else []
     enough = [s for s in tried if P is not None and rate_of(P, As, B, None, s) >= rate]
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(
