@@ -181,7 +181,7 @@ def test_a_failure_can_end_the_run_and_keeps_what_was_flown(monkeypatch):
         "The run was stopped, since the solver of agent 1 failed (`MADE_UP`) at t = 0.4 s; "
         "what was computed is kept."
     )
-    assert result.times[-1] == pytest.approx(0.35) and np.isfinite(result.states).all()
+    assert result.times[-1] == pytest.approx(0.4) and np.isfinite(result.states).all()
 
 
 def test_a_real_failure_is_counted_and_survived():

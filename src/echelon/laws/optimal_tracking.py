@@ -119,8 +119,9 @@ class OptimalTracking(Law):
         held = jnp.clip(k, 0, count - 1)
         u = jnp.asarray(self.inputs, dtype)[held]
         x, step = jnp.asarray(self.states, dtype)[held], jnp.maximum(t - held * span, 0.0)
-        for _ in range(_BETWEEN):
-            x = rk4(model.velocity, x, u, step / _BETWEEN)
+        x = jax.lax.fori_loop(
+            0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
+        )
         planned = k < count
         return jnp.where(planned, x, follow[0]), jnp.where(planned, u, follow[1])
 
