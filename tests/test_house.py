@@ -39,8 +39,7 @@ FLOORS = [
     ["_jacobians", "_plan"],
     ["gains.gain", "laws.law", "_planar_baseline", "_formation_plan"],
     ["_initial", "_result", "laws.consensus", "gains.riccati", "gains.regional"],
-    ["_arguments", "_loop", "_finite_condition", "_basin", "_solver_figures"]
-    + ["_recommend"],
+    ["_arguments", "_loop", "_finite_condition", "_basin", "_solver_figures"] + ["_recommend"],
     ["gains.*"],
     ["laws.*", "_simulate", "_synthesize", "_gain_file"],
     ["_build", "_metrics", "_lyapunov", "_drive"],
