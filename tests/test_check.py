@@ -445,6 +445,16 @@ def test_a_gain_file_of_another_model_or_graph_is_refused_by_check(echelon):
         assert code == 2 and sentence in err and err.count("\n") == 1
 
 
+def test_a_gain_from_a_file_keeps_its_region(echelon):
+    domain = "method: robust-lqr, domain: {angle: 0.5}"
+    written(domain, "pendulum")
+    before = json.loads(echelon("check", "mine.yaml", "--json")[1])
+    assert echelon("design", "mine.yaml", "--method", "robust-lqr", "--out", "gain.json")[0] == 0
+    written("file: gain.json", "pendulum")
+    after = json.loads(echelon("check", "mine.yaml", "--json")[1])
+    assert after == before and "(T1)" in after["promise"]
+
+
 def test_a_missing_solver_names_its_pip_line(echelon, monkeypatch):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     written("method: robust-lqr, domain: {angle: 0.5}", "pendulum")

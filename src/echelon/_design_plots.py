@@ -20,6 +20,7 @@ from echelon.models.model import ControlAffine
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_MOST = 500
 _LOST, _HELD = "#F0C9A8", "#CFE3F1"  # pale, so that the sets' outlines stand out on them
 _CERTIFIED, _OBSERVED = draw.COLOURS[2], draw.COLOURS[0]
 
@@ -95,8 +96,8 @@ def save_design_figures(
 ) -> tuple[list[Path], Radii | None]:
     """Write `modes` and `certified_set` of a gain as PNG and PDF; return paths and both radii.
 
-    A model of one state has no slice, and a loop that does not decay has nothing to show in one:
-    then the second figure and the radii are missing.
+    A model of one state has no slice, a loop that does not decay has nothing to show in one, and
+    more than 500 followers take too long to run: then the second figure and the radii are missing.
 
     Raises:
         GainError: the slice asked for is none of the model's.
@@ -109,7 +110,7 @@ def save_design_figures(
     states = chosen_slice(parts.model, gain, asked) if sliced else None
     with draw.style():
         made["modes"] = _modes(loop)
-        if states is not None and loop.every:
+        if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
             made["certified_set"], radii = _certified_set(loop, gain, states)
     return draw.save(made, folder), radii
 

@@ -109,7 +109,7 @@ def _shown(model: ControlAffine) -> Matrix:
     """Tell which states the output depends on at the trim, (n,)."""
     with precision("float64"):
         slopes = jax.jacfwd(model.output)(jnp.asarray(np.asarray(model.trim[0], float)))
-    return np.asarray(slopes).any(axis=0)
+    return np.array(np.asarray(slopes).any(axis=0))
 
 
 def _weights(name: str, given: Any, count: int) -> Matrix:

@@ -249,7 +249,7 @@ def spacing(
     spent, count = _spending(model), len(distances) * len(axes)
 
     def stage(x: jax.Array, u: jax.Array, p: jax.Array) -> jax.Array:
-        apart = p[:count].reshape(len(distances), len(axes)) - x[np.array(axes)]
+        apart = p[:count].reshape(len(distances), len(axes)) - x[None, np.array(axes)]
         off = jnp.sqrt(jnp.sum(apart * apart, axis=1)) - jnp.asarray(distances, x.dtype)
         return jnp.sum(off * off) + spent(u, p[count:])
 
