@@ -96,8 +96,8 @@ def main() -> None:
         "## The two halves compared",
         "`echelon compare paper`: the same starts (seed 0), motor limits and wind for all methods, "
         "10 s, RMSE in m. `optimization` is planned once and flown open loop; `mpc` plans 1 s "
-        "ahead 50 times a second. Printed are the paper's rows. Computing is that of one shared machine, "
-        "compilation apart.",
+        "ahead 50 times a second. Printed are the paper's rows. Computing is on one shared "
+        "machine, compilation apart.",
     ]
     for title, changes in CONDITIONS.items():
         parts += compared(title, changes)
