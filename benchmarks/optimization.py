@@ -218,18 +218,24 @@ def times_and_mpc() -> Iterator[Row]:
         yield (f"{name}: failures", f"{figures.failures} of {figures.solves}", "-")
 
 
-def main() -> None:
-    """Print the table."""
+def rows() -> Iterator[Row]:
+    """Yield all rows of the table."""
     initial = starts()
     within = ech.simulate_plans(MODEL, TREE, DRAWN, initial=initial, **FLIGHT)
     free = ech.simulate_plans(MODEL, TREE, DRAWN, initial=initial, limits=False, **FLIGHT)
     sharp = ech.simulate_plans(
         MODEL, TREE, DRAWN, planning=SHARP, initial=initial, limits=False, **FLIGHT
     )
+    yield from leader(free, within)
+    yield from followers(sharp, within)
+    yield from times_and_mpc()
+
+
+def main() -> None:
+    """Print the table."""
     print("| what | measured | asked |\n|---|---|---|")
-    for rows in (leader(free, within), followers(sharp, within), times_and_mpc()):
-        for row in rows:
-            print(f"| {' | '.join(row)} |", flush=True)
+    for row in rows():
+        print(f"| {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measure what echelon claims of the paper's experiment and write `docs/results.md`.
+"""Measure what echelon claims of the paper's experiment and write its part of `docs/results.md`.
 
 Run `python benchmarks/results.py` (about three minutes on two cores); `--seeds 10` is quicker.
 Every number on the page is made here, by the same commands that a user has.
@@ -6,15 +6,14 @@ Every number on the page is made here, by the same commands that a user has.
 
 import argparse
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
+from pages import write_part
 
 import echelon as ech
 from echelon._metrics import formation_errors
 from echelon._provenance import versions
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 OFFSETS = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
 
 
@@ -266,7 +265,6 @@ def main() -> None:
     seeds = range(parser.parse_args().seeds)
     told = ", ".join(f"{name} {text}" for name, text in versions().items() if name != "git")
     page = [
-        "# Results",
         "Made by `python benchmarks/results.py`; rerun it to check. Random starts are seeds "
         f"0 to {len(seeds) - 1} unless said; float64, Runge-Kutta with held input, "
         f"the Crazyflie's motor limits with attitude-priority mixing. Versions: {told}.",
@@ -288,8 +286,7 @@ def main() -> None:
         "## Oracles",
         ORACLES,
     ]
-    PAGE.write_text("\n\n".join(page) + "\n", "utf-8")
-    print(PAGE.read_text("utf-8"))
+    write_part("results.md", "results.py", "\n\n".join(page))
 
 
 if __name__ == "__main__":

@@ -119,6 +119,19 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelo
     assert "it needs a step below" in because(long, tried, 1.0)
 
 
+def test_an_inner_loop_comes_with_what_would_shorten_it(echelon):
+    _, out, _ = echelon("design", "paper-line", "--method", "inner-loop", "--json")
+    (row,) = json.loads(out)["methods"]
+    wanted = ech.shorter(*parts_of("paper-line")[:2], inner_loop_gain("paper-line")).sentence()
+    assert row["advice"] == wanted and "as a leader too" in wanted
+    _, out, _ = echelon("design", "paper-line", "--method", "inner-loop")
+    assert f"- inner-loop: {wanted}" in out
+
+
+def inner_loop_gain(scenario):
+    return ech.synthesize(*parts_of(scenario)[:2], ech.InnerLoop())
+
+
 def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
     code, out, _ = echelon("design", "integrators", "--json")
     rows = {row["method"]: row for row in json.loads(out)["methods"]}

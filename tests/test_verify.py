@@ -140,14 +140,17 @@ def test_a_proof_that_holds_is_found_again_at_its_rate_and_not_far_above(files):
 BROKEN = {
     "the file must be a mapping": lambda told: [told],
     "`P` is missing": lambda told: {key: told[key] for key in told if key != "P"},
-    "`P` must be 2 x 2 finite numbers": lambda told: told | {"P": [[1.0]]},
+    "`P` must be 2 x 2 finite numbers (to 1e50)": lambda told: told | {"P": [[1.0]]},
     "`R` must be 1 x 1 finite numbers": lambda told: told | {"R": [[float("nan")]]},
-    "`coupling` must be a finite number": lambda told: told | {"coupling": float("inf")},
-    "`graph.agents` must be a whole number from 2 on": lambda told: (
+    "`coupling` must be a finite number (to 1e50)": lambda told: told | {"coupling": float("inf")},
+    "`graph.agents` must be a whole number from 2 on (to 1e9)": lambda told: (
         told | {"graph": told["graph"] | {"agents": True}}
     ),
     "`graph` must name agents from 0 to 3": lambda told: (
         told | {"graph": told["graph"] | {"leaders": [7]}}
+    ),
+    "`graph.edges` must be null for more than 2000 edges": lambda told: (
+        told | {"graph": told["graph"] | {"edges": [[0, 1, 1.0]] * 2001}}
     ),
     "`certificate.region.kind` must be one of `proof`, `vertices`, `samples`": lambda told: changed(
         told, kind="sure"
@@ -172,6 +175,40 @@ def test_what_is_no_gain_has_its_sentence(files, wanted, tmp_path):
         ech.verify(file)
     assert wanted.replace("the file must", "`the file` must") in str(caught.value)
     assert str(caught.value).count("\n") == 0
+
+
+def places(told, path=()):
+    """The path to every part of a file."""
+    parts = told.items() if isinstance(told, dict) else enumerate(told) if path else ()
+    for key, part in parts:
+        yield (*path, key)
+        if isinstance(part, (dict, list)):
+            yield from places(part, (*path, key))
+
+
+ODD = [None, 0, -1, 1e308, -1e50, 1e-320, 10**400, 10**9, "x", [], {}, True, [[1]], 2.5]
+ODD += ["echelon.models.pendulum:Nope", "echelon.models.check:check_model", "echelon.models._x:y"]
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_whatever_stands_in_a_file_it_is_refused_in_words(files, data, tmp_path_factory):
+    told = json.loads(json.dumps(files[data.draw(st.sampled_from(FAST[:3]))]))
+    path = data.draw(st.sampled_from(list(places(told))))
+    value, part = data.draw(st.sampled_from(ODD)), told
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    file = tmp_path_factory.getbasetemp() / "odd.json"
+    file.write_text(json.dumps(told))
+    try:
+        found = ech.verify(file)
+    except ech.EchelonError as error:
+        assert str(error).count("\n") == 0
+    else:
+        refused = any(each.verdict == "refused" for each in found.findings)
+        assert found.holds is not refused
+        assert found.sentence.startswith("Refused" if refused else "Verified")
 
 
 @pytest.fixture

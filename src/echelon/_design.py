@@ -12,12 +12,14 @@ from echelon._check_loop import CheckedLoop, checked_loop
 from echelon._check_region import CertifiedSet, certified_set
 from echelon._errors import EchelonError
 from echelon._numerics import longest_step, precision
+from echelon._recommend import shorter
 from echelon._scenario import Scenario
 from echelon._synthesize import synthesize
 from echelon.gains.gain import Gain
 from echelon.laws.consensus import Consensus
 
 _NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
+_ADVISED = 100
 _RATE = 0.1
 """Rate that `contraction` is asked for where the scenario names none, 1/s."""
 _STRENGTH: dict[Kind, int] = {"proof": 3, "vertices": 2, "samples": 1, "linearization": 0}
@@ -136,8 +138,16 @@ def _known(name: str, loop: CheckedLoop) -> Design:
 
 
 def _advice(name: str, loop: CheckedLoop) -> str:
-    """Return what else to know: for `inner-loop`, a graph or leaders that make it faster."""
-    return ""
+    """Return what else to know: for `inner-loop`, an edge or a leader that makes it faster.
+
+    Any graph keeps it stable, and so the graph alone sets its rate. A swarm would take minutes.
+    """
+    graph, gain = loop.parts.graph, loop.gain
+    followers, free = len(graph.followers), graph.agents * (graph.agents - 1) // 2
+    if name != "inner-loop" or gain is None or followers > _ADVISED:
+        return ""
+    more = int(followers > 1), int(len(graph.edges) < free)
+    return shorter(loop.parts.model, graph, gain, *more).sentence()
 
 
 def _options(name: str, scenario: Scenario) -> dict[str, Any]:

@@ -153,9 +153,8 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
 def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Metric:
     """Return the P of least trace with A_k'P + P A_k + Q - P B R^-1 B'P <= 0 for all k.
 
-    The theorem needs rho = 1, that is c lambda_min >= 1/2; there the inequality, which the solver
-    meets to its accuracy, gives half the smallest eigenvalue of P^-1 Q as rate, and there the rate
-    returned is measured. At c = 1/lambda_min `rate_of(P, As, B, R, 2.0)` is no smaller.
+    The rate is measured at rho = 1, the edge c = 1/(2 lambda_min); the inequality makes it half the
+    smallest eigenvalue of P^-1 Q or more, to the solver's accuracy, and a larger rho no smaller.
 
     Args:
         As: (K, n, n) vertices, 1/s.
@@ -217,10 +216,8 @@ def contraction(As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4) 
     solved = _least(cp, rho, [W - unit >> 0, 0.999 * condition_max * unit - W >> 0], gaps)
     P = _unscaled(W.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
-    tried = (
-        [max(0.0, float(rho.value)) * part for part in (1.0, 1.0001, 1.01, 1.1)] if solved else []
-    )
-    enough = [s for s in tried if P is not None and rate_of(P, As, B, None, s) >= rate]
+    tried = max(0.0, float(rho.value)) * np.array([1.0, 1.0001, 1.01, 1.1]) if solved else []
+    enough = [float(s) for s in tried if P is not None and rate_of(P, As, B, None, s) >= rate]
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(
             f"no constant metric of condition number up to {condition_max:g} was found that one "
@@ -345,8 +342,7 @@ def _basis(n: int) -> Matrix:
 
 def _pull(As: Matrix, basis: Matrix) -> Matrix:
     """Return A_k E_i + E_i A_k', (K, d, n, n)."""
-    product = As[:, None] @ basis
-    return product + product.swapaxes(-1, -2)
+    return (product := As[:, None] @ basis) + product.swapaxes(-1, -2)
 
 
 def _gaps(cp: Any, slopes: list[Matrix], x: Any) -> list[Any]:

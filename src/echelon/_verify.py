@@ -4,6 +4,7 @@ Nothing of the synthesis is used here: neither its matrices' algebra nor its exa
 hull or its graphs. What is shared is what both speak of, the equations of the bundled models.
 """
 
+import warnings
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import NamedTuple
@@ -71,16 +72,30 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verified:
     Raises:
         GainError: the file is no gain, or lacks a part.
     """
-    saved = read(path)
-    findings = [*_definite(saved)]
-    if all(each.verdict == "holds" for each in findings):
-        findings += _graph(saved.graph, saved)
-    # What follows rests on these.
-    if all(each.verdict != "refused" for each in findings):
-        facts = _facts(saved)
-        findings += [*_linearized(facts), *_regional(facts), *_equations(facts, model)]
+    saved, findings = read(path), list[Finding]()
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for finding in _findings(saved, model):
+                findings.append(finding)
+        except (ArithmeticError, TypeError, ValueError) as error:
+            # Numbers at which an algorithm gives up are no certificate.
+            findings.append(_said("all of it can be computed", False, text=str(error)))
     refused = [each.claim for each in findings if each.verdict == "refused"]
     return Verified(tuple(findings), not refused, _sentence(findings, refused))
+
+
+def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding]:
+    first = [*_definite(saved)]
+    if all(each.verdict == "holds" for each in first):
+        first += _graph(saved.graph, saved)
+    yield from first
+    # What follows rests on these.
+    if all(each.verdict != "refused" for each in first):
+        facts = _facts(saved)
+        yield from _linearized(facts)
+        yield from _regional(facts)
+        yield from _equations(facts, model)
 
 
 def _sentence(findings: list[Finding], refused: list[str]) -> str:
@@ -128,8 +143,9 @@ def _graph(graph: SavedGraph, saved: SavedGain) -> Iterator[Finding]:
     if graph.edges is None:
         text = "the file holds no edges of so large a graph"
         yield Finding("graph spectrum", _shown(float(stored[0])), "", "not checked", text)
-    elif not _is_graph(graph.edges):
-        text = "an edge is no link of two agents, is given twice or has no positive weight"
+    elif not _is_graph(graph.edges) or followers > len(graph.edges):
+        text = "an edge links no two agents, is given twice or has no positive weight, or some are"
+        text += " missing"
         yield _said("graph", False, text=text)
         return
     found = stored if graph.edges is None else algebra.spectrum(graph, graph.edges)

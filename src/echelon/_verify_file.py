@@ -13,6 +13,9 @@ from echelon._types import Matrix, PathLike
 
 _FORMAT = "echelon gain 2"
 _KINDS = ("proof", "vertices", "samples", "linearization")
+_LARGEST = 1e50
+"""Larger numbers are no part of a gain, and their products no numbers."""
+_MOST_EDGES = 2000
 _THEOREMS = ("T1", "T2", "A5")
 
 
@@ -106,7 +109,7 @@ class _Part:
     def number(self, key: str) -> float:
         value, name = self.entry(key)
         if not _is_number(value):
-            raise self.fault(name, "must be a finite number")
+            raise self.fault(name, "must be a finite number (to 1e50)")
         return float(value)
 
     def maybe(self, key: str) -> float | None:
@@ -114,8 +117,8 @@ class _Part:
 
     def whole(self, key: str, least: int = 0) -> int:
         value, name = self.entry(key)
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise self.fault(name, f"must be a whole number from {least} on")
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 10**9:
+            raise self.fault(name, f"must be a whole number from {least} on (to 1e9)")
         return value
 
     def text(self, key: str, allowed: tuple[str, ...] = ()) -> str:
@@ -142,7 +145,7 @@ class _Part:
             or any(wanted not in (-1, got) for got, wanted in zip(found.shape, shape, strict=True))
         ):
             wanted = " x ".join("any" if size < 0 else str(size) for size in shape)
-            raise self.fault(name, f"must be {wanted} finite numbers")
+            raise self.fault(name, f"must be {wanted} finite numbers (to 1e50)")
         return found
 
     def bounds(self, key: str, size: int, absent: float) -> Matrix:
@@ -158,10 +161,7 @@ class _Part:
 def _is_number(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
-    try:
-        return math.isfinite(float(value))
-    except OverflowError:
-        return False
+    return -_LARGEST <= value <= _LARGEST
 
 
 def _array(value: object) -> Matrix | None:
@@ -246,6 +246,8 @@ def _graph(told: _Part) -> SavedGraph:
     agents = told.whole("agents", 2)
     leaders = told.array("leaders", -1)
     edges = told.array("edges", -1, 3) if told.optional("edges") else None
+    if edges is not None and len(edges) > _MOST_EDGES:
+        raise told.fault("graph.edges", f"must be null for more than {_MOST_EDGES} edges")
     numbers = leaders if edges is None else np.append(leaders, edges[:, :2])
     if not len(leaders) or not all(x == int(x) and 0 <= x < agents for x in numbers):
         raise told.fault("graph", f"must name agents from 0 to {agents - 1}, one leader at least")

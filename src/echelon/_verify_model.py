@@ -18,6 +18,8 @@ from echelon.models.model import ControlAffine
 
 _EACH = 128
 """States of each sort: corners of the domain, points of a lattice, and random ones."""
+_MOST_DIMENSIONS = 1000
+"""A whole number above it counts no dimensions, and is made a float."""
 _FAR = 10.0
 """A state without bounds is looked at up to this far from the trim."""
 
@@ -49,7 +51,14 @@ def model_of(saved: SavedModel) -> ControlAffine | NoModel:
     try:
         cls = getattr(importlib.import_module(module), name)
         made = cls(**{key: _frozen(value) for key, value in saved.parameters.items()})
-    except (ImportError, AttributeError, TypeError, ValueError, EchelonError) as error:
+    except (
+        ImportError,
+        AttributeError,
+        ArithmeticError,
+        TypeError,
+        ValueError,
+        EchelonError,
+    ) as error:
         return NoModel(f"`{saved.path}` cannot be made: {error}", True)
     if not isinstance(made, ControlAffine):
         return NoModel(f"`{saved.path}` is no model", True)
@@ -57,6 +66,8 @@ def model_of(saved: SavedModel) -> ControlAffine | NoModel:
 
 
 def _frozen(value: object) -> object:
+    if isinstance(value, int) and abs(value) > _MOST_DIMENSIONS:
+        return float(value)
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
