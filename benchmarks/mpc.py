@@ -29,7 +29,7 @@ NONLINEAR: dict[str, dict[str, Any]] = {
     "sqpmethod": {
         "qpsol": "osqp",
         "qpsol_options": {"osqp": {"verbose": False}, "error_on_fail": False},
-        "max_iter": 1,
+        "max_iter": 10,
         "print_header": False,
         "print_iteration": False,
         "print_status": False,
@@ -38,7 +38,7 @@ NONLINEAR: dict[str, dict[str, Any]] = {
     "sqpmethod+qrqp": {
         "qpsol": "qrqp",
         "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
-        "max_iter": 1,
+        "max_iter": 10,
         "print_header": False,
         "print_iteration": False,
         "print_status": False,
