@@ -347,7 +347,8 @@ def _compare(
 
 
 def _energy(delta: np.ndarray, weight: np.ndarray, P: np.ndarray) -> np.ndarray:
-    return np.einsum("tsia,tsia->ts", np.einsum("ij,tsja->tsia", weight, delta), delta @ P)
+    with np.errstate(all="ignore"):  # a run that leaves the domain may have no end
+        return np.einsum("tsia,tsia->ts", np.einsum("ij,tsja->tsia", weight, delta), delta @ P)
 
 
 def _decays(
