@@ -22,7 +22,7 @@ MODEL = ech.Quadrotor.crazyflie()
 STEPS, DT = 50, 0.02
 Step = Callable[[np.ndarray, Course, Course], tuple[Course | None, int]]
 
-QUADRATIC = ("piqp", "proxqp", "osqp", "qrqp", "qpoases")
+QUADRATIC = ("piqp", "proxqp", "osqp", "qrqp")
 NONLINEAR: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-4, "ipopt.tol": 1e-6},
     "fatrop": {"fatrop.tol": 1e-6, "fatrop.mu_init": 1e-3},
