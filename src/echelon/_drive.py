@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from echelon._formation import Formation
 from echelon._graph import Graph
 from echelon._initial import Initial, initial_states
 from echelon._loop import Loop, advance_plant, assemble, delivered
-from echelon._numerics import precision
+from echelon._numerics import Precision, precision
 from echelon._plant import check_plant
 from echelon._result import Result, Settings
 from echelon._types import Inputs, Matrix, States
@@ -122,7 +122,7 @@ def fly(
 
     `told` is what the followers know of others, in words.
     """
-    with precision("float64"):
+    with precision(cast(Precision, flight.settings.precision)):
         track = _fly(flight, pilot, hold, progress)
     return _result(flight, track, told)
 
@@ -134,13 +134,13 @@ def _fly(flight: Flight, pilot: Pilot, hold: int, progress: Progress | None) -> 
     try:
         for first in range(0, total, hold):
             count = min(hold, total - first)
-            wanted = pilot(first, np.asarray(states))
+            wanted = jnp.asarray(pilot(first, np.asarray(states, np.float64)))
             states, each, u = _held(
-                flight.loop, states, jnp.asarray(wanted), jnp.asarray(first, jnp.int32), count
+                flight.loop, states, wanted, jnp.asarray(first, jnp.int32), count
             )
-            passed.append(np.asarray(each))
-            inputs += [np.asarray(u)[None]] * count
-            saturated += count * (np.asarray(u) != wanted).any(axis=1)
+            passed.append(np.asarray(each, np.float64))
+            inputs += [np.asarray(u, np.float64)[None]] * count
+            saturated += count * np.asarray(u != wanted).any(axis=1)
             if progress is not None:
                 progress(first + count, total)
             if not np.isfinite(passed[-1]).all() or not np.isfinite(inputs[-1]).all():
@@ -149,7 +149,9 @@ def _fly(flight: Flight, pilot: Pilot, hold: int, progress: Progress | None) -> 
         stopped = "The run was interrupted"
     except Stopped as reason:
         stopped = f"The run was stopped, since {reason}"
-    every = np.concatenate([np.zeros((0, *states.shape)), *passed, np.asarray(states)[None]])
+    every = np.concatenate(
+        [np.zeros((0, *states.shape)), *passed, np.asarray(states, np.float64)[None]]
+    )
     none = np.zeros((0, len(states), len(flight.model.input_names)))
     return _Track(every, np.concatenate([none, *inputs]), saturated, stopped)
 
