@@ -1,7 +1,7 @@
 """Attack every promise that echelon makes for random systems: none may be false.
 
 Run `python benchmarks/attack.py` (2,000 systems, about 20 minutes on two idle cores), `--systems
-100` is quicker. Each system is given to three gain methods. Every promise of kind `proof` or
+100` is quicker. Each system is given to two gain methods. Every promise of kind `proof` or
 `vertices` is attacked twice, by code that shares nothing with echelon (`attack_systems.Terms` has
 its own calculus): a gradient search of the domain for a state that breaks the inequality, and
 simulation from the boundary of the certified set, behind a resting and behind a moving leader.
@@ -347,7 +347,8 @@ def _compare(
 
 
 def _energy(delta: np.ndarray, weight: np.ndarray, P: np.ndarray) -> np.ndarray:
-    return np.einsum("tsia,tsia->ts", np.einsum("ij,tsja->tsia", weight, delta), delta @ P)
+    with np.errstate(all="ignore"):  # a run that leaves the domain may have no end
+        return np.einsum("tsia,tsia->ts", np.einsum("ij,tsja->tsia", weight, delta), delta @ P)
 
 
 def _decays(
@@ -405,12 +406,12 @@ def _variational(
 # ---- the study ----
 
 
-def study(seed: int, number: int) -> list[dict[str, Any]]:
-    """Give a system to three methods and attack what they promise; one record a method."""
+def study(seed: int, number: int, methods: int = 2) -> list[dict[str, Any]]:
+    """Give a system to some methods and attack what they promise; one record a method."""
     system, rng = random_system(seed, number), np.random.default_rng([seed, number, 1])
     chances = np.array([3.0, 4.0, 4.0, 1.0, 1.0, 1.0]) / 14.0
     records = []
-    for name in rng.choice(METHODS, 3, replace=False, p=chances):
+    for name in rng.choice(METHODS, methods, replace=False, p=chances):
         record: dict[str, Any] = {"number": number, "family": system.family, "method": str(name)}
         start = time.perf_counter()
         try:

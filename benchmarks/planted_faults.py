@@ -292,6 +292,16 @@ def radius_raised(told: Told, random: Random, size: float) -> bool:
     return True
 
 
+@fault("radius raised")
+def radius_invented(told: Told, random: Random) -> bool:
+    """Promise a set where there is none, T2 being local."""
+    region = region_of(told)
+    if region is None or region["radius"] is not None:
+        return False
+    region["radius"] = 0.01
+    return True
+
+
 @fault("corners changed", 0.3, 0.1, 0.01)
 def corners_drawn_in(told: Told, random: Random, size: float) -> bool:
     """Draw all corners towards their mean, so that Jacobians stick out."""

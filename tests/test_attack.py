@@ -46,7 +46,7 @@ def test_a_plant_with_its_loop_closed_is_the_plant_under_that_input():
 def test_no_promise_for_random_systems_is_false():
     # Agents of one shape compile once; the study has all.
     numbers = [k for k in range(400) if random_system(11, k).plant.B.shape == (3, 2)][:20]
-    records = [record for number in numbers for record in study(11, number)]
+    records = [record for number in numbers for record in study(11, number, 3)]
     attacked = [record for record in records if "margin" in record]
     assert len(attacked) >= 20 and {r["theorem"] for r in attacked} == {"T1", "T2", "A5"}
     assert {r["kind"] for r in attacked} == {"proof", "vertices"}

@@ -383,6 +383,22 @@ def test_a_chain_of_integrators_passes_on_what_it_gets():
     assert "string gain" not in lines
 
 
+def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
+    # Riccati for a chain of ten on the coupling of one link: A - c B K alone must decay.
+    follower = {"gain": {"method": "riccati", "coupling": 1.0}, "feedforward": "parent"}
+    graph = {"name": "path", "agents": 11}
+    lines, found = checked(follower, model={"name": "double-integrator"}, graph=graph)
+    assert found.promised
+    assert lines["coupling"].number == "c 1, edge 0.5"
+    # Q = R = I on (x, v): s^2 + sqrt(3) s + 1, whose roots have real part -sqrt(3)/2.
+    told = float(lines["disagreement decays"].number.removesuffix(" 1/s"))
+    assert told == pytest.approx(-(3.0**0.5) / 2.0, abs=5e-4)
+    assert "disturbance, network" not in lines
+    lines, found = checked({**follower, "feedforward": "relay"},
+                           model={"name": "double-integrator"}, graph=graph)  # fmt: skip
+    assert lines["coupling"].verdict == "fails"
+
+
 # ---- bad input ----
 
 

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from echelon._errors import GainError, MissingExtraError
-from echelon._lmi import contraction, monotone, obstacle, rate_of, robust_lqr
+from echelon._lmi import contraction, monotone, rate_of, robust_lqr
+from echelon._modes import obstacle
 from echelon.models import Quadrotor
 
 GRAVITY = 9.81

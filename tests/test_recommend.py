@@ -127,6 +127,14 @@ def test_what_is_told_is_what_the_changed_graph_has():
     )
 
 
+def test_what_does_not_shorten_is_not_recommended():
+    model, graph = ech.Quadrotor.crazyflie(), ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
+    found = shorter(model, graph, ech.synthesize(model, graph, ech.Riccati()))
+    assert not found.edges and found.with_edges == found.now
+    assert found.leaders == () or found.with_leaders < found.now
+    assert "edge" not in found.sentence()
+
+
 def test_more_than_there_is_cannot_be_had():
     graph = ech.Graph.complete(4)
     with pytest.raises(ech.EchelonError, match="from 0 to 2 of the 3 followers"):

@@ -11,9 +11,11 @@ import pytest
 import echelon as ech
 from echelon import cli
 from echelon._check import check
-from echelon._jacobians import has_constant_input_map, jacobians
+from echelon._jacobians import has_constant_input_map, jacobians, weighted_jacobians
+from echelon._linearization import linearize
+from echelon._lmi import robust_lqr
 from echelon._numerics import precision
-from echelon.gains.regional import radius
+from echelon.gains.regional import contracting_region, radius
 
 LINE = ech.Graph.path(4)
 DEG = np.pi / 180.0
@@ -108,13 +110,20 @@ def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
     assert tilt > 0.3 or region is not None
 
 
-def test_nothing_is_promised_on_a_domain_where_the_turning_thrust_expands_the_metric():
-    # With the input map of the trim alone it would seem to contract at 0.5 1/s.
-    model = ech.QuadrotorEuler()
+def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
+    model, low = ech.QuadrotorEuler(), float(LINE.grounded_spectrum()[0])
+    domain = ech.Domain.about(model, TILT)
     gain = ech.synthesize(model, LINE, ech.RobustLQR(TILT))
-    low = float(LINE.grounded_spectrum()[0])
-    assert with_its_own_map(model, gain, ech.Domain.about(model, TILT), low) < 0.0
-    assert gain.certificate.region is None and gain.certificate.stable
+    region = gain.certificate.region
+    assert (region.theorem, region.kind, region.radius) == ("T2", "vertices", None)
+    assert 0.2 <= region.rate <= with_its_own_map(model, gain, domain, low) + 1e-12
+    assert np.linalg.cond(gain.P) <= 500
+    # With the input map of the trim alone a metric would seem to contract at 0.5 1/s.
+    with precision("float64"):
+        _, B = linearize(model)
+        P = robust_lqr(jacobians(model, domain).matrices, B, np.diag(model.weights[0]), gain.R).P
+        pairs = weighted_jacobians(model, domain, gain.R)
+    assert contracting_region(domain, pairs, P, B, gain.R, 2.0, False) is None
 
 
 def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():

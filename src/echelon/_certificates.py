@@ -83,24 +83,33 @@ def certify(
     coupling: float,
     edge: float | None,
     region: Region | None = None,
+    modes: Matrix | None = None,
 ) -> Certificate:
     """Return what linearization at the trim says of the law with gain P, R and coupling c.
 
     With constant g the disagreement splits over the eigenvectors of the grounded Laplacian into
-    modes A - c lambda B R^-1 B'P (theory page, T2).
+    modes A - c lambda B R^-1 B'P (theory page, T2). Where a feed-forward changes these lambda,
+    `modes` holds those that there are.
     """
     eigenvalues = graph.grounded_spectrum()
+    seen = eigenvalues if modes is None else modes
     feedback = linear.B @ np.linalg.solve(R, linear.B.T @ P)
     return Certificate(
         kind="linearization",
         lambda_min=float(eigenvalues[0]),
         lambda_max=float(eigenvalues[-1]),
-        abscissa=_abscissa(linear.A - coupling * eigenvalues[:, None, None] * feedback),
-        modes=len(eigenvalues),
+        abscissa=_abscissa(linear.A - coupling * seen[:, None, None] * feedback),
+        modes=len(seen),
         edge=edge,
         observable=observability_rank(linear.A, linear.B.T @ P),
         region=region,
     )
+
+
+def parent_modes(graph: Graph) -> Matrix:
+    """Return the eigenvalues where parents' inputs are fed forward: the weights (theory, T4)."""
+    led = np.isin(graph.edges, graph.leaders).all(axis=1)
+    return np.unique(graph.weights[~led])
 
 
 def _abscissa(matrices: Matrix) -> float:

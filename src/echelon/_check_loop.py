@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon._build import Parts
-from echelon._certificates import Certificate, Kind, Region, certify
+from echelon._certificates import Certificate, Kind, Region, certify, parent_modes
 from echelon._linearization import Linearization, linearize
 from echelon._margins import ClosedLoop, decays_between
 from echelon._types import Matrix
@@ -63,8 +63,18 @@ class CheckedLoop(NamedTuple):
 
     @property
     def region(self) -> Region | None:
-        """What the gain promises on a domain."""
-        return None if self.gain is None else self.gain.certificate.region
+        """What the gain promises on a domain; nothing where parents' inputs are fed forward.
+
+        The modes are then no longer those of a symmetric matrix, which its proof rests on.
+        """
+        if self.gain is None or self.fed_by_parents:
+            return None
+        return self.gain.certificate.region
+
+    @property
+    def fed_by_parents(self) -> bool:
+        """Whether each follower is told the input of its parent."""
+        return self.parts.follower.asks() == "parent"
 
     @property
     def inner(self) -> Matrix:
@@ -117,22 +127,25 @@ def checked_loop(parts: Parts) -> CheckedLoop:
         R, c, edge = gain.R, gain.coupling, gain.certificate.edge
         A = A if gain.inner is None else A - B @ gain.inner
     linear, P = Linearization(A, B), np.eye(n) if P is None else P
-    certificate = certify(linear, graph, P, R, c, edge)
-    values, where = _looked_at(graph.grounded_spectrum(), len(graph.followers))
+    modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
+    if parts.follower.asks() == "parent":
+        edge = None if edge is None else edge * modes[0]
+        modes = parent_modes(graph)
+        edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"
+    certificate = certify(linear, graph, P, R, c, edge, modes=modes)
+    values, where = _looked_at(modes, count, kind)
     closed = ClosedLoop(A, B, P, R, c, values)
-    every = certificate.stable and (
-        certificate.modes == len(graph.followers) or decays_between(closed)
-    )
+    every = certificate.stable and (certificate.modes == count or decays_between(closed))
     broken = parts.formation.broken_symmetries(model)
     return CheckedLoop(parts, linear, closed, where, every, certificate, broken)
 
 
-def _looked_at(spectrum: Matrix, followers: int) -> tuple[Matrix, str]:
+def _looked_at(spectrum: Matrix, count: int, kind: str) -> tuple[Matrix, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
-    if len(spectrum) < followers:
+    if len(spectrum) < count:
         values = np.geomspace(spectrum[0], spectrum[-1], SHOWN)
         return values, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
     if len(spectrum) <= SHOWN:
-        return spectrum, "all eigenvalues of the graph"
+        return spectrum, f"all {kind} of the graph"
     places = np.linspace(0, len(spectrum) - 1, SHOWN).round().astype(int)
-    return spectrum[places], f"{SHOWN} of {followers} eigenvalues, the extreme ones among them"
+    return spectrum[places], f"{SHOWN} of {count} {kind}, the extreme ones among them"

@@ -44,6 +44,7 @@ def _matched_line(loop: CheckedLoop) -> Line:
     text = "the leader has no input beyond its trim, so there is nothing to tell"
     if loop.moving:
         text = "the leader's input reaches every follower, which the paper's network does not give"
+        text = "each follower is told its parent's input" if loop.fed_by_parents else text
     if not loop.matched:
         text = "followers lag behind a moving leader; `feedforward: relay` removes it"
     return Line("leader's motion is matched", _verdict(loop.matched), "proof", "", text)
@@ -53,7 +54,9 @@ def _decay_line(loop: CheckedLoop) -> Line:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
     certificate, followers = loop.certificate, len(loop.parts.graph.followers)
     text = f"over {certificate.modes} eigenvalues of the graph"
-    if certificate.modes < followers:
+    if loop.fed_by_parents:
+        text = "over the edges' weights, as parents' inputs are fed forward"
+    elif certificate.modes < followers:
         text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
     if not loop.governed:
         text = "the followers' law does not use the disagreement; use `consensus`"
@@ -93,7 +96,8 @@ def margin_lines(loop: CheckedLoop) -> Iterator[Line]:
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
     yield Line("delay margin", "holds", _KIND, number, text)
     yield _scaling_line(loop)
-    yield from _push_lines(loop)
+    # The bound of the network rests on a symmetric matrix, which parents' inputs take away.
+    yield from () if loop.fed_by_parents else _push_lines(loop)
     yield from _string_line(loop)
 
 
@@ -154,8 +158,8 @@ def _string_line(loop: CheckedLoop) -> Iterator[Line]:
     hops = csgraph.dijkstra(graph.adjacency(), indices=graph.leaders[0], unweighted=True)
     depth = int(hops.max())
     number = f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
-    used = loop.parts.follower.asks() == "parent"
-    text = "by so much inputs grow from parent to child; fewer links or more `coupling` help"
+    used = loop.fed_by_parents
+    text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
     if not used:
         text = "what feeding forward the parent's input would amplify; it is not used here"
     yield Line("string gain", "holds" if used else "not needed", _KIND, number, text)

@@ -7,7 +7,7 @@ import numpy as np
 from echelon._check_loop import CheckedLoop, Line
 from echelon._finite_condition import finite_condition, goal_drifts
 from echelon._linearization import linearize
-from echelon._lmi import obstacle
+from echelon._modes import obstacle
 from echelon._numerics import in_words
 from echelon.gains.gain import Gain
 

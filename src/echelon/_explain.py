@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon._archive import gain_of, imperfections
-from echelon._certificates import Certificate
+from echelon._certificates import Certificate, certify, parent_modes
 from echelon._errors import Outcome
-from echelon._linearization import linearize
+from echelon._linearization import Linearization, linearize
 from echelon._lyapunov import Lyapunov, lyapunov
 from echelon._metrics import Metrics, formation_errors
 from echelon._numerics import held_radius, precision
@@ -158,12 +158,10 @@ def _with_parents(result: Result, gain: Gain) -> tuple[float, float | None]:
     with precision("float64"):
         A, B = linearize(result.model)
     A = A if gain.inner is None else A - B @ gain.inner
-    led = np.isin(result.graph.edges, result.graph.leaders).all(axis=1)
-    weights = np.unique(result.graph.weights[~led])
-    pull = gain.coupling * B @ np.linalg.solve(gain.R, B.T @ gain.P)
-    abscissa = float(np.linalg.eigvals(A - weights[:, None, None] * pull).real.max())
-    edge = gain.certificate.edge
-    return abscissa, None if edge is None else edge * gain.certificate.lambda_min / weights[0]
+    edge, weights = gain.certificate.edge, parent_modes(result.graph)
+    linear, given = Linearization(A, B), (gain.P, gain.R, gain.coupling)
+    found = certify(linear, result.graph, *given, edge, modes=weights)
+    return found.abscissa, None if edge is None else edge * found.lambda_min / weights[0]
 
 
 def _region(certificate: Certificate, model: ControlAffine) -> str:

@@ -20,11 +20,10 @@ import scipy.fft
 import scipy.linalg
 
 from echelon._errors import GainError, MissingExtraError, listing
+from echelon._modes import AXIS, axis_modes, obstacle, vertices_of
 from echelon._numerics import in_words, riccati, symmetric_part
 from echelon._types import Matrix
 
-_AXIS = 1e-9  # eigenvalues closer to the imaginary axis, in units of the norm, count as on it
-_DEFECTIVE = 1e-6  # a spectral projector of norm 1e6 would need a P of condition 1e12
 _STRICT = 1e-6  # asked of the solver, in scaled states, so that its own error does not reach zero
 _FIRST, _BATCH = 16, 12  # vertices that the solver sees at first; violated ones added at a time
 
@@ -47,22 +46,6 @@ class Metric(NamedTuple):
     margin: float
 
 
-class Obstacle(NamedTuple):
-    """A mode that no constant metric can keep from growing.
-
-    Attributes:
-        vertex: which matrix has it.
-        eigenvalue: 1/s; on the imaginary axis where the mode is `defective`.
-        defective: whether it is a Jordan block on the axis rather than an unstable mode.
-        states: indices of the states that take part, those that feed a Jordan block included.
-    """
-
-    vertex: int
-    eigenvalue: complex
-    defective: bool
-    states: tuple[int, ...]
-
-
 def rate_of(
     P: Matrix, As: Matrix, B: Matrix | None = None, R: Matrix | None = None, strength: float = 0.0
 ) -> float:
@@ -80,31 +63,7 @@ def rate_of(
     """
     if not (np.isfinite(P).all() and np.allclose(P, P.T, 1e-9, 0.0) and _condition(P) < np.inf):
         raise GainError("`P` must be a symmetric positive definite matrix of finite numbers.")
-    inverse = np.linalg.inv(np.linalg.cholesky(P))
-    X = inverse @ _drift(P, _vertices(As), B, R, strength) @ inverse.T
-    return -0.5 * float(np.linalg.eigvalsh(0.5 * (X + X.swapaxes(-1, -2))).max())
-
-
-def obstacle(As: Matrix) -> Obstacle | None:
-    """Return the first mode that forbids every P > 0 with P A_k + A_k'P <= 0, or None.
-
-    It is an eigenvalue in the open right half plane, or one on the imaginary axis with a Jordan
-    block: where A - s I and its square differ in rank, that is where the left and the right null
-    space of A - s I do not pair. Singular values decide, relative to the norm of the balanced A.
-    """
-    for vertex, A in enumerate(_vertices(As)):
-        A = scipy.linalg.matrix_balance(A, permute=False)[0]
-        for s, right, left in _axis_modes(A):
-            _, cosines, turn = np.linalg.svd(left.conj().T @ right)
-            lost = right @ turn[cosines < _DEFECTIVE].conj().T
-            if lost.size:
-                feeding = np.linalg.lstsq(A - s * np.eye(len(A)), lost)[0]
-                return Obstacle(vertex, s, True, _support(np.hstack([lost, feeding])))
-        values, vectors = np.linalg.eig(A)
-        worst = int(np.argmax(np.real(values)))
-        if values[worst].real > _AXIS * np.linalg.norm(A, 2):
-            return Obstacle(vertex, complex(values[worst]), False, _support(vectors[:, [worst]]))
-    return None
+    return _rate(P, vertices_of(As), None if B is None else _weighted(B, R), strength)
 
 
 def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None = None) -> Metric:
@@ -121,7 +80,7 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
         GainError: a mode forbids it, and is named, or no such P was found.
         MissingExtraError: cvxpy or clarabel is not installed.
     """
-    As, found = _vertices(As), obstacle(As)
+    As, found = vertices_of(As), obstacle(As)
     if found is not None:
         along = listing(names[i] if names else f"x{i + 1}" for i in found.states)
         kind = "a Jordan block on the imaginary axis" if found.defective else "an unstable mode"
@@ -146,11 +105,11 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
             f"vertex of {len(As)} expands, though none alone forbids it; shrink the domain, add "
             "damping by an inner loop, or take a method with feedback."
         )
-    found = _measured(P / np.linalg.eigvalsh(P)[0], As, None, None, 0.0)
+    found = _measured(P / np.linalg.eigvalsh(P)[0], As, None, 0.0)
     return found._replace(rate=max(0.0, found.rate))
 
 
-def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Metric:
+def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix, W: Matrix | None = None) -> Metric:
     """Return the P of least trace with A_k'P + P A_k + Q - P B R^-1 B'P <= 0 for all k.
 
     The rate is measured at rho = 1, the edge c = 1/(2 lambda_min); the inequality makes it half the
@@ -161,42 +120,47 @@ def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Metric:
         B: (n, m), or (K, n, m) where the input map differs from vertex to vertex.
         Q: (n, n) symmetric positive semidefinite.
         R: (m, m) symmetric positive definite.
+        W: (K, n, n), what stands for B R^-1 B' at each vertex of a hull of pairs, where that hull
+            goes beyond products; B then only scales the states.
 
     Raises:
         GainError: no such P was found.
         MissingExtraError: cvxpy or clarabel is not installed.
     """
-    cp, As = _cvxpy(), _vertices(As)
-    M = _scale(As, B, Q, R)
+    cp, As = _cvxpy(), vertices_of(As)
+    M, S = _scale(As, B, Q, R), _weighted(B, R) if W is None else W
     basis, one = _basis(len(M)), np.eye(len(M))
     values, vectors = np.linalg.eigh(Q)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T @ np.linalg.inv(M)
-    w, y = cp.Variable(len(basis)), cp.Variable(len(basis))
+    v, y = cp.Variable(len(basis)), cp.Variable(len(basis))
     Z = cp.Variable(one.shape, symmetric=True)
-    # Y stands for W Q W once for all vertices, which keeps each vertex's own cone at n x n.
-    W, Y = _matrix(cp, basis, w), _matrix(cp, basis, y)
-    cones = [cp.bmat([[Z, one], [one, W]]) >> 0, cp.bmat([[Y, W @ root.T], [root @ W, one]]) >> 0]
-    gaps = _gaps(cp, _stack(As, B, R, M, basis), cp.hstack([w, y, [-1.0]]))
+    # Y stands for V Q V, V = P^-1, once for all vertices: each vertex's own cone stays n x n.
+    V, Y = _matrix(cp, basis, v), _matrix(cp, basis, y)
+    cones = [cp.bmat([[Z, one], [one, V]]) >> 0, cp.bmat([[Y, V @ root.T], [root @ V, one]]) >> 0]
+    gaps = _gaps(cp, _stack(As, S, M, basis), cp.hstack([v, y, [-1.0]]))
     solved = _least(cp, cp.trace(M @ M.T @ Z), cones, gaps)
-    P = _unscaled(W.value, M) if solved else None
-    if P is None or rate_of(P, As, B, R, 1.0) <= 0.0:
+    P = _unscaled(V.value, M) if solved else None
+    if P is None or _rate(P, As, S, 1.0) <= 0.0:
         raise GainError(
             f"no constant metric was found that one gain contracts on all of the {len(As)} "
             "matrices; shrink the domain, or weigh the input less in `R`."
         )
-    return _measured(P, As, B, R, 1.0)
+    return _measured(P, As, S, 1.0)
 
 
-def contraction(As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4) -> Metric:
+def contraction(
+    As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4, W: Matrix | None = None
+) -> Metric:
     """Return the metric of least strength rho that contracts every vertex at `rate`, with R = I.
 
-    W = P^-1 solves: min rho, A_k W + W A_k' - rho B B' + 2 rate W < 0, I <= W <= condition_max I.
+    V = P^-1 solves: min rho, A_k V + V A_k' - rho B B' + 2 rate V < 0, I <= V <= condition_max I.
 
     Args:
         As: (K, n, n) vertices, 1/s.
         B: (n, m), or (K, n, m) where the input map differs from vertex to vertex.
         rate: 1/s, not negative.
         condition_max: largest condition number of P.
+        W: (K, n, n) in place of B B', as in `robust_lqr`.
 
     Raises:
         GainError: `rate` is out of range, or no such P was found.
@@ -204,35 +168,28 @@ def contraction(As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4) 
     """
     if not 0.0 <= rate < np.inf:
         raise GainError(f"`rate` is {rate}, and must be finite and not negative.")
-    cp, As = _cvxpy(), _vertices(As)
+    cp, As = _cvxpy(), vertices_of(As)
     n = As.shape[-1]
     M = _scale(As + rate * np.eye(n), B, np.eye(n), np.eye(B.shape[-1]))
-    # The solver's error grows with W: it is asked for a little more than eigenvalues must show.
+    S = _weighted(B, None) if W is None else W
+    # The solver's error grows with V: it is asked for a little more than eigenvalues must show.
     more = _STRICT * np.linalg.norm(M @ As @ np.linalg.inv(M), axis=(1, 2)).max()
     shifted, basis, unit = As + (rate + more) * np.eye(n), _basis(n), M @ M.T
-    w, rho = cp.Variable(len(basis)), cp.Variable(nonneg=True)
-    W = _matrix(cp, basis, w)
-    gaps = _gaps(cp, _stack(shifted, B, None, M, basis[:0]), cp.hstack([w, -rho]))
-    solved = _least(cp, rho, [W - unit >> 0, 0.999 * condition_max * unit - W >> 0], gaps)
-    P = _unscaled(W.value, M) if solved else None
+    v, rho = cp.Variable(len(basis)), cp.Variable(nonneg=True)
+    V = _matrix(cp, basis, v)
+    gaps = _gaps(cp, _stack(shifted, S, M, basis[:0]), cp.hstack([v, -rho]))
+    solved = _least(cp, rho, [V - unit >> 0, 0.999 * condition_max * unit - V >> 0], gaps)
+    P = _unscaled(V.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
     tried = max(0.0, float(rho.value)) * np.array([1.0, 1.0001, 1.01, 1.1]) if solved else []
-    enough = [float(s) for s in tried if P is not None and rate_of(P, As, B, None, s) >= rate]
+    enough = [float(s) for s in tried if P is not None and _rate(P, As, S, float(s)) >= rate]
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(
             f"no constant metric of condition number up to {condition_max:g} was found that one "
             f"gain contracts at {rate:g} 1/s on all of the {len(As)} matrices; ask a smaller "
             "`rate` or shrink the domain."
         )
-    return _measured(P, As, B, None, enough[0])
-
-
-def _vertices(As: Matrix) -> Matrix:
-    """Return As as a float64 array (K, n, n), K >= 1, of finite numbers."""
-    As = np.asarray(As, dtype=np.float64)
-    if As.ndim != 3 or As.shape[1] != As.shape[2] or not As.size or not np.isfinite(As).all():
-        raise GainError(f"`As` has shape {As.shape}, and must be (K, n, n) finite numbers, K >= 1.")
-    return As
+    return _measured(P, As, S, enough[0])
 
 
 def _weighted(B: Matrix, R: Matrix | None) -> Matrix:
@@ -240,12 +197,18 @@ def _weighted(B: Matrix, R: Matrix | None) -> Matrix:
     return B @ (B.swapaxes(-1, -2) if R is None else np.linalg.solve(R, B.swapaxes(-1, -2)))
 
 
-def _drift(P: Matrix, As: Matrix, B: Matrix | None, R: Matrix | None, strength: float) -> Matrix:
-    """Return P A_k + A_k'P - strength P B R^-1 B'P, (K, n, n), symmetric."""
+def _drift(P: Matrix, As: Matrix, S: Matrix | None, strength: float) -> Matrix:
+    """Return P A_k + A_k'P - strength P S P, (K, n, n), symmetric."""
     pull = P @ As
-    if B is not None and strength:
-        pull = pull - 0.5 * strength * (P @ _weighted(B, R) @ P)
+    if S is not None and strength:
+        pull = pull - 0.5 * strength * (P @ S @ P)
     return pull + pull.swapaxes(-1, -2)
+
+
+def _rate(P: Matrix, As: Matrix, S: Matrix | None, strength: float) -> float:
+    inverse = np.linalg.inv(np.linalg.cholesky(P))
+    X = inverse @ _drift(P, As, S, strength) @ inverse.T
+    return -0.5 * float(np.linalg.eigvalsh(0.5 * (X + X.swapaxes(-1, -2))).max())
 
 
 def _condition(P: Matrix) -> float:
@@ -257,37 +220,13 @@ def _condition(P: Matrix) -> float:
 def _falls(P: Matrix, As: Matrix) -> bool:
     """Return whether no P^-1 (P A_k + A_k'P) has an eigenvalue above what rounding makes."""
     inverse = np.abs(np.linalg.inv(np.linalg.cholesky(P)))
-    size = inverse @ _drift(np.abs(P), np.abs(As), None, None, 0.0) @ inverse.T
+    size = inverse @ _drift(np.abs(P), np.abs(As), None, 0.0) @ inverse.T
     return -2.0 * rate_of(P, As) <= 4.0 * len(P) * np.finfo(float).eps * size.sum(-1).max()
 
 
-def _measured(P: Matrix, As: Matrix, B: Matrix | None, R: Matrix | None, rho: float) -> Metric:
-    margin = float(np.linalg.eigvalsh(_drift(P, As, B, R, rho)).max())
-    return Metric(P, rho, rate_of(P, As, B, R, rho), _condition(P), margin)
-
-
-def _axis_modes(A: Matrix) -> list[tuple[complex, Matrix, Matrix]]:
-    """Return each s = i w, w >= 0, on the imaginary axis with right and left null space of A - s I.
-
-    Rounding scatters the eigenvalues of a Jordan block and leaves their mean in place, so means of
-    clusters are tried, the widest first.
-    """
-    size, values = float(np.linalg.norm(A, 2)) or 1.0, np.linalg.eigvals(A)
-    points: dict[float, complex] = {}
-    for radius in size * 10.0 ** np.arange(-1.0, -11.0, -1.0):
-        close = np.abs(values[:, None] - values) <= radius
-        for mean in (close @ values) / close.sum(1):
-            if abs(mean.real) <= _AXIS * size and mean.imag >= -_AXIS * size:
-                points.setdefault(round(float(mean.imag / size), 10), 1j * mean.imag)
-    cuts = [(s, *np.linalg.svd(A - s * np.eye(len(A)))) for s in points.values()]
-    modes = [(s, v[w <= _AXIS * size].conj().T, u[:, w <= _AXIS * size]) for s, u, w, v in cuts]
-    return [mode for mode in modes if mode[1].size]
-
-
-def _support(vectors: Matrix) -> tuple[int, ...]:
-    """Return the rows that hold a tenth or more of a column's largest entry."""
-    sizes = np.abs(vectors)
-    return tuple(np.flatnonzero((sizes >= 0.1 * sizes.max(0)).any(1)).tolist())
+def _measured(P: Matrix, As: Matrix, S: Matrix | None, rho: float) -> Metric:
+    margin = float(np.linalg.eigvalsh(_drift(P, As, S, rho)).max())
+    return Metric(P, rho, _rate(P, As, S, rho), _condition(P), margin)
 
 
 def _cvxpy() -> Any:
@@ -355,9 +294,9 @@ def _gaps(cp: Any, slopes: list[Matrix], x: Any) -> list[Any]:
     return [_matrix(cp, U @ X @ U.T, x) for U, X in zip(turns, slopes, strict=True)]
 
 
-def _stack(As: Matrix, B: Matrix, R: Matrix | None, M: Matrix, more: Matrix) -> list[Matrix]:
-    """Return A_k E_i + E_i A_k', then `more`, then B R^-1 B', in the states M x, for each k."""
-    S = np.broadcast_to(M @ _weighted(B, R) @ M.T, As.shape)
+def _stack(As: Matrix, S: Matrix, M: Matrix, more: Matrix) -> list[Matrix]:
+    """Return A_k E_i + E_i A_k', then `more`, then S_k, in the states M x, for each k."""
+    S = np.broadcast_to(M @ S @ M.T, As.shape)
     pulls = _pull(M @ As @ np.linalg.inv(M), _basis(len(M)))
     return [np.concatenate([X, more, s[None]]) for X, s in zip(pulls, S, strict=True)]
 
@@ -387,14 +326,14 @@ def _face(A: Matrix) -> tuple[Matrix, list[Matrix]]:
     equations = [
         np.moveaxis(X @ part, 0, -1).reshape(-1, len(basis))
         for X, a in zip(_pull(A, basis), A, strict=True)
-        for _, v, _ in _axis_modes(a.T)
+        for _, v, _ in axis_modes(a.T)
         for part in (np.real(v), np.imag(v))
     ]
     if not equations:
         return basis, list(_pull(A, basis))
     _, size, right = np.linalg.svd(np.linalg.qr(np.vstack(equations), mode="r"))
-    allowed = right[int((size > _AXIS).sum()) :]
+    allowed = right[int((size > AXIS).sum()) :]
     basis = np.tensordot(allowed, basis, 1) if len(allowed) else basis  # then there is no point
     cuts = [np.linalg.svd(np.hstack([*X]), full_matrices=False)[:2] for X in _pull(A, basis)]
-    frees = [left[:, size > _AXIS] for left, size in cuts]
+    frees = [left[:, size > AXIS] for left, size in cuts]
     return basis, [F.T @ X @ F for F, X in zip(frees, _pull(A, basis), strict=True) if F.size]

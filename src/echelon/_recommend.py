@@ -65,19 +65,21 @@ def shorter(
 ) -> Shorter:
     """Return the time constant of a gain's slowest disagreement, and what would shorten it.
 
-    The coupling stays as it is, which suits an inner loop: any graph keeps it stable.
+    The coupling stays as it is, which suits an inner loop: any graph keeps it stable. What does not
+    shorten it after all, since the slowest mode need not be that of lambda_min, is left out.
 
     Raises:
         GraphError: there are not so many followers to make leaders, or pairs to link.
     """
     led, linked = recommend_leaders(graph, leaders), recommend_edges(graph, edges)
-    return Shorter(
-        time_constant(model, graph, gain),
-        led,
-        time_constant(model, _with_leaders(graph, led), gain),
-        linked,
-        time_constant(model, _with_edges(graph, linked), gain),
-    )
+    now = time_constant(model, graph, gain)
+    with_leaders = time_constant(model, _with_leaders(graph, led), gain)
+    with_edges = time_constant(model, _with_edges(graph, linked), gain)
+    if not with_leaders < now:
+        led, with_leaders = (), now
+    if not with_edges < now:
+        linked, with_edges = (), now
+    return Shorter(now, led, with_leaders, linked, with_edges)
 
 
 def time_constant(model: ControlAffine, graph: Graph, gain: Gain) -> float:

@@ -7,11 +7,10 @@ import numpy as np
 from echelon._certificates import certify
 from echelon._domain import Bound, Domain
 from echelon._graph import Graph
-from echelon._jacobians import jacobians
 from echelon._linearization import linearize
 from echelon._lmi import contraction
 from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.gains.regional import contracting_region, the_domain
+from echelon.gains.regional import contracting_region, pairs_on, the_domain
 from echelon.models.model import ControlAffine
 
 
@@ -40,16 +39,15 @@ class Contraction(Method):
             MissingExtraError: the solver is not installed.
         """
         domain, linear = the_domain(model, self.domain), linearize(model)
-        found = jacobians(model, domain)
-        metric = contraction(found.matrices, linear.B, self.rate)
+        R = np.eye(len(model.input_names))
+        found, As, W = pairs_on(model, domain, R)
+        metric = contraction(As, linear.B, self.rate, W=W)
         low = float(graph.grounded_spectrum()[0])
         edge = metric.rho / (2.0 * low)
         # A drift that contracts by itself needs no feedback, and takes any.
         coupling = (edge or 1.0) if self.coupling is None else float(self.coupling)
         check_coupling(coupling)
-        R, strength = np.eye(len(model.input_names)), 2.0 * coupling * low
-        region = contracting_region(
-            model, domain, found, metric.P, linear.B, R, strength, self.exact
-        )
+        strength = 2.0 * coupling * low
+        region = contracting_region(domain, found, metric.P, linear.B, R, strength, self.exact)
         certificate = certify(linear, graph, metric.P, R, coupling, edge=edge, region=region)
         return Gain(metric.P, R, coupling, "contraction", certificate)

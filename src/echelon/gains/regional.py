@@ -9,7 +9,7 @@ from echelon._certificates import Region
 from echelon._domain import Bound, Domain
 from echelon._errors import GainError
 from echelon._exact import prove_contraction
-from echelon._jacobians import Jacobians, has_constant_input_map, weighted_jacobians
+from echelon._jacobians import Jacobians, has_constant_input_map, jacobians, weighted_jacobians
 from echelon._lmi import rate_of
 from echelon._types import Matrix
 from echelon.models.model import ControlAffine
@@ -32,8 +32,25 @@ def the_domain(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None
     return bounds if isinstance(bounds, Domain) else Domain.about(model, bounds)
 
 
+def pairs_on(
+    model: ControlAffine, domain: Domain, R: Matrix
+) -> tuple[Jacobians, Matrix, Matrix | None]:
+    """Return what a gain must contract: the Jacobians on a domain, and (A_k, W_k).
+
+    W_k = g S R^-1 (g S)' is enclosed with A_k where g varies, and None where it is constant.
+
+    Raises:
+        GainError: they depend on a state that the domain leaves unbounded.
+    """
+    if has_constant_input_map(model, domain):
+        found = jacobians(model, domain)
+        return found, found.matrices, None
+    found = weighted_jacobians(model, domain, R)
+    A, W = np.split(found.matrices, 2, axis=2)
+    return found, A, W
+
+
 def contracting_region(
-    model: ControlAffine,
     domain: Domain,
     found: Jacobians,
     P: Matrix,
@@ -45,9 +62,8 @@ def contracting_region(
     """Return what a metric promises on a domain; None where it contracts at no rate there.
 
     Args:
-        model: the agents.
         domain: where.
-        found: the Jacobians on the domain.
+        found: the Jacobians on the domain, beside their W where g varies.
         P: metric (n, n).
         B: input matrix at the trim (n, m).
         R: weight of the normalized input (m, m).
@@ -55,8 +71,7 @@ def contracting_region(
         exact: whether to prove it in rational arithmetic (seconds), where a hull is at hand and g
             is constant.
     """
-    constant = has_constant_input_map(model, domain)
-    found = found if constant else weighted_jacobians(model, domain, R)
+    constant = found.matrices.shape[2] == len(P)
     rate = (
         rate_of(P, found.matrices, B, R, strength)
         if constant

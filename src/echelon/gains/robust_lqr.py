@@ -5,16 +5,17 @@ from collections.abc import Mapping
 from echelon._certificates import certify
 from echelon._domain import Bound, Domain
 from echelon._graph import Graph
-from echelon._jacobians import jacobians
 from echelon._linearization import linearize
 from echelon._lmi import robust_lqr
 from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
-from echelon.gains.regional import contracting_region, the_domain
+from echelon.gains.regional import contracting_region, pairs_on, the_domain
 from echelon.models.model import ControlAffine
 
 
 class RobustLQR(Method):
     """P with A'P + P A - P B R^-1 B'P + Q <= 0 for every Jacobian A of a domain, least trace.
+
+    Where g varies, each A has its own B R^-1 B' (theory page, T2).
 
     Args:
         domain: half-widths, or (lower, upper), by state, group or normalized input.
@@ -43,12 +44,12 @@ class RobustLQR(Method):
         check_definite("Q", Q)
         check_definite("R", R)
         domain, linear = the_domain(model, self.domain), linearize(model)
-        found = jacobians(model, domain)
-        P = robust_lqr(found.matrices, linear.B, Q, R).P
+        found, As, W = pairs_on(model, domain, R)
+        P = robust_lqr(As, linear.B, Q, R, W).P
         low = float(graph.grounded_spectrum()[0])
         coupling = 1.0 / low if self.coupling is None else float(self.coupling)
         check_coupling(coupling)
         strength = 2.0 * coupling * low
-        region = contracting_region(model, domain, found, P, linear.B, R, strength, self.exact)
+        region = contracting_region(domain, found, P, linear.B, R, strength, self.exact)
         certificate = certify(linear, graph, P, R, coupling, edge=0.5 / low, region=region)
         return Gain(P, R, coupling, "robust-lqr", certificate)
