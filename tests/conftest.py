@@ -1,8 +1,10 @@
 """What every test runs under: no silent broadcasting, checked shapes, repeatable examples."""
 
 import os
+import sys
 
 import jax
+import pytest
 from beartype import beartype
 from hypothesis import settings
 from jaxtyping import install_import_hook
@@ -22,3 +24,18 @@ install_import_hook("echelon", "conftest.check_shapes")
 # The first example compiles, so none has a deadline.
 settings.register_profile("echelon", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("echelon")
+
+
+@pytest.fixture
+def echelon(monkeypatch, capsys):
+    """Run the command line in this process: exit code, standard output, standard error."""
+    from echelon import cli
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            cli.main()
+        told = capsys.readouterr()
+        return left.value.code or 0, told.out, told.err
+
+    return call

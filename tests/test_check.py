@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon import cli
 from echelon._check import check
 from echelon._check_region import killing_residual
 from echelon._finite_condition import pair_values
@@ -403,17 +402,9 @@ def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
 
 
 @pytest.fixture
-def echelon(monkeypatch, capsys, tmp_path):
+def echelon(echelon, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            cli.main()
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return call
+    return echelon
 
 
 def written(gain, model="planar-quadrotor"):

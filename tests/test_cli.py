@@ -12,7 +12,6 @@ import pytest
 import xarray as xr
 
 import echelon as ech
-from echelon import cli
 
 QUICK = ["--set", "simulation.horizon=0.5", "--no-figures"]
 PENDULUM = """
@@ -51,20 +50,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "pendulum.py").write_text(PENDULUM)
     (tmp_path / "mine.yaml").write_text(SCENARIO)
     return tmp_path
-
-
-@pytest.fixture
-def echelon(monkeypatch, capsys):
-    """Run the command line in this process: exit code, standard output, standard error."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            cli.main()
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return call
 
 
 def test_run_writes_what_it_says(here, echelon):

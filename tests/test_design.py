@@ -1,7 +1,6 @@
 """`design`: the table of methods, what it recommends, and pictures that claim no more than seen."""
 
 import json
-import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon import cli
 from echelon._basin import converged, observed_radius, side_of, slice_of, trial
 from echelon._design import because, designs, recommended, with_gain
 from echelon._design_plots import chosen_slice, save_design_figures
@@ -41,18 +39,10 @@ simulation: {horizon: 1.0, dt: 0.01}
 
 
 @pytest.fixture
-def echelon(monkeypatch, capsys, tmp_path):
+def echelon(echelon, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.yaml").write_text(SCENARIO)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            cli.main()
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return call
+    return echelon
 
 
 def parts_of(scenario):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon import cli
 from echelon._check import check
 from echelon._jacobians import has_constant_input_map, jacobians, weighted_jacobians
 from echelon._linearization import linearize
@@ -385,17 +384,9 @@ def test_a_weak_input_weakens_the_trim_thrust_too():
 
 
 @pytest.fixture
-def echelon(monkeypatch, capsys, tmp_path):
+def echelon(echelon, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            cli.main()
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return call
+    return echelon
 
 
 def test_check_exits_by_what_is_promised(echelon):

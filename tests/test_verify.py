@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon import _registry, cli
+from echelon import _registry
 from echelon._build import resolve
 from echelon._verify_algebra import grounded_rows, observable, rightmost, spectrum
 from echelon._verify_exact import first_unproved, inverse, is_positive_definite, product, rows_of
@@ -209,18 +209,6 @@ def test_whatever_stands_in_a_file_it_is_refused_in_words(files, data, tmp_path_
         refused = any(each.verdict == "refused" for each in found.findings)
         assert found.holds is not refused
         assert found.sentence.startswith("Refused" if refused else "Verified")
-
-
-@pytest.fixture
-def echelon(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            cli.main()
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return call
 
 
 def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_path):
