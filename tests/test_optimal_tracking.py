@@ -146,3 +146,13 @@ def test_a_gain_of_another_model_is_refused():
     small = ech.synthesize(ech.DoubleIntegrator(1), TREE, ech.Riccati())
     with pytest.raises(LawError, match="`OptimalTracking` has P"):
         ech.OptimalTracking(LOOP, gain=small).prepared(QUADROTOR, TREE)
+
+
+def test_a_reference_that_is_too_fast_is_warned_of_with_the_ratio():
+    # At rate w the lemniscate's acceleration grows as w^2, past the thrust to weight of 2.3.
+    fast = ech.OptimalTracking(ech.Lemniscate(rate=3.0), horizon=2.0)
+    (told,) = fast.warnings(QUADROTOR, TREE)
+    assert "is too fast for `Quadrotor`" in told and "times what the actuators leave" in told
+    assert LAW.warnings(QUADROTOR, TREE) == ()
+    free = ech.OptimalTracking(ech.Lemniscate(rate=3.0), horizon=2.0, limits=False)
+    assert free.warnings(QUADROTOR, TREE) == ()

@@ -90,7 +90,8 @@ def simulate(
         warnings = _checked(model, plant)
         leader, follower = leader.prepared(model, graph), follower.prepared(model, graph)
         loop = assemble(model, graph, formation, leader, follower, settings, plant, disturbance)
-        told = follower.warnings(model, graph) + formation_warnings(model, formation)
+        told = leader.warnings(model, graph) + follower.warnings(model, graph)
+        told += formation_warnings(model, formation)
         states = initial_states(model, graph, formation, leader, initial, start_error or {}, seed)
     with _numerics.precision(precision):
         record = _run(loop, states, _frame_counts(settings), progress)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon._demand import reference_warnings
 from echelon._errors import LawError
 from echelon._formation_plan import plan_tracking
 from echelon._graph import Graph
@@ -100,6 +101,10 @@ class OptimalTracking(Law):
             (unit, plan.states, plan.inputs),
             is_leaf=lambda leaf: leaf is None,
         )
+
+    def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+        """Tell how much faster the reference is than the actuators allow, where limits hold."""
+        return reference_warnings(model, self.reference, self.horizon) if self.limits else ()
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_p, u_p) at time t, or the reference's (x_r, u_r) after the plan.
