@@ -22,9 +22,9 @@ import numpy as np
 import planted_faults
 
 import echelon as ech
-from echelon._metrics import formation_errors
-from echelon._provenance import versions
-from echelon._recommend import time_constant
+from echelon.core.provenance import versions
+from echelon.network.topology import time_constant
+from echelon.results.metrics import formation_errors
 
 HERE = Path(__file__).resolve().parent
 PAGE = HERE.parent / "docs" / "certificates.md"
@@ -129,7 +129,7 @@ def crazyflie() -> list[Row]:
     begun = time.process_time()
     again = [timed(lambda: ech.synthesize(model, LINE, ech.Riccati()))[1] for _ in range(50)]
     busy = (time.process_time() - begun) / len(again)
-    command, before = [sys.executable, "-m", "echelon.cli", "check", "paper"], _children()
+    command, before = [sys.executable, "-m", "echelon", "check", "paper"], _children()
     done, seconds = timed(lambda: subprocess.run(command, capture_output=True, text=True))
     assert done.returncode == 0, done.stderr
     return [

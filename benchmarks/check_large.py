@@ -31,7 +31,7 @@ def main() -> None:
     file = Path("check_large.yaml")
     file.write_text(SCENARIO.format(agents=agents, radius=radius), "utf-8")
     began = time.perf_counter()
-    command = [sys.executable, "-m", "echelon.cli", "check", str(file)]
+    command = [sys.executable, "-m", "echelon", "check", str(file)]
     done = subprocess.run(command, capture_output=True, text=True)
     seconds = time.perf_counter() - began
     used = resource.getrusage(resource.RUSAGE_CHILDREN)

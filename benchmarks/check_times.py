@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 
 import echelon as ech
-from echelon._disturbance_bounds import disturbance_ellipsoid, disturbance_l1
-from echelon._linearization import linearize
-from echelon._margins import ClosedLoop, delay_margin, gain_margin, string_gain
-from echelon._numerics import precision
+from echelon.certificates.bounds import disturbance_ellipsoid, disturbance_l1
+from echelon.certificates.margins import ClosedLoop, delay_margin, gain_margin, string_gain
+from echelon.core.numerics import precision
+from echelon.models.linearization import linearize
 
 GRAPH = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 
@@ -36,7 +36,7 @@ def milliseconds(act: Callable[[], object], times: int = 10) -> float:
 def command(*arguments: str) -> str:
     """Return what a command line takes, of wall and of processor time."""
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    call = [sys.executable, "-m", "echelon.cli", *arguments]
+    call = [sys.executable, "-m", "echelon", *arguments]
     subprocess.run(call, capture_output=True, text=True, check=False)
     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

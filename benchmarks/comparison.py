@@ -10,9 +10,9 @@ import optimization
 from pages import write_part
 
 import echelon as ech
-from echelon._compare import Row
-from echelon._comparison_report import verdict
-from echelon._paper import PRINTED
+from echelon.reports.comparison import verdict
+from echelon.reports.printed import PRINTED
+from echelon.studies.compare import Row
 
 CONDITIONS = {
     "as in the paper: no wind, no error of mass": [],

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import echelon as ech
-from echelon._errors import PlanError
-from echelon._horizon import Course, Horizon
-from echelon._posing import normalized, physical, reference_targets
+from echelon.core.errors import PlanError
+from echelon.optimal.horizon import Course, Horizon
+from echelon.optimal.objectives import normalized, physical, reference_targets
 
 MODEL = ech.Quadrotor.crazyflie()
 STEPS, DT = 50, 0.02

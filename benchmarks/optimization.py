@@ -11,9 +11,8 @@ import casadi as ca
 import numpy as np
 
 import echelon as ech
-from echelon._formation_plan import plan_tracking
-from echelon._optimal_control import OptimalControl
-from echelon._posing import (
+from echelon.optimal.formation_plan import plan_tracking
+from echelon.optimal.objectives import (
     Grid,
     Planning,
     Targets,
@@ -24,6 +23,7 @@ from echelon._posing import (
     shifted_targets,
     tracking,
 )
+from echelon.optimal.problem import OptimalControl
 
 MODEL, LOOP = ech.Quadrotor.crazyflie(), ech.Lemniscate()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])

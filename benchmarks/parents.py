@@ -9,10 +9,10 @@ import argparse
 import numpy as np
 
 import echelon as ech
-from echelon._linearization import linearize
-from echelon._margins import ClosedLoop, string_gain
-from echelon._metrics import formation_errors
-from echelon._numerics import precision
+from echelon.certificates.margins import ClosedLoop, string_gain
+from echelon.core.numerics import precision
+from echelon.models.linearization import linearize
+from echelon.results.metrics import formation_errors
 
 MODEL = ech.Quadrotor()
 LAWS = [("relay", None), ("parent", 1.0), ("parent", 2.5), ("parent", 10.0)]

@@ -11,8 +11,8 @@ import numpy as np
 from pages import write_part
 
 import echelon as ech
-from echelon._metrics import formation_errors
-from echelon._provenance import versions
+from echelon.core.provenance import versions
+from echelon.results.metrics import formation_errors
 
 OFFSETS = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
 

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import echelon as ech
-from echelon._drawing import COLOURS, EDGE, LEADER, logarithmic, style
-from echelon._metrics import formation_errors
+from echelon.plots.style import COLOURS, EDGE, LEADER, logarithmic, style
+from echelon.results.metrics import formation_errors
 
 TARGET = Path(__file__).parent / "assets" / "paper.gif"
 SETTINGS = ("simulation.horizon=10", "simulation.dt=0.0025", "simulation.store_every=25")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon._hull import model_jacobian
-from echelon._numerics import precision
+from echelon.core.numerics import precision
+from echelon.enclosure.hull import model_jacobian
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from attack import attack, promise_of, study  # noqa: E402

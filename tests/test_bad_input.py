@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from echelon._errors import (
+from echelon.core.errors import (
     EchelonError,
     FormationError,
     GainError,
@@ -14,11 +14,9 @@ from echelon._errors import (
     ReferenceError,
     SimulationError,
 )
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Agreement, Consensus, Passive, Tracking
 from echelon.models import (
     DoubleIntegrator,
@@ -32,6 +30,8 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 from echelon.references import Circle, FigureEight, Hover, Lemniscate, Line, Waypoints
 
 NAN, INF = float("nan"), float("inf")

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from test_models import FAMILY, FLAT
 
 import echelon as ech
-from echelon._casadi import casadi_function
-from echelon._errors import MissingExtraError, ModelError
-from echelon._numerics import precision
+from echelon.core.errors import MissingExtraError, ModelError
+from echelon.core.numerics import precision
+from echelon.optimal.casadi import casadi_function
 
 
 def both(function, lengths):

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon._check import check
-from echelon._check_region import killing_residual
-from echelon._finite_condition import pair_values
-from echelon._numerics import longest_step, precision
+from echelon.core.numerics import longest_step, precision
+from echelon.promises.certified_set import killing_residual
+from echelon.studies.check import check
+from echelon.studies.finite_condition import pair_values
 
 PATH = ech.Graph.path(4)
 LOW, _, HIGH = PATH.grounded_spectrum()

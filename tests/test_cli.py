@@ -123,7 +123,7 @@ def test_a_users_own_agent_runs_as_from_python(here, echelon):
 
 
 def _metrics(result):
-    from echelon._metrics import metrics
+    from echelon.results.metrics import metrics
 
     return metrics(result)
 
@@ -241,7 +241,7 @@ def test_interrupting_keeps_what_was_computed(here):
     (here / "mine.yaml").write_text(
         SCENARIO.replace("horizon: 1.0, dt: 0.01", "horizon: 1.0e+6, dt: 0.01, store_every: 1000")
     )
-    command = [sys.executable, "-m", "echelon.cli", "run", "mine.yaml", "--no-figures"]
+    command = [sys.executable, "-m", "echelon", "run", "mine.yaml", "--no-figures"]
     process = subprocess.Popen(
         [*command, "--out", "o"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -10,8 +10,8 @@ import pytest
 
 import echelon as ech
 from echelon import cli
-from echelon._compare import LABELS, Comparison
-from echelon._comparison_report import comparison_report, verdict
+from echelon.reports.comparison import comparison_report, verdict
+from echelon.studies.compare import LABELS, Comparison
 
 LAWS = ("literal", "riccati-relay", "riccati", "inner-loop")
 SHORT = ["simulation.horizon=1.0"]
@@ -133,7 +133,7 @@ def test_two_scenarios_get_a_folder_each(tmp_path, capsys):
 def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path, arguments, told):
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
-        [sys.executable, "-m", "echelon.cli", *arguments],
+        [sys.executable, "-m", "echelon", *arguments],
         capture_output=True,
         text=True,
         cwd=tmp_path,

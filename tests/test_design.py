@@ -8,9 +8,9 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon._basin import converged, observed_radius, side_of, slice_of, trial
-from echelon._design import because, designs, recommended, with_gain
-from echelon._design_plots import chosen_slice, save_design_figures
+from echelon.plots.design import chosen_slice, save_design_figures
+from echelon.studies.basin import converged, observed_radius, side_of, slice_of, trial
+from echelon.studies.design import because, designs, recommended, with_gain
 
 PATH = ech.Graph.path(4)
 

@@ -9,20 +9,10 @@ import scipy.linalg
 import scipy.stats
 from oracles import laplacian
 
-from echelon import _registry
-from echelon._archive import dataset, summary
-from echelon._build import build, resolve
-from echelon._disturbance import Disturbance
-from echelon._errors import EchelonError, Outcome, ScenarioError
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._lyapunov import lyapunov
-from echelon._plant import differences, varied
-from echelon._report import report
-from echelon._scenario import load_scenario, scenario_from_mapping
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core.errors import EchelonError, Outcome, ScenarioError
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Consensus, Passive, Tracking
 from echelon.models import (
     DoubleIntegrator,
@@ -32,7 +22,17 @@ from echelon.models import (
     PrintedQuadrotor,
     Quadrotor,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 from echelon.references import Hover
+from echelon.reports.run import report
+from echelon.results.dataset import dataset, summary
+from echelon.results.lyapunov import lyapunov
+from echelon.scenario import registry
+from echelon.scenario.build import build, resolve
+from echelon.scenario.scenario import load_scenario, scenario_from_mapping
+from echelon.world.disturbance import Disturbance
+from echelon.world.plant import differences, varied
 
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 CART = DoubleIntegrator(2)
@@ -328,7 +328,7 @@ def test_a_law_made_for_another_class_of_the_same_states_flies_it():
 
 BUNDLED = {
     name: resolve(entry)
-    for name, entry in _registry.MODELS.items()
+    for name, entry in registry.MODELS.items()
     if name not in ("linear", "quadrotor-printed")
 } | {"linear": lambda: Linear(-np.eye(2), np.eye(2)), "quadrotor-printed": PrintedQuadrotor}
 
@@ -392,7 +392,7 @@ def imperfect(**more):
 
 
 def test_a_scenario_says_plant_and_disturbance_and_every_report_repeats_them():
-    from echelon._build import run
+    from echelon.scenario.build import run
 
     result = run(imperfect())
     assert result.outcome is Outcome.COMPLETED

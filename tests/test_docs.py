@@ -14,7 +14,7 @@ import pytest
 
 import echelon as ech
 from echelon import cli
-from echelon._paper import PRINTED
+from echelon.reports.printed import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from test_hull import NO_INPUTS, euler_rate_quadrotor, quadrotor_box
 
-from echelon._errors import GainError
-from echelon._exact import negative_definite, prove_contraction, rationalize
-from echelon._hull import jacobian_hull
+from echelon.certificates.exact import negative_definite, prove_contraction, rationalize
+from echelon.core.errors import GainError
+from echelon.enclosure.hull import jacobian_hull
 
 # --- definiteness -----------------------------------------------------------------------------
 

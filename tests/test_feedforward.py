@@ -7,15 +7,10 @@ import pytest
 import scipy.linalg
 from oracles import laplacian
 
-from echelon._build import build
-from echelon._errors import EchelonError, ScenarioError
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._report import report
-from echelon._scenario import load_scenario
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core.errors import EchelonError, ScenarioError
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Consensus, Law, Passive, Tracking
 from echelon.models import (
     DoubleIntegrator,
@@ -25,7 +20,12 @@ from echelon.models import (
     SingleIntegrator,
     UnicyclePoint,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Lemniscate
+from echelon.reports.run import report
+from echelon.scenario.build import build
+from echelon.scenario.scenario import load_scenario
 
 # Numbered so that no parent has the number before its child's, and on several levels of unequal
 # width.

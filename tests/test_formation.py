@@ -9,9 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, disagreements
 
-from echelon import _numerics
-from echelon._formation import Formation
-from echelon._graph import Graph
+from echelon.core import numerics
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -23,6 +21,8 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 
 DRAWN = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
@@ -65,7 +65,7 @@ def test_displacements_point_from_an_agent_s_goal_to_its_neighbour_s(seed):
     # z = e + d is the disagreement of the states minus their offsets.
     x = rng.normal(size=(4, 2))
     e = np.array([sum(A[i, j] * (x[i] - x[j]) for j in range(4)) for i in range(4)])
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         z = np.asarray(graph.disagreement(jnp.asarray(x - xi)))
     assert z == pytest.approx(e + d, abs=1e-12)
     assert z == pytest.approx(disagreements(A, x, xi), abs=1e-12)
@@ -74,7 +74,7 @@ def test_displacements_point_from_an_agent_s_goal_to_its_neighbour_s(seed):
 def test_agents_on_their_goals_have_no_disagreement_wherever_the_leader_is():
     formation = Formation.from_offsets(QUAD, TREE, DRAWN)
     there = np.tile(np.linspace(0.5, 3.0, 12), (4, 1)) + formation.offsets
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         z = np.asarray(TREE.disagreement(jnp.asarray(there - formation.offsets)))
     assert np.abs(z).max() <= 4e-15
 

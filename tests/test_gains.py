@@ -7,12 +7,10 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon import _numerics
-from echelon._errors import GainError
-from echelon._graph import Graph
-from echelon._linearization import linearize
-from echelon._synthesize import synthesize
+from echelon.core import numerics
+from echelon.core.errors import GainError
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -26,6 +24,8 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.models.linearization import linearize
+from echelon.network.graph import Graph
 
 LINE = Graph.path(4)
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
@@ -47,7 +47,7 @@ def near_trim(model):
     S = np.array(model.input_scale)
 
     def moved(dx, dv):
-        with _numerics.precision("float64"):
+        with numerics.precision("float64"):
             return np.asarray(model.velocity(jnp.asarray(x + dx), jnp.asarray(u + S @ dv)))
 
     def slope(size, place):
@@ -73,7 +73,7 @@ def modes(gain, A, B, eigenvalue, coupling=None):
 
 @pytest.mark.parametrize("model", STABILIZABLE, ids=lambda m: type(m).__name__)
 def test_linearization_is_the_slope_of_the_velocity_at_the_trim(model):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         A, B = linearize(model)
     wanted = near_trim(model)
     assert A == pytest.approx(wanted[0], abs=1e-8) and B == pytest.approx(wanted[1], abs=1e-8)
@@ -81,7 +81,7 @@ def test_linearization_is_the_slope_of_the_velocity_at_the_trim(model):
 
 
 def test_a_hovering_quadrotor_is_four_chains_of_integrators():
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         A, B = linearize(QUAD)
     wanted = np.zeros((12, 12))
     wanted[0:3, 3:6] = wanted[6:9, 9:12] = np.eye(3)
@@ -243,7 +243,7 @@ def test_rank_of_observability_agrees_with_counting_modes_that_never_enter_the_i
     C = B.T
     stacked = np.vstack([C @ np.linalg.matrix_power(A, k) for k in range(12)])
     assert np.linalg.matrix_rank(stacked) == 4
-    seen = _numerics.observability_rank(A, B.T @ synthesize(QUAD, TREE, Riccati()).P)
+    seen = numerics.observability_rank(A, B.T @ synthesize(QUAD, TREE, Riccati()).P)
     assert seen == 12
 
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, connected, laplacian
 
-from echelon import _numerics
-from echelon._graph import Graph
+from echelon.core import numerics
+from echelon.network.graph import Graph
 
 
 def graphs(most=9, weighted=True):
@@ -22,7 +22,7 @@ def dense(graph):
 
 
 def disagreement(graph, y):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         return np.asarray(graph.disagreement(jnp.asarray(y)))
 
 

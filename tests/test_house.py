@@ -252,7 +252,9 @@ def test_importing_echelon_loads_nothing_heavy():
 
 
 def test_the_texts_and_the_schema_load_no_jax():
-    assert "jax" not in loaded_after("import echelon._registry, echelon._scenario, echelon._yaml")
+    assert "jax" not in loaded_after(
+        "import echelon.scenario.registry, echelon.scenario.scenario, echelon.scenario.yaml"
+    )
 
 
 def test_using_the_library_loads_no_optional_part():
@@ -261,7 +263,7 @@ def test_using_the_library_loads_no_optional_part():
 
 
 def test_help_loads_no_jax():
-    code = "import sys\nfrom echelon.cli import main\nsys.argv = ['echelon', '--help']\n"
+    code = "import sys\nfrom echelon.cli.app import main\nsys.argv = ['echelon', '--help']\n"
     call = "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code"
     assert not {"jax", "equinox", "scipy", "matplotlib", "xarray"} & loaded_after(code + call)
 

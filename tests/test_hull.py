@@ -13,13 +13,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from echelon import _hull_algebra
-from echelon._errors import GainError
-from echelon._hull import Box, jacobian_hull, model_jacobian
-from echelon._hull_algebra import Atoms, constant, corner_values
-from echelon._hull_curves import power_points, wave_points
-from echelon._hull_enclosure import ELEMENTARY, Interval, circle, pi, point, wave
-from echelon._numerics import precision
+from echelon.core.errors import GainError
+from echelon.core.numerics import precision
+from echelon.enclosure.curves import power_points, wave_points
+from echelon.enclosure.hull import Box, jacobian_hull, model_jacobian
+from echelon.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
+from echelon.enclosure.polynomial import Atoms, constant, corner_values
 from echelon.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol
 
 TILT, YAW = math.radians(30.0), math.radians(20.0)

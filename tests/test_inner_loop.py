@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon._linearization import linearize
-from echelon._metrics import formation_errors
-from echelon._numerics import precision
+from echelon.core.numerics import precision
 from echelon.gains.inner_loop import symmetric_states
+from echelon.models.linearization import linearize
+from echelon.results.metrics import formation_errors
 
 AGENTS = {
     "double integrator": ech.DoubleIntegrator(2),

@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map
 
-from echelon import _numerics
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core import numerics
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Agreement, Consensus, LocalView, Passive, Tracking
 from echelon.models import (
     DoubleIntegrator,
@@ -23,6 +21,8 @@ from echelon.models import (
     SingleIntegrator,
     UnicyclePoint,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Lemniscate, Line
 
 LINE = Graph.path(4)
@@ -37,7 +37,7 @@ def spd(rng, size):
 def input_of(law, model, *, x, z=None, offset=None, said=None, t=0.0):
     """The input of one agent that knows what is given, in float64; zeros for what is not."""
     n, m = len(model.state_names), len(model.input_names)
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         known = LocalView(
             t=jnp.asarray(t),
             x=jnp.asarray(x),
@@ -51,7 +51,7 @@ def input_of(law, model, *, x, z=None, offset=None, said=None, t=0.0):
 
 
 def prepared(law, model, graph=LINE):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         return law.prepared(model, graph)
 
 
@@ -98,7 +98,7 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
     blocks = np.kron(np.eye(len(rows)), np.linalg.inv(R)) @ G.T @ np.kron(np.eye(len(rows)), P)
     v = (-c * blocks @ (e + d)).reshape(-1, m)
 
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         z = np.asarray(graph.disagreement(jnp.asarray(x - xi)))
     for k, wanted in zip(rows, v, strict=True):
         u = input_of(law, model, x=x[k], z=z[k], offset=xi[k])
@@ -182,7 +182,7 @@ def test_the_leader_tracks_with_unit_coupling_and_reacts_with_the_followers_gain
 
 def test_a_leader_on_its_reference_flies_the_feedforward_alone():
     law = prepared(Tracking(Lemniscate()), QUAD)
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         x, u = map(np.asarray, law.target(QUAD, jnp.asarray(2.0)))
     assert input_of(law, QUAD, x=x, t=2.0) == pytest.approx(u, abs=1e-15)
     assert u[0] > 0.0
@@ -197,7 +197,7 @@ def test_a_tracking_gain_is_the_model_s_riccati_gain_unless_given():
 def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():
     model = UnicyclePoint(ahead=0.4)
     law = prepared(Tracking(Circle(), synthesize(model, LINE, Given())), model)
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         x = np.asarray(law.target(model, jnp.asarray(0.3))[0]) + [0.1, 0.2, 0.3]
     turned = x + [0.0, 0.0, 4.0 * np.pi]
     once = input_of(law, model, x=x, t=0.3)
@@ -205,7 +205,7 @@ def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():
 
 
 def test_a_leader_starts_where_its_law_says():
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         assert np.asarray(Passive().start(QUAD)).tolist() == [0.0] * 12
         start = np.asarray(Tracking(Line((1, 2, 3), (0.5, 0, 0))).start(QUAD))
         rows = np.asarray(Tracking(Line()).reference_states(QUAD, jnp.array([0.0, 2.0])))
@@ -228,7 +228,7 @@ def test_an_agent_hears_its_neighbours_and_nobody_else(parts, seed):
     moved = int(rng.integers(graph.agents))
     there = y.copy()
     there[moved] += 1.0
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         before, after = (np.asarray(graph.disagreement(jnp.asarray(v))) for v in (y, there))
     changed = {k for k in range(graph.agents) if not np.array_equal(before[k], after[k])}
     assert changed == {moved, *graph.neighbours(moved)}

@@ -12,9 +12,9 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon._errors import GainError, MissingExtraError
-from echelon._lmi import contraction, monotone, rate_of, robust_lqr
-from echelon._modes import obstacle
+from echelon.certificates.lmi import contraction, monotone, rate_of, robust_lqr
+from echelon.certificates.modes import obstacle
+from echelon.core.errors import GainError, MissingExtraError
 from echelon.models import Quadrotor
 
 GRAVITY = 9.81

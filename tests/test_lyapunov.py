@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon._lyapunov import lyapunov
+from echelon.results.lyapunov import lyapunov
 
 DRAG = 0.7
 

@@ -7,9 +7,8 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon._disturbance_bounds import disturbance_ellipsoid, disturbance_l1, exponential
-from echelon._errors import GainError
-from echelon._margins import (
+from echelon.certificates.bounds import disturbance_ellipsoid, disturbance_l1, exponential
+from echelon.certificates.margins import (
     ClosedLoop,
     decays_between,
     delay_margin,
@@ -19,6 +18,7 @@ from echelon._margins import (
     modes,
     string_gain,
 )
+from echelon.core.errors import GainError
 from echelon.models import Quadrotor
 
 ONE = np.eye(1)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon._errors import Outcome
-from echelon._metrics import formation_errors, metrics, output_errors
-from echelon._result import Result, Settings
+from echelon.core.errors import Outcome
+from echelon.engine.result import Result, Settings
+from echelon.results.metrics import formation_errors, metrics, output_errors
 
 
 def made_up(

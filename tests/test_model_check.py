@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 from test_models import FAMILY
 
-from echelon import _numerics
-from echelon._errors import EchelonError, ModelError
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core import numerics
+from echelon.core.errors import EchelonError, ModelError
+from echelon.engine.simulate import simulate
 from echelon.gains import Given
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Passive
 from echelon.models import ControlAffine, SingleIntegrator
 from echelon.models.check import check_model
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 
 NAN = float("nan")
 
@@ -38,7 +38,7 @@ def spoiled(**changes):
 
 
 def checked(model):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         return check_model(model)
 
 

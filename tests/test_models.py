@@ -12,8 +12,8 @@ from oracles import newton_euler, quadrotor_input_map, rotation
 from scipy.integrate import solve_ivp
 
 import echelon.models
-from echelon import _numerics, _registry
-from echelon._numerics import precision
+from echelon.core import numerics
+from echelon.core.numerics import precision
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -31,6 +31,7 @@ from echelon.models import (
 )
 from echelon.models.quadrotor_euler import computed_torque
 from echelon.models.rigid_body import euler_rates
+from echelon.scenario import registry
 
 rng = np.random.default_rng(7)
 A, B, C = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=(1, 3))
@@ -62,7 +63,7 @@ every_flat_model = pytest.mark.parametrize("model", FLAT.values(), ids=FLAT)
 
 def numpy(function, *arguments):
     """The value of a function of echelon in float64, as NumPy."""
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         return np.asarray(function(*map(jnp.asarray, arguments)))
 
 
@@ -136,7 +137,7 @@ def test_the_family_of_these_tests_is_the_whole_family():
     members = {getattr(echelon.models, name) for name in echelon.models.__all__}
     assert {type(model) for model in FAMILY.values()} == members - {ControlAffine}
     registered = set()
-    for entry in _registry.MODELS.values():
+    for entry in registry.MODELS.values():
         module, _, name = entry.target.partition(":")
         registered.add(getattr(importlib.import_module(module), name))
     assert registered == members - {ControlAffine}
@@ -223,7 +224,7 @@ def test_normalized_inputs_are_deviations_from_the_trim(model):
 @pytest.mark.parametrize("name", ["float64", "float32"])
 def test_agents_compute_in_the_precision_that_is_asked_for(model, name):
     x, u = state_and_input(model)
-    with _numerics.precision(name):
+    with numerics.precision(name):
         a, b = jnp.asarray(x), jnp.asarray(u)
         values = [model.drift(a), model.input_map(a), model.output(a), model.limit(b)]
         values += [model.physical(b), model.normalized_input_map(a), model.difference(a, a)]
@@ -295,7 +296,7 @@ def test_the_flat_state_moves_as_its_flat_input_makes_it(model, seed):
     def fly(t):
         return model.flat(path.derivatives(t, model.flat_order))
 
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         (x, u), (rate, _) = jax.jvp(fly, (jnp.asarray(0.3),), (jnp.asarray(1.0),))
         assert np.asarray(rate) == pytest.approx(
             np.asarray(model.velocity(x, u)), rel=1e-10, abs=1e-10
@@ -305,7 +306,7 @@ def test_the_flat_state_moves_as_its_flat_input_makes_it(model, seed):
 @every_flat_model
 def test_the_flat_state_contains_the_path_and_its_speed(model):
     path = Smooth(len(model.flat_outputs), 5)
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         rows = path.derivatives(jnp.asarray(0.3), model.flat_order)
         x = np.asarray(model.flat(rows)[0])
     ahead = getattr(model, "ahead", 0.0)
@@ -322,7 +323,7 @@ def test_standing_still_is_flown_by_the_trim(name):
     model = FAMILY[name]
     rows = np.zeros((model.flat_order + 1, len(model.flat_outputs)))
     rows[0] = 1.0 + np.arange(len(model.flat_outputs))
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         x, u = map(np.asarray, model.flat(jnp.asarray(rows)))
     wanted = np.zeros(len(x))
     wanted[[model.state_names.index(name) for name in model.flat_outputs]] = rows[0]
@@ -355,7 +356,7 @@ def test_a_tumbling_body_keeps_energy_and_angular_momentum_in_free_fall():
     model = FAMILY["big"]
     x0, _ = state_and_input(model, 3)
     x0[9:12] = [0.9, 2.0, -1.1]
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         fall = jax.jit(lambda x: model.velocity(x, jnp.zeros(4)))
         solved = solve_ivp(
             lambda t, x: np.asarray(fall(jnp.asarray(x))),

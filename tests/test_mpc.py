@@ -8,8 +8,8 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon._errors import MissingExtraError, PlanError
-from echelon._horizon import Answer, Horizon
+from echelon.core.errors import MissingExtraError, PlanError
+from echelon.optimal.horizon import Answer, Horizon
 
 CART = ech.DoubleIntegrator(1)
 PAIR = ech.Graph.path(2)

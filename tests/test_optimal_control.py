@@ -11,9 +11,9 @@ import pytest
 from scipy.integrate import solve_bvp
 
 import echelon as ech
-from echelon._demand import demand, flat_inputs, reference_warnings
-from echelon._errors import MissingExtraError, ModelError, PlanError
-from echelon._numerics import precision
+from echelon.core.errors import MissingExtraError, ModelError, PlanError
+from echelon.core.numerics import precision
+from echelon.references.flatness import demand, flat_inputs, reference_warnings
 
 CART = ech.DoubleIntegrator(1)
 PUSH = ech.Limits(((1.0,),), (-1.0,), (1.0,))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon._errors import LawError, PlanError
-from echelon._numerics import precision
+from echelon.core.errors import LawError, PlanError
+from echelon.core.numerics import precision
 
 QUADROTOR = ech.Quadrotor.crazyflie()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2)], leaders=[0])

@@ -7,14 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import laplacian, skew
 
-from echelon import _numerics
-from echelon._errors import ModelError, Outcome
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._linearization import linearize
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core import numerics
+from echelon.core.errors import ModelError, Outcome
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Agreement, Consensus, Passive, Tracking
 from echelon.models import (
     DoubleIntegrator,
@@ -24,6 +21,9 @@ from echelon.models import (
     Quadrotor,
     SingleIntegrator,
 )
+from echelon.models.linearization import linearize
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 from echelon.references import Lemniscate, Line
 
 seeds = st.integers(0, 10**6)
@@ -39,7 +39,7 @@ def spd(rng, size):
 
 
 def at_trim(model):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         return linearize(model)
 
 
@@ -85,7 +85,7 @@ def test_the_errors_of_table_2_are_multiples_of_the_rounding_of_one():
 
 
 def test_with_gravity_the_origin_is_no_equilibrium_without_its_trim():
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         f = np.asarray(QUAD.drift(jnp.zeros(12)))
         with_trim = np.asarray(QUAD.normalized_drift(jnp.zeros(12)))
         printed = np.asarray(PrintedQuadrotor().drift(jnp.zeros(12)))
@@ -95,7 +95,7 @@ def test_with_gravity_the_origin_is_no_equilibrium_without_its_trim():
 def test_the_printed_quadrotor_cannot_choose_where_its_thrust_points():
     rng = np.random.default_rng(0)
     model = PrintedQuadrotor()
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         pushes = [
             np.asarray(model.input_map(jnp.asarray(rng.uniform(-1, 1, 12))))[3:6, 0]
             for _ in range(3)
@@ -107,7 +107,7 @@ def test_the_printed_rate_equation_is_euler_s():
     model, rng = PrintedQuadrotor(), np.random.default_rng(1)
     omega, J = rng.normal(size=3), np.array(model.inertia)
     x = np.concatenate([np.zeros(9), omega])
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         spin = np.asarray(model.drift(jnp.asarray(x)))[9:]
     assert spin == pytest.approx(-(skew(omega) @ (J * omega)) / J)
 
@@ -214,7 +214,7 @@ def test_with_drag_such_a_p_exists():
 def test_position_offsets_satisfy_assumption_5_for_any_p_and_so_say_nothing(seed):
     rng = np.random.default_rng(seed)
     formation = Formation.from_offsets(QUAD, TREE, OFFSETS)
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         f = np.array([np.asarray(QUAD.drift(jnp.asarray(xi))) for xi in formation.offsets])
     P = spd(rng, 12)
     for i in range(4):
@@ -417,7 +417,7 @@ def test_the_printed_law_sees_four_of_the_twelve_states():
 
 
 def test_the_printed_law_in_physical_inputs_is_stiffer_than_any_step_can_follow():
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         g = np.asarray(QUAD.input_map(jnp.zeros(12)))
     poles = np.linalg.eigvals(-np.kron(TREE.grounded_laplacian().toarray(), g @ g.T))
     assert -poles.real.min() > 1e10

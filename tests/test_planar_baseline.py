@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import echelon as ech
-from echelon._errors import ModelError, PlanError
-from echelon._numerics import precision
-from echelon._planar_baseline import LinearPlanarQuadrotor, PlanarBaseline
+from echelon.core.errors import ModelError, PlanError
+from echelon.core.numerics import precision
+from echelon.optimal.planar_baseline import LinearPlanarQuadrotor, PlanarBaseline
 
 MASS, INERTIA, GRAVITY = 0.028, 16.571710e-6, 9.81
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])

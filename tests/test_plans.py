@@ -10,10 +10,10 @@ import pytest
 from oracles import GRAVITY
 
 import echelon as ech
-from echelon._errors import MissingExtraError, PlanError
-from echelon._formation_plan import plan_formation
-from echelon._numerics import precision
-from echelon._posing import Grid, grid
+from echelon.core.errors import MissingExtraError, PlanError
+from echelon.core.numerics import precision
+from echelon.optimal.formation_plan import plan_formation
+from echelon.optimal.objectives import Grid, grid
 
 QUADROTOR = ech.Quadrotor.crazyflie()
 LOOP = ech.Lemniscate()

@@ -10,15 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from echelon._drawing import COLOURS, thin
-from echelon._errors import Outcome
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._lyapunov import lyapunov
-from echelon._plots import figures, save_figures
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core.errors import Outcome
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Consensus, Passive, Tracking
 from echelon.models import (
     PlanarQuadrotor,
@@ -27,7 +22,12 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
+from echelon.plots.run import figures, save_figures
+from echelon.plots.style import COLOURS, thin
 from echelon.references import Circle, Lemniscate
+from echelon.results.lyapunov import lyapunov
 
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 POINT = Given([1.0, 1.0, 0.1], coupling=2.0)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon._recommend import _Large, shorter, time_constant
+from echelon.network.topology import _Large, shorter, time_constant
 
 
 def slowest(edges, leaders, agents):

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon.references
-from echelon import _numerics, _registry
+from echelon.core import numerics
 from echelon.references import (
     Circle,
     FigureEight,
@@ -18,6 +18,7 @@ from echelon.references import (
     Reference,
     Waypoints,
 )
+from echelon.scenario import registry
 
 ALL = ("x", "y", "z", "yaw")
 TIMES = [0.0, 1.0, 2.5, 4.0]
@@ -35,7 +36,7 @@ every_reference = pytest.mark.parametrize("reference", FAMILY.values(), ids=FAMI
 
 def at(reference, t, order=None, coordinates=ALL):
     """(x, y, z, yaw) at t in float64, or the stack of it and its derivatives."""
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         t = jnp.asarray(float(t))
         value = reference(t) if order is None else reference.derivatives(t, order, coordinates)
         return np.asarray(value)
@@ -44,7 +45,7 @@ def at(reference, t, order=None, coordinates=ALL):
 def test_the_family_of_these_tests_is_the_whole_family():
     members = {getattr(echelon.references, name) for name in echelon.references.__all__}
     assert {type(reference) for reference in FAMILY.values()} == members - {Reference}
-    assert set(FAMILY) == set(_registry.REFERENCES)
+    assert set(FAMILY) == set(registry.REFERENCES)
 
 
 @every_reference
@@ -70,14 +71,14 @@ def test_coordinates_are_picked_by_name_in_the_order_of_the_names(reference):
 @every_reference
 @pytest.mark.parametrize("name", ["float64", "float32"])
 def test_references_compute_in_the_precision_of_the_time(reference, name):
-    with _numerics.precision(name):
+    with numerics.precision(name):
         value = reference(jnp.asarray(0.3))
         assert value.shape == (4,) and str(value.dtype) == name
 
 
 @every_reference
 def test_yaw_is_constant(reference):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         yaws = np.asarray(jax.vmap(reference)(jnp.linspace(0.0, 9.0, 7)))[:, 3]
     assert yaws == pytest.approx(np.full(7, reference.yaw), abs=0.0)
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon._check import check
-from echelon._jacobians import has_constant_input_map, jacobians, weighted_jacobians
-from echelon._linearization import linearize
-from echelon._lmi import robust_lqr
-from echelon._numerics import precision
-from echelon.gains.regional import contracting_region, radius
+from echelon.certificates.jacobians import has_constant_input_map, jacobians, weighted_jacobians
+from echelon.certificates.lmi import robust_lqr
+from echelon.certificates.region import contracting_region, radius
+from echelon.core.numerics import precision
+from echelon.models.linearization import linearize
+from echelon.studies.check import check
 
 LINE = ech.Graph.path(4)
 DEG = np.pi / 180.0
@@ -29,8 +29,8 @@ def sentence(act):
 
 def rate_seen(model, gain, domain, low, count=500):
     """The slowest contraction at random states of a domain, by eigenvalues of the inequality."""
-    from echelon._hull import model_jacobian
-    from echelon._linearization import linearize
+    from echelon.enclosure.hull import model_jacobian
+    from echelon.models.linearization import linearize
 
     states, inputs = domain.sample(count, seed=7)
     with precision("float64"):
@@ -79,7 +79,7 @@ def test_only_a_constant_input_map_gives_the_nonlocal_theorem():
 
 def with_its_own_map(model, gain, domain, low):
     """The slowest contraction at states and corners of a domain, each with the g that it has."""
-    from echelon._hull import model_jacobian
+    from echelon.enclosure.hull import model_jacobian
 
     random = np.random.default_rng(8)
     points = [np.concatenate(both) for both in zip(*map(domain.sample, (300, 300)), strict=True)]

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from oracles import angle_rates, prioritized_thrusts, rotation, skew
 from scipy.spatial.transform import Rotation
 
-from echelon import _numerics
-from echelon._errors import ModelError
+from echelon.core import numerics
+from echelon.core.errors import ModelError
 from echelon.models import PlanarQuadrotor, Quadrotor
 from echelon.models.rigid_body import (
     body_rates,
@@ -31,7 +31,7 @@ moment = st.floats(1e-6, 1.0)
 
 def in_float64(function, *arguments):
     """The value of a function of echelon at NumPy arguments, as NumPy."""
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         return np.asarray(function(*[jnp.asarray(a) if np.ndim(a) else a for a in arguments]))
 
 
@@ -60,7 +60,7 @@ def test_euler_rates_agree_with_the_axes_of_the_three_turns(zeta, omega):
 
 @given(angles, rates)
 def test_body_rates_undo_euler_rates(zeta, omega):
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         back = body_rates(jnp.asarray(zeta), euler_rates(jnp.asarray(zeta), jnp.asarray(omega)))
         assert np.asarray(back) == pytest.approx(omega, rel=1e-12, abs=1e-12)
 
@@ -79,7 +79,7 @@ def test_tilt_towards_has_a_finite_slope_when_upright():
     def along(direction):
         return tilt_towards(direction, jnp.zeros(()))
 
-    with _numerics.precision("float64"):
+    with numerics.precision("float64"):
         slope = np.asarray(jax.jacfwd(along)(jnp.array([0.0, 0.0, 2.0])))
     # A push b across a lift of 2 tilts by b / 2: forward pitches, to the left rolls left.
     assert slope == pytest.approx(np.array([[0, -0.5, 0], [0.5, 0, 0], [0, 0, 0]]), abs=1e-15)

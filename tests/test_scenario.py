@@ -10,20 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import echelon._scenario
-from echelon import _registry
-from echelon._errors import ScenarioError, listing
-from echelon._registry import FORMATIONS, GRAPHS, METHODS, MODELS
-from echelon._scenario import (
+import echelon.scenario.scenario
+from echelon.core.errors import ScenarioError, listing
+from echelon.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
+from echelon.scenario.scenario import (
     Fault,
     bundled_scenarios,
     json_schema,
     load_scenario,
     scenario_from_mapping,
 )
-from echelon._yaml import read_yaml
+from echelon.scenario.yaml import read_yaml
 
-FOLDER = Path(echelon._scenario.__file__).parent
+FOLDER = Path(echelon.scenario.scenario.__file__).parent
 
 # Each line of this file stands alone, so that a test replaces one and knows its number.
 LINES = {
@@ -216,7 +215,7 @@ def test_further_sections_that_are_accepted(load, override):
 
 
 def test_the_tables_of_choices_cover_the_registry():
-    checks = echelon._scenario_checks
+    checks = echelon.scenario.checks
     assert set(checks._GRAPH_KEYS) == {"edges", *GRAPHS}
     assert set(checks._FORMATION_KEYS) == {"offsets", *FORMATIONS}
     assert set(checks._GAIN_KEYS) == {*METHODS, "file"}
@@ -426,7 +425,7 @@ def test_a_scenario_cannot_be_changed(load):
 @pytest.mark.parametrize("name", bundled_scenarios())
 def test_bundled_scenarios_load_and_introduce_themselves(name):
     scenario = load_scenario(name)
-    assert scenario.name == name and scenario.folder == FOLDER / "scenarios"
+    assert scenario.name == name and scenario.folder == FOLDER / "bundled"
     assert scenario.place("name").startswith(f"{name}.yaml:")
     summary = bundled_scenarios()[name]
     assert summary.endswith(".") and len(summary) < 100

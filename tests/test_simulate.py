@@ -19,13 +19,11 @@ from oracles import (
 )
 from scipy.integrate import solve_ivp
 
-from echelon import _simulate
-from echelon._errors import EchelonError, Outcome
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.core.errors import EchelonError, Outcome
+from echelon.engine import simulate as _simulate
+from echelon.engine.simulate import simulate
 from echelon.gains import Given, Riccati
+from echelon.gains.synthesize import synthesize
 from echelon.laws import Agreement, Consensus, Passive, Tracking
 from echelon.models import (
     ControlAffine,
@@ -37,6 +35,8 @@ from echelon.models import (
     SingleIntegrator,
     VanDerPol,
 )
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Line
 
 QUAD = Quadrotor()
@@ -545,10 +545,10 @@ FRESH = """
 import json, sys
 import jax
 import numpy as np
-from echelon._formation import Formation
-from echelon._graph import Graph
-from echelon._simulate import simulate
-from echelon._synthesize import synthesize
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
+from echelon.engine.simulate import simulate
+from echelon.gains.synthesize import synthesize
 from echelon.gains import Riccati
 from echelon.laws import Consensus, Tracking
 from echelon.models import DoubleIntegrator

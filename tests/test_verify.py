@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon import _registry
-from echelon._build import resolve
-from echelon._verify_algebra import grounded_rows, observable, rightmost, spectrum
-from echelon._verify_exact import first_unproved, inverse, is_positive_definite, product, rows_of
-from echelon._verify_file import SavedGraph
-from echelon._verify_model import farthest_outside
+from echelon.scenario import registry
+from echelon.scenario.build import resolve
+from echelon.verifier.algebra import grounded_rows, observable, rightmost, spectrum
+from echelon.verifier.equations import farthest_outside
+from echelon.verifier.exact import first_unproved, inverse, is_positive_definite, product, rows_of
+from echelon.verifier.file import SavedGraph
 
 ROOT = Path(__file__).resolve().parents[1]
 LINE = ech.Graph.path(4)
@@ -44,7 +44,7 @@ FAST = [
 
 
 def test_the_checker_loads_nothing_of_the_synthesis():
-    code = "import sys, echelon._verify, echelon.models\nprint(*sys.modules)"
+    code = "import sys, echelon.verifier.verify, echelon.models\nprint(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     ours = {name.removeprefix("echelon.") for name in done.stdout.split() if "echelon." in name}
     assert "_verify_exact" in ours
@@ -86,9 +86,9 @@ def test_no_perturbation_of_the_metric_passes(files, seed, size, tmp_path_factor
     assert STUDY.refused(told, tmp_path_factory.getbasetemp(), None)
 
 
-@pytest.mark.parametrize("name", _registry.MODELS)
+@pytest.mark.parametrize("name", registry.MODELS)
 def test_every_bundled_model_is_made_again_from_its_file(name, tmp_path):
-    kind = resolve(_registry.MODELS[name])
+    kind = resolve(registry.MODELS[name])
     model = kind([[0.0, 1.0], [-2.0, 0.1]], [[0.0], [3.0]]) if name == "linear" else kind()
     ech.save_gain(ech.synthesize(model, LINE, ech.Given()), model, LINE, tmp_path / "gain.json")
     found = ech.verify(tmp_path / "gain.json")

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon._errors import ScenarioError
-from echelon._yaml import (
+from echelon.core.errors import ScenarioError
+from echelon.scenario.yaml import (
     apply_overrides,
     dump_yaml,
     inline_yaml,

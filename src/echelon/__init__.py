@@ -9,34 +9,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from echelon._archive import dataset, save_dataset, summary
-    from echelon._build import build, run
-    from echelon._compare import Comparison, compare
-    from echelon._comparison_report import comparison_report
-    from echelon._disturbance import Disturbance
-    from echelon._domain import Domain
-    from echelon._errors import EchelonError, Outcome
-    from echelon._finite_condition import FiniteCondition, finite_condition
-    from echelon._formation import Formation
-    from echelon._gain_file import load_gain, save_gain
-    from echelon._graph import Graph
-    from echelon._horizon import MPC
-    from echelon._lyapunov import Lyapunov, lyapunov
-    from echelon._metrics import Metrics, metrics
-    from echelon._optimal_control import Constraint, OptimalControl
-    from echelon._optimization import simulate_mpc, simulate_plans
-    from echelon._plan import Plan, Planner, plan
-    from echelon._planar_baseline import PlanarBaseline
-    from echelon._plots import figures, save_figures
-    from echelon._posing import Planning
-    from echelon._recommend import Shorter, recommend_edges, recommend_leaders, shorter
-    from echelon._report import report
-    from echelon._result import Result
-    from echelon._scenario import Scenario, bundled_scenarios, load_scenario, scenario_from_mapping
-    from echelon._simulate import simulate
-    from echelon._solver_figures import SolverFigures, solver_figures
-    from echelon._synthesize import synthesize
-    from echelon._verify import Verified, verify
+    from echelon.certificates.domain import Domain
+    from echelon.core.errors import EchelonError, Outcome
+    from echelon.engine.result import Result
+    from echelon.engine.simulate import simulate
+    from echelon.engine.work import SolverFigures, solver_figures
     from echelon.gains import (
         Certificate,
         Contraction,
@@ -49,6 +26,8 @@ if TYPE_CHECKING:
         Riccati,
         RobustLQR,
     )
+    from echelon.gains.file import load_gain, save_gain
+    from echelon.gains.synthesize import synthesize
     from echelon.laws import (
         Agreement,
         Consensus,
@@ -74,6 +53,16 @@ if TYPE_CHECKING:
         VanDerPol,
     )
     from echelon.models.model import Limits
+    from echelon.network.formation import Formation
+    from echelon.network.graph import Graph
+    from echelon.network.topology import Shorter, recommend_edges, recommend_leaders, shorter
+    from echelon.optimal.horizon import MPC
+    from echelon.optimal.objectives import Planning
+    from echelon.optimal.pilots import simulate_mpc, simulate_plans
+    from echelon.optimal.planar_baseline import PlanarBaseline
+    from echelon.optimal.planner import Plan, Planner, plan
+    from echelon.optimal.problem import Constraint, OptimalControl
+    from echelon.plots.run import figures, save_figures
     from echelon.references import (
         Circle,
         FigureEight,
@@ -83,38 +72,59 @@ if TYPE_CHECKING:
         Reference,
         Waypoints,
     )
+    from echelon.reports.comparison import comparison_report
+    from echelon.reports.run import report
+    from echelon.results.dataset import dataset, save_dataset, summary
+    from echelon.results.lyapunov import Lyapunov, lyapunov
+    from echelon.results.metrics import Metrics, metrics
+    from echelon.scenario.build import build, run
+    from echelon.scenario.scenario import (
+        Scenario,
+        bundled_scenarios,
+        load_scenario,
+        scenario_from_mapping,
+    )
+    from echelon.studies.compare import Comparison, compare
+    from echelon.studies.finite_condition import FiniteCondition, finite_condition
+    from echelon.verifier.verify import Verified, verify
+    from echelon.world.disturbance import Disturbance
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "_archive": ("dataset", "save_dataset", "summary"),
-    "_build": ("build", "run"),
-    "_disturbance": ("Disturbance",),
-    "_compare": ("Comparison", "compare"),
-    "_comparison_report": ("comparison_report",),
-    "_domain": ("Domain",),
-    "_errors": ("EchelonError", "Outcome"),
-    "_finite_condition": ("FiniteCondition", "finite_condition"),
-    "_formation": ("Formation",),
-    "_gain_file": ("load_gain", "save_gain"),
-    "_graph": ("Graph",),
-    "_horizon": ("MPC",),
-    "_lyapunov": ("Lyapunov", "lyapunov"),
-    "_metrics": ("Metrics", "metrics"),
-    "_optimal_control": ("Constraint", "OptimalControl"),
-    "_optimization": ("simulate_mpc", "simulate_plans"),
-    "_plan": ("Plan", "Planner", "plan"),
-    "_planar_baseline": ("PlanarBaseline",),
-    "_plots": ("figures", "save_figures"),
-    "_posing": ("Planning",),
-    "_recommend": ("Shorter", "recommend_edges", "recommend_leaders", "shorter"),
-    "_report": ("report",),
-    "_result": ("Result",),
-    "_scenario": ("Scenario", "bundled_scenarios", "load_scenario", "scenario_from_mapping"),
-    "_simulate": ("simulate",),
-    "_solver_figures": ("SolverFigures", "solver_figures"),
-    "_synthesize": ("synthesize",),
-    "_verify": ("Verified", "verify"),
+    "results.dataset": ("dataset", "save_dataset", "summary"),
+    "scenario.build": ("build", "run"),
+    "world.disturbance": ("Disturbance",),
+    "studies.compare": ("Comparison", "compare"),
+    "reports.comparison": ("comparison_report",),
+    "certificates.domain": ("Domain",),
+    "core.errors": ("EchelonError", "Outcome"),
+    "studies.finite_condition": ("FiniteCondition", "finite_condition"),
+    "network.formation": ("Formation",),
+    "gains.file": ("load_gain", "save_gain"),
+    "network.graph": ("Graph",),
+    "optimal.horizon": ("MPC",),
+    "results.lyapunov": ("Lyapunov", "lyapunov"),
+    "results.metrics": ("Metrics", "metrics"),
+    "optimal.problem": ("Constraint", "OptimalControl"),
+    "optimal.pilots": ("simulate_mpc", "simulate_plans"),
+    "optimal.planner": ("Plan", "Planner", "plan"),
+    "optimal.planar_baseline": ("PlanarBaseline",),
+    "plots.run": ("figures", "save_figures"),
+    "optimal.objectives": ("Planning",),
+    "network.topology": ("Shorter", "recommend_edges", "recommend_leaders", "shorter"),
+    "reports.run": ("report",),
+    "engine.result": ("Result",),
+    "scenario.scenario": (
+        "Scenario",
+        "bundled_scenarios",
+        "load_scenario",
+        "scenario_from_mapping",
+    ),
+    "engine.simulate": ("simulate",),
+    "engine.work": ("SolverFigures", "solver_figures"),
+    "gains.synthesize": ("synthesize",),
+    "verifier.verify": ("Verified", "verify"),
     "gains": (
         "Certificate",
         "Contraction",

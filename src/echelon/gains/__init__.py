@@ -1,6 +1,6 @@
 """Gains: what a synthesis returns, the interface `Method`, and the bundled methods."""
 
-from echelon._certificates import Certificate, Region
+from echelon.certificates.certificate import Certificate, Region
 from echelon.gains.contraction import Contraction
 from echelon.gains.gain import Gain, Method
 from echelon.gains.given import Given

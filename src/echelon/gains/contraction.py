@@ -4,14 +4,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from echelon._certificates import certify
-from echelon._domain import Bound, Domain
-from echelon._graph import Graph
-from echelon._linearization import linearize
-from echelon._lmi import contraction
+from echelon.certificates.certificate import certify
+from echelon.certificates.domain import Bound, Domain
+from echelon.certificates.lmi import contraction
+from echelon.certificates.region import contracting_region, pairs_on, the_domain
 from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.gains.regional import contracting_region, pairs_on, the_domain
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 
 class Contraction(Method):

@@ -11,11 +11,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._certificates import Certificate
-from echelon._errors import GainError
-from echelon._graph import Graph
-from echelon._types import Input, Matrix, State
+from echelon.certificates.certificate import Certificate
+from echelon.core.errors import GainError
+from echelon.core.types import Input, Matrix, State
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Matrix
 

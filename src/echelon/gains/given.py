@@ -4,12 +4,12 @@ from typing import Literal
 
 import numpy as np
 
-from echelon._certificates import certify
-from echelon._errors import GainError
-from echelon._graph import Graph
-from echelon._linearization import linearize
+from echelon.certificates.certificate import certify
+from echelon.core.errors import GainError
 from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 
 class Given(Method):

@@ -6,15 +6,15 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon._certificates import certify
-from echelon._errors import GainError, listing
-from echelon._graph import Graph
-from echelon._linearization import Linearization, linearize
-from echelon._numerics import riccati
-from echelon._types import Matrix
+from echelon.certificates.certificate import certify
+from echelon.core.errors import GainError, listing
+from echelon.core.numerics import riccati
+from echelon.core.types import Matrix
 from echelon.gains.gain import Gain, Method, as_matrix, check_coupling
 from echelon.gains.riccati import Riccati
+from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 _SAMPLES = 16
 

@@ -4,15 +4,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from echelon._certificates import Region, certify
-from echelon._domain import Bound, Domain
-from echelon._graph import Graph
-from echelon._jacobians import has_constant_input_map, jacobians
-from echelon._linearization import linearize
-from echelon._lmi import monotone
+from echelon.certificates.certificate import Region, certify
+from echelon.certificates.domain import Bound, Domain
+from echelon.certificates.jacobians import has_constant_input_map, jacobians
+from echelon.certificates.lmi import monotone
+from echelon.certificates.region import radius, the_domain
 from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.gains.regional import radius, the_domain
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 
 class Monotone(Method):

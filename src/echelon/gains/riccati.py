@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from echelon._certificates import certify
-from echelon._errors import GainError
-from echelon._graph import Graph
-from echelon._linearization import Linearization, linearize
-from echelon._numerics import in_words, riccati, uncontrollable_modes
+from echelon.certificates.certificate import certify
+from echelon.core.errors import GainError
+from echelon.core.numerics import in_words, riccati, uncontrollable_modes
 from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
+from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 
 class Riccati(Method):

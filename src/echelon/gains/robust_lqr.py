@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 
-from echelon._certificates import certify
-from echelon._domain import Bound, Domain
-from echelon._graph import Graph
-from echelon._linearization import linearize
-from echelon._lmi import robust_lqr
+from echelon.certificates.certificate import certify
+from echelon.certificates.domain import Bound, Domain
+from echelon.certificates.lmi import robust_lqr
+from echelon.certificates.region import contracting_region, pairs_on, the_domain
 from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
-from echelon.gains.regional import contracting_region, pairs_on, the_domain
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 
 class RobustLQR(Method):

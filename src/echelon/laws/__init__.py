@@ -3,8 +3,8 @@
 from echelon.laws.agreement import Agreement
 from echelon.laws.consensus import Consensus
 from echelon.laws.law import Law, LocalView
-from echelon.laws.optimal_tracking import OptimalTracking
 from echelon.laws.passive import Passive
 from echelon.laws.tracking import Tracking
+from echelon.optimal.leader import OptimalTracking
 
 __all__ = ["Agreement", "Consensus", "Law", "LocalView", "OptimalTracking", "Passive", "Tracking"]

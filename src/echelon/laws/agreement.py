@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from echelon._errors import LawError
-from echelon._graph import Graph
-from echelon._types import Input, Matrix
+from echelon.core.errors import LawError
+from echelon.core.types import Input, Matrix
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.integrator import SingleIntegrator
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 
 class Agreement(Law):

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from echelon._errors import GainError, LawError, did_you_mean, listing
-from echelon._graph import Graph
-from echelon._linearization import linearize
-from echelon._margins import ClosedLoop, string_gain
-from echelon._types import Input, Matrix, State
+from echelon.certificates.margins import ClosedLoop, string_gain
+from echelon.core.errors import GainError, LawError, did_you_mean, listing
+from echelon.core.types import Input, Matrix, State
 from echelon.gains.gain import Gain
 from echelon.laws.law import Feedforward, Law, LocalView, Memory, check_gain_fits
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 _TOLD = {
     "none": (),

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from echelon._errors import LawError
-from echelon._graph import Graph
-from echelon._types import Input, Matrix, Scalar, State
+from echelon.core.errors import LawError
+from echelon.core.types import Input, Matrix, Scalar, State
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 Feedforward: TypeAlias = Literal["none", "relay", "relay-velocity", "parent"]
 Memory: TypeAlias = Any

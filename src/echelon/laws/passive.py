@@ -1,6 +1,6 @@
 """The law that does nothing: the trim input alone."""
 
-from echelon._types import Input
+from echelon.core.types import Input
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.model import ControlAffine
 

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._errors import LawError, ReferenceError, listing
-from echelon._graph import Graph
-from echelon._types import Input, Scalar, State
+from echelon.core.errors import LawError, ReferenceError, listing
+from echelon.core.types import Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 from echelon.references.reference import COORDINATES, Reference
 
 

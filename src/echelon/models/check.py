@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._errors import ModelError, did_you_mean, listing
+from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.models.model import ControlAffine
 
 _TRIM_TOLERANCE = 1e-9

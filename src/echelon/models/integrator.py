@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from echelon._errors import ModelError
-from echelon._types import Input, InputMap, Output, State
+from echelon.core.errors import ModelError
+from echelon.core.types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, not_negative
 
 _AXES = ("x", "y", "z")

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._errors import ModelError
-from echelon._types import InputMap, Matrix, Output, State
+from echelon.core.errors import ModelError
+from echelon.core.types import InputMap, Matrix, Output, State
 from echelon.models.model import ControlAffine
 
 

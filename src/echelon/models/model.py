@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, cast
 import equinox as eqx
 import jax.numpy as jnp
 
-from echelon._errors import ModelError, did_you_mean, listing
-from echelon._types import Input, InputMap, Output, State
+from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.types import Input, InputMap, Output, State
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from echelon._types import InputMap, State
+from echelon.core.types import InputMap, State
 from echelon.models.model import ControlAffine, not_negative, positive
 
 

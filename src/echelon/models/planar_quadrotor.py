@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from echelon._types import Input, InputMap, Output, State
+from echelon.core.types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, Limits, diagonal, positive
 from echelon.models.rotors import attitude_priority, fits
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._errors import ModelError, did_you_mean, listing
-from echelon._types import Input, InputMap, Output, State
+from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, Limits, Rows, diagonal, positive
 from echelon.models.rigid_body import (
     body_rates,

@@ -9,7 +9,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from echelon._types import Input, InputMap, Output, State
+from echelon.core.types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, positive
 from echelon.models.quadrotor import Quadrotor
 from echelon.models.rigid_body import body_rates, euler_rates, free_spin, thrust_axis

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from echelon._types import InputMap, Output, State
+from echelon.core.types import InputMap, Output, State
 from echelon.models.model import ControlAffine, diagonal, positive
 from echelon.models.rigid_body import check_moments, euler_rates, free_spin
 

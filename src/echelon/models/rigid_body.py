@@ -6,7 +6,7 @@ Body to world is Rz(yaw) Ry(pitch) Rx(roll).
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from echelon._errors import ModelError
+from echelon.core.errors import ModelError
 from echelon.models.model import positive
 
 

@@ -8,7 +8,7 @@ alone do not fit.
 import jax
 import jax.numpy as jnp
 
-from echelon._types import Input, Scalar
+from echelon.core.types import Input, Scalar
 
 
 def _largest_share(base: Input, extra: Input, maximum: float) -> Scalar:

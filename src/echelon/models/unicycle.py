@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from echelon._types import Input, InputMap, State
+from echelon.core.types import Input, InputMap, State
 from echelon.models.model import ControlAffine, diagonal, positive
 
 

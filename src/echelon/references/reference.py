@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._errors import ReferenceError
-from echelon._numerics import derivatives
-from echelon._types import Scalar
+from echelon.core.errors import ReferenceError
+from echelon.core.numerics import derivatives
+from echelon.core.types import Scalar
 
 COORDINATES = ("x", "y", "z", "yaw")
 

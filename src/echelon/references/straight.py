@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from echelon._types import Scalar
+from echelon.core.types import Scalar
 from echelon.references.reference import Reference, finite, in_space
 
 _Vector = tuple[float, ...]

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon._errors import ReferenceError
-from echelon._types import Matrix, Scalar
+from echelon.core.errors import ReferenceError
+from echelon.core.types import Matrix, Scalar
 from echelon.references.reference import Reference, finite, in_space
 
 

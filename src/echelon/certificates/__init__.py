@@ -1,0 +1,1 @@
+"""What can be proved of a feedback on a graph and on a domain."""

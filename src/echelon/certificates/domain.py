@@ -1,0 +1,124 @@
+"""A domain: the box of states and inputs on which a certificate is asked for."""
+
+from collections.abc import Mapping
+from typing import TypeAlias, final
+
+import numpy as np
+
+from echelon.core.errors import GainError, did_you_mean, listing
+from echelon.core.types import Matrix
+from echelon.models.model import ControlAffine
+
+Bound: TypeAlias = float | tuple[float, float]
+
+
+@final
+class Domain:
+    """A box about a model's trim, in deviations of states and normalized inputs.
+
+    Attributes:
+        lower, upper: (n,) bounds on x - x*; infinite for states that were not named.
+        input_lower, input_upper: (m,) bounds on the normalized input; zero where not named.
+
+    A certificate on a domain holds while every agent's state, and the leader's input, stay inside.
+    """
+
+    def __init__(
+        self, lower: Matrix, upper: Matrix, input_lower: Matrix, input_upper: Matrix
+    ) -> None:
+        """Keep the bounds, read-only."""
+        self.lower, self.upper = np.array(lower, float), np.array(upper, float)
+        self.input_lower, self.input_upper = (
+            np.array(input_lower, float),
+            np.array(input_upper, float),
+        )
+        for array in (self.lower, self.upper, self.input_lower, self.input_upper):
+            array.setflags(write=False)
+
+    @classmethod
+    def about(cls, model: ControlAffine, bounds: Mapping[str, Bound]) -> "Domain":
+        """Return the box with the given bounds, by state, group or input name.
+
+        Args:
+            model: gives the names, the trim and the chart.
+            bounds: a half-width, or (lower, upper), in the state's unit or that of the normalized
+                input. A state not named is unbounded, an input not named is held at the trim.
+
+        Raises:
+            GainError: a name is unknown, a bound is empty, inverted or leaves the model's chart.
+        """
+        n, m = len(model.state_names), len(model.input_names)
+        box = cls(np.full(n, -np.inf), np.full(n, np.inf), np.zeros(m), np.zeros(m))
+        state, given = np.array([box.lower, box.upper]), np.zeros((2, m))
+        # A state's own bound wins over its group's.
+        for name in sorted(bounds, key=lambda name: name in model.state_names):
+            low, high = _interval(name, bounds[name])
+            if name in model.input_names:
+                given[:, model.input_names.index(name)] = low, high
+            else:
+                state[:, _places(model, name)] = np.array([[low], [high]])
+        _check_chart(model, state)
+        return cls(*state, *given)
+
+    def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Matrix, Matrix]:
+        """Return random deviations (count, n) and inputs (count, m); unbounded states in +-free."""
+        random = np.random.default_rng(seed)
+        low = np.where(np.isfinite(self.lower), self.lower, -free)
+        high = np.where(np.isfinite(self.upper), self.upper, free)
+        states = random.uniform(low, high, (count, len(low)))
+        return states, random.uniform(
+            self.input_lower, self.input_upper, (count, len(self.input_lower))
+        )
+
+    def in_words(self, model: ControlAffine) -> str:
+        """Return the bounds as text, deviations from the trim."""
+        names = (*model.state_names, *model.input_names)
+        lower = np.concatenate([self.lower, self.input_lower])
+        upper = np.concatenate([self.upper, self.input_upper])
+        told = [
+            f"{name} in [{low:.4g}, {high:.4g}]"
+            for name, low, high in zip(names, lower, upper, strict=True)
+            if np.isfinite([low, high]).all() and low < high
+        ]
+        return ", ".join(told) or "all states"
+
+    def margins(self) -> Matrix:
+        """Return (n,) how far each state may deviate from the trim to both sides."""
+        return np.minimum(self.upper, -self.lower)
+
+
+def _interval(name: str, bound: Bound) -> tuple[float, float]:
+    low, high = (-bound, bound) if isinstance(bound, (int, float)) else tuple(bound)
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise GainError(
+            f"the domain of `{name}` is [{low:g}, {high:g}], and must be finite with its lower end "
+            "below its upper."
+        )
+    if not low <= 0.0 <= high:
+        raise GainError(
+            f"the domain of `{name}` is [{low:g}, {high:g}], and must hold the trim, 0."
+        )
+    return float(low), float(high)
+
+
+def _places(model: ControlAffine, name: str) -> list[int]:
+    if name not in model.state_names and name not in model.state_groups:
+        allowed = [*model.state_groups, *model.state_names, *model.input_names]
+        raise GainError(
+            f"the domain names `{name}`, and `{type(model).__name__}` has {listing(allowed)}"
+            f"{did_you_mean(name, allowed)}."
+        )
+    return list(model.states_called(name))
+
+
+def _check_chart(model: ControlAffine, state: Matrix) -> None:
+    """Check that a bounded state stays where the model's equations hold."""
+    trim = np.asarray(model.trim[0], float)
+    for name, (low, high) in model.chart.items():
+        k = model.state_names.index(name)
+        reach = trim[k] + state[:, k]
+        if np.isfinite(reach).all() and not (low < reach[0] and reach[1] < high):
+            raise GainError(
+                f"the domain of `{name}` reaches [{reach[0]:.4g}, {reach[1]:.4g}], and "
+                f"`{type(model).__name__}` holds only inside ({low:.4g}, {high:.4g})."
+            )

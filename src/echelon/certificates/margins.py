@@ -1,0 +1,325 @@
+"""How far a stable linear loop is from losing what it promises.
+
+The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes
+A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda. All that is said here is of
+these matrices (kind: linearization), with the same delay or scale for every agent.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from echelon.core.errors import GainError
+from echelon.core.types import Matrix
+
+_FAR = 1e6  # factors on the coupling beyond this count as infinite
+_HIDDEN = 1e-9  # relative size below which a singular value or a damping counts as zero
+
+
+class ClosedLoop(NamedTuple):
+    """What every margin is of: the modes A - c lambda B R^-1 B'P for lambda in `eigenvalues`."""
+
+    A: Matrix
+    B: Matrix
+    P: Matrix
+    R: Matrix
+    coupling: float
+    eigenvalues: Matrix
+
+    @property
+    def K(self) -> Matrix:
+        """R^-1 B'P, (m, n)."""
+        return np.linalg.solve(self.R, self.B.T @ self.P)
+
+    @property
+    def strengths(self) -> Matrix:
+        """The distinct c lambda, ascending."""
+        return self.coupling * np.unique(np.asarray(self.eigenvalues, dtype=np.float64))
+
+
+class GainMargin(NamedTuple):
+    """Every mode decays for the factors on the coupling low < factor < high."""
+
+    low: float
+    high: float
+
+
+class DelayMargin(NamedTuple):
+    """The least delay (s) that costs stability, or infinity, and where: w (rad/s) and lambda."""
+
+    delay: float
+    frequency: float
+    eigenvalue: float
+
+
+class InputScaling(NamedTuple):
+    """The worst abscissa (1/s) over scaled inputs, the scales (m,) and the lambda that give it."""
+
+    abscissa: float
+    scales: tuple[float, ...]
+    eigenvalue: float
+
+
+class StringGain(NamedTuple):
+    """||T||_inf of one link of a chain, and the frequency (rad/s) where it is reached."""
+
+    gain: float
+    frequency: float
+
+
+class HiddenMode(NamedTuple):
+    """A mode that does not decay and never shows: its eigenvalue, 1/s, and its direction (n,)."""
+
+    eigenvalue: complex
+    direction: Matrix
+
+
+def modes(loop: ClosedLoop) -> Matrix:
+    """Return the matrices A - c lambda B R^-1 B'P, (K, n, n), for the distinct eigenvalues.
+
+    Raises:
+        GainError: one of them does not decay, so that there is no margin to speak of.
+    """
+    strengths = loop.strengths
+    closed = loop.A - strengths[:, None, None] * (loop.B @ loop.K)
+    abscissas = np.linalg.eigvals(closed).real.max(1)
+    worst = int(abscissas.argmax())
+    if not abscissas[worst] < 0.0:
+        raise GainError(
+            f"margins need a loop that decays, and the mode of eigenvalue "
+            f"{strengths[worst] / loop.coupling:.6g} has abscissa {abscissas[worst]:.3g} 1/s."
+        )
+    return closed
+
+
+def gain_margin(loop: ClosedLoop) -> GainMargin:
+    """Return the interval of factors on the coupling, around 1, for which every mode decays.
+
+    At an edge two eigenvalues of A - k B K add to zero, k = factor c lambda, so that the pencil of
+    X -> A X + X A' and X -> B K X + X (B K)' is singular: its real eigenvalues are candidates.
+    Between two of them one sample decides, and bisection sharpens the edge. `high` is infinite
+    where no edge lies below a factor of 1e6, `low` is 0 where none lies above 1e-6.
+
+    Raises:
+        GainError: a mode does not decay at factor 1.
+    """
+    modes(loop)
+    G, strengths = loop.B @ loop.K, loop.strengths
+    edges = _crossings(loop.A, G, _FAR * strengths[-1])
+
+    def decays(k: float) -> bool:
+        return bool(np.linalg.eigvals(loop.A - k * G).real.max() < 0.0)
+
+    low = max(float(_edge(decays, k, edges[edges < k][::-1], 0.0) / k) for k in strengths)
+    high = min(float(_edge(decays, k, edges[edges > k], _FAR * k) / k) for k in strengths)
+    return GainMargin(low if low > 1.0 / _FAR else 0.0, high if high < 0.999 * _FAR else np.inf)
+
+
+def decays_between(loop: ClosedLoop) -> bool:
+    """Tell whether a mode decays for every lambda from the least eigenvalue to the largest.
+
+    So the extremes of a large graph's spectrum speak for all of it: between the candidates of
+    `gain_margin` nothing can change, and one sample decides.
+    """
+    G, strengths = loop.B @ loop.K, loop.strengths
+    edges = _crossings(loop.A, G, strengths[-1])
+    ends = np.union1d(strengths, edges[edges > strengths[0]])
+    probes = np.union1d(ends, 0.5 * (ends[:-1] + ends[1:]))
+    closed = loop.A - probes[:, None, None] * G
+    return bool(np.linalg.eigvals(closed).real.max() < 0.0)
+
+
+def delay_margin(loop: ClosedLoop) -> DelayMargin:
+    """Return the largest delay tau of all z, u = -c R^-1 B'P z(t - tau), that every mode survives.
+
+    A root of det(s I - A + c lambda B K e^{-s tau}) reaches the axis at s = i w only where an
+    eigenvalue mu of K (i w I - A)^-1 B has size 1 / (c lambda), and first at the delay that turns
+    c lambda mu into -1. The sizes are swept over frequency once and crossed for each lambda.
+
+    Raises:
+        GainError: a mode does not decay without delay.
+    """
+    closed, K, strengths = modes(loop), loop.K, loop.strengths
+
+    def loci(w: Matrix) -> Matrix:
+        mu = np.linalg.eigvals(K @ _resolvent(loop.A, w, loop.B))
+        return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
+
+    def size(w: float, i: int, at: float = 0.0) -> float:
+        return float(np.abs(loci(np.array([w]))[0, i])) - at
+
+    grid = _frequencies([loop.A, *closed])
+    columns = enumerate(np.abs(loci(grid)).T)
+    peaks = [_peaks(lambda w, i=i: size(w, i), grid, column) for i, column in columns]
+    grid = np.union1d(grid, np.concatenate(peaks))
+    sizes, best = np.abs(loci(grid)), DelayMargin(np.inf, 0.0, float(strengths[0] / loop.coupling))
+    for k in strengths:
+        for at, i in np.argwhere(np.diff(sizes > 1.0 / k, axis=0)):
+            ends, sharp = (grid[at], grid[at + 1]), 1e-13 * grid[at]
+            w = scipy.optimize.root_scalar(size, (i, 1.0 / k), "brentq", ends, xtol=sharp).root
+            mu = loci(np.array([w]))[0]
+            # Loci that cross together share the size and differ in phase: the first one counts.
+            phases = np.angle(-mu[np.abs(np.abs(mu) * k - 1.0) < 1e-6]) % (2.0 * np.pi)
+            delay, eigenvalue = float(phases.min() / w), float(k / loop.coupling)
+            best = min(best, DelayMargin(delay, float(w), eigenvalue))
+    return best
+
+
+def input_scaling(
+    loop: ClosedLoop, spread: float = 0.3, slopes: Matrix | None = None
+) -> InputScaling:
+    """Return the worst mode when every input acts 1 +- spread as strongly as the law believes.
+
+    The plant's B becomes B diag(s) for all agents alike, as by a wrong mass or inertia, while the
+    law keeps its own. Where the trim input u* is part of A through a state-dependent g, `slopes`
+    (m, n, n) holds u*_k dg_k/dx, and A becomes A + sum_k (s_k - 1) slopes_k. The 2^m corners are
+    looked at, not what lies between them, nor where the trim moves.
+
+    Raises:
+        GainError: `spread` is not in [0, 1), or there are more than 12 inputs.
+    """
+    A, B, m = loop.A, loop.B, loop.B.shape[1]
+    if not 0.0 <= spread < 1.0 or m > 12:
+        raise GainError(f"`spread` is {spread} on {m} inputs; allowed are [0, 1) and 12 inputs.")
+    K, values = loop.K, np.unique(loop.eigenvalues)
+    slopes = np.zeros((m, *A.shape)) if slopes is None else slopes
+    worst = InputScaling(-np.inf, (), 0.0)
+    for scales in itertools.product((1.0 - spread, 1.0 + spread), repeat=m):
+        plant = A + np.tensordot(np.array(scales) - 1.0, slopes, 1)
+        closed = plant - loop.coupling * values[:, None, None] * (B * np.array(scales) @ K)
+        abscissas = np.linalg.eigvals(closed).real.max(1)
+        at = int(abscissas.argmax())
+        worst = max(worst, InputScaling(float(abscissas[at]), scales, float(values[at])))
+    return worst
+
+
+def string_gain(loop: ClosedLoop) -> StringGain:
+    """Return ||T||_inf, T(s) = c K (s I - A + c B K)^-1 B, whatever the eigenvalues are.
+
+    By so much can one link of a chain amplify its parent's input when that is fed forward (theory
+    page, T4), and d links by the d-th power. The norm is Euclidean in normalized inputs.
+
+    Raises:
+        GainError: A - c B K does not decay.
+    """
+    closed = modes(loop._replace(eigenvalues=np.ones(1)))[0]
+    K = loop.coupling * loop.K
+
+    def sizes(w: Matrix) -> Matrix:
+        return np.linalg.norm(K @ _resolvent(closed, w, loop.B), ord=2, axis=(-2, -1))
+
+    grid = np.append(0.0, _frequencies([loop.A, closed]))
+    grid = np.union1d(grid, _peaks(lambda w: float(sizes(np.array([w]))[0]), grid, sizes(grid)))
+    at = int(sizes(grid).argmax())
+    return StringGain(float(sizes(grid)[at]), float(grid[at]))
+
+
+def detectability(A: Matrix, C: Matrix) -> list[HiddenMode]:
+    """Return the modes with Re s >= 0 and a right eigenvector v with C v = 0 (the PBH test).
+
+    The largest invariant subspace where C vanishes is found first, by singular values; then the
+    eigenvalues there. A mode of several directions is listed once for each, in a sparse basis.
+    """
+    hidden, size = _unobservable(A, C), float(np.linalg.norm(A, 2)) or 1.0
+    inner, tiny = hidden.T @ A @ hidden, _HIDDEN * size
+    values, found = np.linalg.eigvals(inner), list[HiddenMode]()
+    for value in values:
+        # Rounding scatters the eigenvalues of a Jordan block around their mean, which stays put.
+        centre = values[np.abs(values - value) <= 1e-3 * size].mean()
+        nulls = [(s, _null_space(inner - s * np.eye(len(inner)), tiny)) for s in (centre, value)]
+        s, null = nulls[0] if nulls[0][1].size else nulls[1]
+        if s.real >= -tiny and all(abs(s - m.eigenvalue) > 1e-6 * size for m in found):
+            found += [HiddenMode(complex(s), v) for v in _sparse(hidden @ null).T]
+    return found
+
+
+def _edge(decays: Callable[[float], bool], k: float, edges: Matrix, end: float) -> float:
+    """Return where stability ends on the way from k over the candidates `edges` to `end`."""
+    inside = k
+    for here, beyond in itertools.pairwise([*edges, end]):
+        probe = 0.5 * (here + beyond)
+        if not decays(probe):
+            outside = probe
+            for _ in range(60):
+                middle = 0.5 * (inside + outside)
+                inside, outside = (middle, outside) if decays(middle) else (inside, middle)
+            return inside
+        inside = probe
+    return end
+
+
+def _crossings(A: Matrix, G: Matrix, top: float) -> Matrix:
+    """Return the k in (0, top) at which two eigenvalues of A - k G may add to zero, ascending."""
+    i, j = np.triu_indices(len(A))
+    basis = np.zeros((len(i), *A.shape))
+    basis[range(len(i)), i, j] = basis[range(len(i)), j, i] = 1.0
+    fixed, moved = (((M @ basis) + (M @ basis).swapaxes(1, 2))[:, i, j].T for M in (A, G))
+    over, under = np.asarray(scipy.linalg.eigvals(fixed, moved, homogeneous_eigvals=True))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        k = over / under
+    real = np.isfinite(k) & (np.abs(k.imag) <= 1e-3 * np.abs(k)) & (k.real > 0.0)
+    return np.unique(k.real[real & (k.real < top)])
+
+
+def _resolvent(A: Matrix, w: Matrix, B: Matrix) -> Matrix:
+    """Return (i w I - A)^-1 B for each frequency, (N, n, m)."""
+    return np.linalg.solve(1j * w[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
+
+
+def _frequencies(matrices: list[Matrix]) -> Matrix:
+    """Return frequencies up to the largest norm of the matrices, denser about their resonances."""
+    # |w| <= |A - k B K z| for |z| = 1, which is at most twice the norm of A and that of A - k B K.
+    top = 3.0 * max(float(np.linalg.norm(M, 2)) for M in matrices) or 1.0
+    poles = np.concatenate([np.linalg.eigvals(M) for M in matrices])
+    width = np.maximum(np.abs(poles.real), 1e-6 * np.abs(poles))
+    steps = np.geomspace(0.05, 20.0, 12)
+    near = np.abs(poles.imag)[:, None] + width[:, None] * np.concatenate([-steps, steps])
+    sweep = np.geomspace(1e-9 * top, top, 3600)
+    return np.union1d(sweep, near[near > sweep[0]])
+
+
+def _peaks(f: Callable[[float], float], grid: Matrix, values: Matrix) -> Matrix:
+    """Return the local maxima of f between the points of a grid where it has these values."""
+    middle, left, right = values[1:-1], values[:-2], values[2:]
+    # A flat stretch has maxima by rounding, which are no peaks.
+    tops = (middle >= left) & (middle >= right) & (middle > (1.0 + 1e-9) * np.minimum(left, right))
+    around = [(grid[k - 1], grid[k + 1]) for k in np.flatnonzero(tops) + 1]
+    return np.array([lowest(lambda w: -f(w), *ends).x for ends in around])
+
+
+def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
+    """Return SciPy's account of the least f between two points, where it has one minimum."""
+    sharp = {"xatol": 1e-7 * (high - low)}
+    return scipy.optimize.minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
+
+
+def _unobservable(A: Matrix, C: Matrix) -> Matrix:
+    """Return an orthonormal basis, (n, r), of the largest invariant subspace where C vanishes."""
+    rows = np.linalg.norm(C, axis=1, keepdims=True)
+    basis = _null_space(C / np.where(rows > 0.0, rows, 1.0), _HIDDEN)
+    while basis.shape[1]:
+        leak = A @ basis - basis @ (basis.T @ A @ basis)
+        kept = _null_space(leak, _HIDDEN * float(np.linalg.norm(A, 2)))
+        if kept.shape[1] == basis.shape[1]:
+            break
+        basis = basis @ kept
+    return basis
+
+
+def _null_space(M: Matrix, tolerance: float) -> Matrix:
+    """Return an orthonormal basis of the vectors that M sends to less than the tolerance."""
+    _, singular, right = np.linalg.svd(M)
+    return right[int((singular > tolerance).sum()) :].conj().T
+
+
+def _sparse(vectors: Matrix) -> Matrix:
+    """Return unit vectors of the same span, (n, r), each alone at one state where it is large."""
+    pivots = np.asarray(scipy.linalg.qr(vectors.conj().T, pivoting=True)[-1])[: vectors.shape[1]]
+    sparse = vectors @ np.linalg.inv(vectors[pivots])
+    sparse = np.where(np.abs(sparse) > _HIDDEN, sparse, 0.0)
+    sparse = sparse / np.linalg.norm(sparse, axis=0)
+    return sparse if np.abs(sparse.imag).any() else sparse.real

@@ -1,0 +1,152 @@
+"""Where a run's files go: a folder that is new or empty.
+
+It is checked before the run, so that nothing is lost.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from echelon.core.errors import OutputError
+from echelon.engine.result import Result
+from echelon.results.dataset import save_dataset, summary
+from echelon.results.lyapunov import lyapunov
+from echelon.results.metrics import Metrics
+from echelon.studies.compare import Comparison
+
+_OURS = (
+    *("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures"),
+    *("comparison.json", "comparison.txt", "runs"),
+)
+"""What a run or a comparison writes, and all that `--force` may remove."""
+
+
+def claim_folder(name: str, out: Path | None, force: bool) -> Path:
+    """Return the folder for a run, made and empty of earlier runs.
+
+    Without `out` it is `runs/<name>-<time>`, numbered where two runs start in the same second.
+
+    Raises:
+        OutputError: `out` holds something and `force` was not given, or it cannot be written.
+    """
+    try:
+        return _named_folder(out, force) if out is not None else _new_folder(Path("runs"), name)
+    except OSError as error:
+        raise _unwritable(out if out is not None else Path("runs"), error) from error
+
+
+def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[Path]:
+    """Return a folder for the comparison of each named scenario: `out` itself where there is one.
+
+    Raises:
+        OutputError: two scenarios have one name, or as in `claim_folder`.
+    """
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise OutputError(f"two scenarios have the name `{twice}`, and each needs its own folder.")
+    if out is None:
+        return [claim_folder(f"compare-{name}", None, force) for name in names]
+    if len(names) == 1:
+        return [claim_folder(names[0], out, force)]
+    return [claim_folder(name, out / name, force) for name in names]
+
+
+def _new_folder(parent: Path, name: str) -> Path:
+    parent.mkdir(parents=True, exist_ok=True)
+    stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for attempt in range(1, 1000):
+        folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+    raise OutputError(f"a thousand runs of `{name}` started in the same second; wait a second.")
+
+
+def _named_folder(out: Path, force: bool) -> Path:
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"`{out}` is a file, and the output must be a folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    present = sorted(path.name for path in out.iterdir())
+    if present and not force:
+        raise OutputError(
+            f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, "
+            "or `--force` to replace an earlier run."
+        )
+    probe = out / ".writable"
+    probe.touch()
+    probe.unlink()
+    for name in _OURS:
+        path = out / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return out
+
+
+def write_data(result: Result, folder: Path) -> None:
+    """Write a run's dataset and scenario: what must not be lost, before all else.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    try:
+        if "scenario_text" in result.provenance:
+            text = result.provenance["scenario_text"]
+            (folder / "scenario.yaml").write_text(text, "utf-8")
+        save_dataset(result, folder / "run.nc")
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def write_run(
+    result: Result, numbers: Metrics, text: str, folder: Path, figures: bool = True
+) -> dict[str, Any]:
+    """Write what is made of a run: summary, report and figures; return the summary.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    told = summary(result, numbers)
+    try:
+        content = json.dumps(told, indent=2, allow_nan=False)
+        (folder / "summary.json").write_text(content + "\n", "utf-8")
+        (folder / "report.txt").write_text(text + "\n", "utf-8")
+        if figures and len(result.times):
+            from echelon.plots.run import save_figures
+
+            v = lyapunov(result)
+            save_figures(result, folder, None if v is None else (v.value, v.rate))
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    return told
+
+
+def write_comparison(
+    comparison: Comparison, told: dict[str, Any], text: str, folder: Path, figures: bool = True
+) -> None:
+    """Write a comparison: numbers, text, each run's dataset under `runs`, and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    try:
+        (folder / "runs").mkdir(parents=True, exist_ok=True)
+        for row in comparison.rows:
+            if row.flight is not None:
+                save_dataset(row.flight.result, folder / "runs" / f"{row.label}.nc")
+        content = json.dumps(told, indent=2, allow_nan=False)
+        (folder / "comparison.json").write_text(content + "\n", "utf-8")
+        (folder / "comparison.txt").write_text(text + "\n", "utf-8")
+        if figures:
+            from echelon.plots.comparison import save_comparison_figures
+
+            save_comparison_figures(comparison, folder)
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"the folder `{folder}` cannot be written: {error.strerror or error}.")

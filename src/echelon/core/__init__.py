@@ -1,0 +1,1 @@
+"""Words and numbers that know no agent: errors, types, integrators, linear systems."""

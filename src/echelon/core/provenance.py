@@ -1,0 +1,37 @@
+"""Where a number comes from: versions of what computed it, and the state of the source."""
+
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+
+_PACKAGES = ("echelon", "jax", "jaxlib", "equinox", "numpy", "scipy")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that compute.
+
+    In a checkout there is `git` too, the commit.
+    """
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = "unknown"
+    commit = _commit()
+    return {**found, "git": commit} if commit else found
+
+
+def _commit() -> str | None:
+    """Return the commit of echelon's own checkout, with `+` when changed; None elsewhere."""
+    home = Path(__file__).resolve().parents[3]
+    if not (home / ".git").exists():
+        return None
+    try:
+        ask = ["git", "-C", str(home), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        return subprocess.run(
+            ask, capture_output=True, text=True, timeout=5, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,1 @@
+"""All values of a function on a box, exactly: intervals, curves, polynomials, hulls."""

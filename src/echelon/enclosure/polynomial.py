@@ -1,0 +1,368 @@
+"""Polynomials in box variables and in sines and cosines of them, with rational coefficients.
+
+A monomial holds each variable once, as a power x^k, and each angle once, as cos(w theta) or
+sin(w theta): products of waves become sums of waves at once, so that c^2 + s^2 is 1 and a
+difference of equal terms is nothing. What is no polynomial becomes a variable of its own, known by
+its range alone.
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import NamedTuple, TypeAlias, final
+
+import numpy as np
+
+from echelon.core.errors import GainError, listing
+from echelon.enclosure.curves import common_unit, power_points, wave_points
+from echelon.enclosure.interval import ELEMENTARY, Interval, circle, point, wave
+
+Wave: TypeAlias = tuple[Fraction, int]
+"""Frequency w > 0 in units of the angle, and 0 for cos(w theta) or 1 for sin(w theta)."""
+
+Exponent: TypeAlias = int | Wave
+Monomial: TypeAlias = tuple[tuple[int, Exponent], ...]
+"""Numbers of atoms, rising, each with its power or its wave."""
+
+_HALF = Fraction(1, 2)
+MOST_VERTICES = 16384
+"""A hull with more vertices is refused; no solver could use it."""
+
+_MOST_ORDER = 16  # of the waves that share a polygon
+_FEW = 64  # a range is sharpened at the corners where there are no more than these
+_THIN = Fraction(1, 1 << 64)  # relative width of what is a number in all but name
+
+
+def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
+    """Return cos or sin of a times cos or sin of b as a sum of waves; None stands for 1."""
+    (p, i), (q, j) = a, b
+    part = i ^ j
+    sum_sign = Fraction(-1 if i and j else 1)
+    difference_sign = Fraction(-1 if j and not i else 1)
+    terms: list[tuple[Fraction, Wave | None]] = [(_HALF * sum_sign, (p + q, part))]
+    if p != q:
+        if part and p < q:
+            difference_sign = -difference_sign
+        terms.append((_HALF * difference_sign, (abs(p - q), part)))
+    elif not part:
+        terms.append((_HALF * difference_sign, None))
+    return terms
+
+
+def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
+    """Return the product of two monomials as a sum of monomials."""
+    found: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
+    for atom, exponent in b:
+        held = dict(a).get(atom)
+        for _, factors in found:
+            factors.pop(atom, None)
+        if held is None:
+            options: list[tuple[Fraction, Exponent | None]] = [(Fraction(1), exponent)]
+        elif isinstance(held, int) and isinstance(exponent, int):
+            options = [(Fraction(1), held + exponent)]
+        else:
+            assert isinstance(held, tuple) and isinstance(exponent, tuple)
+            options = [*_wave_product(held, exponent)]
+        found = [
+            (c * k, factors if new is None else {**factors, atom: new})
+            for c, factors in found
+            for k, new in options
+        ]
+    return [(c, tuple(sorted(factors.items()))) for c, factors in found]
+
+
+@final
+class Polynomial:
+    """A sum of monomials with rational coefficients, none of them zero; never changed."""
+
+    __slots__ = ("terms",)
+
+    def __init__(self, terms: dict[Monomial, Fraction]) -> None:
+        self.terms = {monomial: c for monomial, c in terms.items() if c}
+
+    def __add__(self, other: "Polynomial") -> "Polynomial":
+        terms = dict(self.terms)
+        for monomial, c in other.terms.items():
+            terms[monomial] = terms.get(monomial, Fraction(0)) + c
+        return Polynomial(terms)
+
+    def __neg__(self) -> "Polynomial":
+        return Polynomial({monomial: -c for monomial, c in self.terms.items()})
+
+    def __sub__(self, other: "Polynomial") -> "Polynomial":
+        return self + (-other)
+
+    def __mul__(self, other: "Polynomial") -> "Polynomial":
+        terms: dict[Monomial, Fraction] = {}
+        for a, p in self.terms.items():
+            for b, q in other.terms.items():
+                for c, monomial in _monomial_product(a, b) if a and b else [(1, a or b)]:
+                    terms[monomial] = terms.get(monomial, Fraction(0)) + p * q * c
+        return Polynomial(terms)
+
+    def power(self, k: int) -> "Polynomial":
+        """Return the k-th power, k >= 0."""
+        found = constant(1)
+        for _ in range(k):
+            found = found * self
+        return found
+
+    def key(self) -> frozenset[tuple[Monomial, Fraction]]:
+        """Return what is equal exactly for equal polynomials."""
+        return frozenset(self.terms.items())
+
+    def value(self) -> Fraction | None:
+        """Return the number that a polynomial without variables is, else None."""
+        return self.terms.get((), Fraction(0)) if set(self.terms) <= {()} else None
+
+    def exponents(self) -> dict[int, set[Exponent]]:
+        """Return which powers or waves of each atom occur."""
+        found: dict[int, set[Exponent]] = {}
+        for monomial in self.terms:
+            for atom, exponent in monomial:
+                found.setdefault(atom, set()).add(exponent)
+        return found
+
+
+def constant(x: Fraction | int | float) -> Polynomial:
+    """Return the polynomial that is the number x, taken exactly."""
+    return Polynomial({(): Fraction(x)})
+
+
+@dataclass(frozen=True)
+class Atom:
+    """A variable or an angle: its range, what it is called, and the box variables behind it."""
+
+    name: str
+    interval: Interval
+    sources: frozenset[str]
+
+
+class Atoms:
+    """Everything that polynomials are made of: numbered variables and angles, and their ranges."""
+
+    def __init__(self) -> None:
+        self.known: list[Atom] = []
+        self._numbers: dict[object, int] = {}
+        self._ranges: dict[tuple[int, Exponent], Interval] = {}
+
+    def _add(self, key: object, atom: Atom) -> int:
+        if key not in self._numbers:
+            self._numbers[key] = len(self.known)
+            self.known.append(atom)
+        return self._numbers[key]
+
+    def variable(self, name: str, interval: Interval) -> Polynomial:
+        """Return a new box variable, or the number that it is fixed at."""
+        if interval.lo == interval.hi:
+            return constant(interval.lo)
+        atom = self._add(("box", len(self.known)), Atom(name, interval, frozenset([name])))
+        return Polynomial({((atom, 1),): Fraction(1)})
+
+    def fresh(self, key: object, interval: Interval, *behind: Polynomial) -> Polynomial:
+        """Return a variable for a value that is known by its range alone.
+
+        The same `key` gives the same variable; a range of one point gives a number.
+        """
+        if interval.lo == interval.hi:
+            return constant(interval.lo)
+        sources = frozenset().union(*(self.sources(p) for p in behind))
+        name = f"expression of {', '.join(sorted(sources))}" if sources else "constant"
+        atom = self._add(("fresh", key), Atom(name, interval, sources))
+        return Polynomial({((atom, 1),): Fraction(1)})
+
+    def sources(self, p: Polynomial) -> frozenset[str]:
+        """Return the names of the box variables that a polynomial depends on."""
+        return frozenset().union(*(self.known[atom].sources for atom in p.exponents()))
+
+    def elementary(self, name: str, p: Polynomial) -> Polynomial:
+        """Return a function of `ELEMENTARY` of a polynomial.
+
+        Raises:
+            GainError: it is not defined on the whole box.
+        """
+        function, interval = ELEMENTARY[name], self.range(p)
+        if not function.defined(interval):
+            verb = "divides by" if name == "reciprocal" else f"takes `{name}` of"
+            behind = listing(sorted(self.sources(p))) or "constants"
+            raise GainError(
+                f"the Jacobian of the model {verb} an expression of {behind}, which may be "
+                f"anything in {interval.text()} on the domain, and {function.domain}; "
+                "make the domain smaller."
+            )
+        return self.fresh((name, p.key()), function.range(interval), p)
+
+    def circle(self, p: Polynomial) -> tuple[Polynomial, Polynomial]:
+        """Return cos p and sin p, with the angles of a sum taken apart."""
+        linear = self._linear(p)
+        shift = linear.pop((), Fraction(0))
+        if not linear:
+            cosine, sine = circle(shift)
+            return self.fresh(("cos", shift), cosine), self.fresh(("sin", shift), sine)
+        found = (constant(1), constant(0))
+        for ((atom, _),), factor in linear.items():
+            c, s = self._angle(atom, factor, shift)
+            found = found[0] * c - found[1] * s, found[1] * c + found[0] * s
+            shift = Fraction(0)
+        return found
+
+    def _linear(self, p: Polynomial) -> dict[Monomial, Fraction]:
+        """Return the constant and linear terms, with all else as one variable more."""
+        bent = {m: c for m, c in p.terms.items() if m and not (len(m) == 1 and m[0][1] == 1)}
+        if not bent:
+            return dict(p.terms)
+        rest = Polynomial(bent)
+        return (p - rest + self.fresh(("angle", rest.key()), self.range(rest), rest)).terms
+
+    def _angle(self, atom: int, factor: Fraction, shift: Fraction) -> tuple[Polynomial, Polynomial]:
+        """Return cos and sin of factor x + shift for a variable x."""
+        phase, behind = shift / factor, self.known[atom]
+        theta = Atom(behind.name, behind.interval + point(phase), behind.sources)
+        angle = self._add(("angle", atom, phase), theta)
+        cosine = Polynomial({((angle, (abs(factor), 0)),): Fraction(1)})
+        sine = Polynomial({((angle, (abs(factor), 1)),): Fraction(1 if factor > 0 else -1)})
+        return cosine, sine
+
+    def factor_range(self, atom: int, exponent: Exponent) -> Interval:
+        """Return the range of a power or of a wave of an atom."""
+        key = (atom, exponent)
+        if key not in self._ranges:
+            interval = self.known[atom].interval
+            self._ranges[key] = (
+                interval.power(exponent)
+                if isinstance(exponent, int)
+                else wave(interval.scaled(exponent[0]), sine=bool(exponent[1]))
+            )
+        return self._ranges[key]
+
+    def range(self, p: Polynomial) -> Interval:
+        """Return an interval that holds every value of a polynomial on the box."""
+        total = point(0)
+        for monomial, c in p.terms.items():
+            product = point(c)
+            for atom, exponent in monomial:
+                product = product * self.factor_range(atom, exponent)
+            total = total + product
+        if len(p.terms) < 2:
+            return total
+        corners = {atom: self.corners(atom, used) for atom, used in p.exponents().items()}
+        if math.prod(len(c.points) for c in corners.values()) > _FEW:
+            return total
+        values = corner_values(p, corners)
+        low, high = min(values.array.flat), max(values.array.flat)
+        return total.cut(Interval(low - values.slack, high + values.slack))
+
+    def corners(self, atom: int, used: Iterable[Exponent]) -> "Corners":
+        """Return points whose hull holds the used powers or waves of an atom, jointly."""
+        wanted = list(used)
+        if len(wanted) == 1:
+            return _gathered(self._ends(atom, wanted[0]))
+        powers = [e for e in wanted if isinstance(e, int)]
+        if powers:
+            return _gathered([{**p} for p in power_points(self.known[atom].interval, powers)])
+        arc, found = self.known[atom].interval, [dict[Exponent, Fraction]()]
+        for group in _harmonics(e for e in wanted if isinstance(e, tuple)):
+            around = _wave_corners(arc, group) if len(group) > 1 else self._ends(atom, group[0])
+            check_count(len(found) * len(around))
+            found = [{**p, **q} for p in found for q in around]
+        return _gathered(found)
+
+    def _ends(self, atom: int, exponent: Exponent) -> list[dict[Exponent, Fraction]]:
+        reached = self.factor_range(atom, exponent)
+        return [{exponent: end} for end in (reached.lo, reached.hi)]
+
+
+def _harmonics(waves: Iterable[Wave]) -> list[list[Wave]]:
+    """Return waves in groups that are low multiples of one frequency each.
+
+    A group gets one polygon, whose corners grow with the highest multiple: 0.7 and 1.3 as floats
+    are multiples of 2^-53. Groups are enclosed apart, and the products of their corners hold all.
+    """
+    groups = list[list[Wave]]()
+    for w in sorted(waves):
+        fitting = (
+            g for g in groups if w[0] <= _MOST_ORDER * common_unit([w[0], *(v for v, _ in g)])
+        )
+        group = next(fitting, None)
+        groups.append([w]) if group is None else group.append(w)
+    return groups
+
+
+def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fraction]]:
+    """Return points around the waves of a group, jointly."""
+    unit = common_unit(w for w, _ in waves)
+    orders = {w: int(w / unit) for w, _ in waves}
+    around = wave_points(arc.scaled(unit), set(orders.values()))
+    return [{(w, s): p[orders[w], s] for w, s in waves} for p in around]
+
+
+def check_count(count: int) -> None:
+    """Refuse a hull of too many vertices.
+
+    Raises:
+        GainError: there are more than `MOST_VERTICES`.
+    """
+    if count > MOST_VERTICES:
+        raise GainError(
+            f"the hull of Jacobians has {count} vertices, and may have {MOST_VERTICES}; "
+            "fix some states or inputs of the domain at one value."
+        )
+
+
+class Corners(NamedTuple):
+    """Points around an atom's powers or waves; or one, each coordinate within `radius` of it."""
+
+    points: list[dict[Exponent, Fraction]]
+    radius: dict[Exponent, Fraction]
+
+    def bound(self, exponent: Exponent) -> Fraction:
+        """Return the largest absolute value of a coordinate."""
+        return max(abs(p[exponent]) for p in self.points) + self.radius[exponent]
+
+
+def _gathered(points: list[dict[Exponent, Fraction]]) -> Corners:
+    """Return points without repetition, or their middle where they all but agree."""
+    ends = {e: (min(p[e] for p in points), max(p[e] for p in points)) for e in points[0]}
+    if all(hi - lo <= _THIN * max(1, abs(hi)) for lo, hi in ends.values()):
+        middle = {e: (lo + hi) / 2 for e, (lo, hi) in ends.items()}
+        return Corners([middle], {e: (hi - lo) / 2 for e, (lo, hi) in ends.items()})
+    distinct = {tuple(p.items()): p for p in points}
+    return Corners(list(distinct.values()), {e: Fraction(0) for e in ends})
+
+
+class CornerValues(NamedTuple):
+    """A polynomial at the products of corners: one axis for each atom; off by at most `slack`."""
+
+    atoms: list[int]
+    array: np.ndarray
+    slack: Fraction
+
+
+def corner_values(p: Polynomial, corners: Mapping[int, Corners]) -> CornerValues:
+    """Return the values of a polynomial at all products of its atoms' corners.
+
+    It is affine in the coordinates of each atom, so their hull (and the slack) holds its values.
+    """
+    atoms = sorted(p.exponents())
+    array = np.empty([len(corners[atom].points) for atom in atoms], object)
+    for place in itertools.product(*(range(k) for k in array.shape)):
+        chosen = {a: corners[a].points[k] for a, k in zip(atoms, place, strict=True)}
+        array[place] = sum(
+            (c * math.prod(chosen[a][e] for a, e in m) for m, c in p.terms.items()), Fraction(0)
+        )
+    return CornerValues(atoms, array, _slack(p, corners))
+
+
+def _slack(p: Polynomial, corners: Mapping[int, Corners]) -> Fraction:
+    """Bound what the radii of corners change: each factor's radius times the others' bounds."""
+    return sum(
+        (
+            abs(c) * corners[a].radius[e] * math.prod(corners[b].bound(d) for b, d in m if b != a)
+            for m, c in p.terms.items()
+            for a, e in m
+            if corners[a].radius[e]
+        ),
+        Fraction(0),
+    )

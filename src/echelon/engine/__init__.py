@@ -1,0 +1,1 @@
+"""Parts in, one `Result` out: the closed loop in time."""

@@ -1,0 +1,96 @@
+"""Where the agents start: leaders on their reference, followers about their goals."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from echelon.core.errors import SimulationError
+from echelon.laws.law import Law
+from echelon.models.model import ControlAffine
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
+
+Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
+"""Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
+
+
+def initial_states(
+    model: ControlAffine,
+    graph: Graph,
+    formation: Formation,
+    leader: Law,
+    initial: Initial,
+    start_error: Mapping[str, float],
+    seed: int,
+) -> np.ndarray:
+    """Return the states (N, n) at time zero.
+
+    A leader starts where its law says, or in its given state, plus its offset and `start_error`. A
+    follower starts at its goal relative to the leader, plus a uniform random deviation within +-
+    the spread of each state. The same seed draws the same deviations whatever the spreads are.
+
+    Raises:
+        SimulationError: given states have a wrong shape or are not finite; a spread is negative.
+        ModelError: a spread or error names no state or group.
+    """
+    shape = (graph.agents, len(model.state_names))
+    error = _per_state(model, start_error, "start error")
+    if initial is not None and not isinstance(initial, Mapping):
+        states = _checked(initial, shape, "initial states have", "(agents, states)")
+        states[list(graph.leaders)] += error
+        return states
+    named = dict(initial or {})
+    spread = _per_state(
+        model,
+        {key: value for key, value in named.items() if isinstance(key, str)},
+        "initial spread",
+    )
+    if (spread < 0.0).any():
+        raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
+    leaders = np.asarray(leader.start(model), np.float64) + error
+    deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
+    deviations[list(graph.leaders)] = 0.0
+    states = leaders + formation.offsets + deviations
+    _place(states, {key: value for key, value in named.items() if not isinstance(key, str)}, graph)
+    states[[agent for agent in graph.leaders if agent in named]] += error
+    return states
+
+
+def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:
+    """Put the given agents into their given states."""
+    for agent, state in given.items():
+        _check_agent(agent, graph)
+        states[agent] = _checked(
+            state, states.shape[1:], f"the initial state of agent {agent} has", "(states,)"
+        )
+
+
+def _check_agent(agent: int, graph: Graph) -> None:
+    if not 0 <= agent < graph.agents:
+        raise SimulationError(
+            f"an initial state is given for agent {agent}, "
+            f"and agents are numbered from 0 to {graph.agents - 1}."
+        )
+
+
+def _checked(values: object, shape: tuple[int, ...], what: str, meaning: str) -> np.ndarray:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise SimulationError(
+            f"{what} shape {array.shape}, and must be finite with shape {shape} {meaning}."
+        )
+    return array
+
+
+def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
+    """Return one number a state, (n,), from numbers by state or group.
+
+    A state's own number wins over its group's.
+    """
+    values = np.zeros(len(model.state_names))
+    for name in sorted(named, key=lambda name: name in model.state_names):
+        if not np.isfinite(named[name]):
+            raise SimulationError(f"the {what} of `{name}` is {named[name]}, and must be finite.")
+        values[list(model.states_called(name))] = named[name]
+    return values

@@ -1,0 +1,77 @@
+"""What solving took in a run whose inputs an optimization gave."""
+
+import json
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from echelon.engine.result import Result
+
+_KEY = "solver"
+
+
+class SolverFigures(NamedTuple):
+    """The work of the solvers of all agents together.
+
+    Attributes:
+        method: `optimization`, planned once, or `mpc`, over a receding horizon.
+        solver: by CasADi's name.
+        solves: how many plans were asked for.
+        failures: how often a solver ended without a solution; the run went on with another attempt
+            or with the last plan.
+        seconds: of all solving.
+        median_ms, p99_ms, worst_ms: of the plans, each of one agent at one time.
+        iterations_median, iterations_worst: the solver's (`optimization`) or the quadratic programs
+            (`mpc`) of a plan.
+        setup_seconds: of making the solvers ready, once.
+    """
+
+    method: Literal["optimization", "mpc"]
+    solver: str
+    solves: int
+    failures: int
+    seconds: float
+    median_ms: float
+    p99_ms: float
+    worst_ms: float
+    iterations_median: float
+    iterations_worst: int
+    setup_seconds: float
+
+
+def figures_of(
+    method: Literal["optimization", "mpc"],
+    solver: str,
+    seconds: Sequence[float],
+    iterations: Sequence[int],
+    failures: int,
+    setup_seconds: float,
+) -> SolverFigures:
+    """Return the figures of plans that took these seconds and iterations."""
+    ms = 1e3 * np.array(seconds) if len(seconds) else np.zeros(1)
+    counts = np.array(iterations) if len(iterations) else np.zeros(1)
+    return SolverFigures(
+        method,
+        solver,
+        len(seconds),
+        failures,
+        float(np.sum(seconds)),
+        float(np.median(ms)),
+        float(np.percentile(ms, 99.0)),
+        float(ms.max()),
+        float(np.median(counts)),
+        int(counts.max()),
+        setup_seconds,
+    )
+
+
+def with_figures(result: Result, figures: SolverFigures) -> Result:
+    """Return the result with the figures in its provenance, which files keep."""
+    return result.with_provenance(**{_KEY: json.dumps(figures._asdict())})
+
+
+def solver_figures(result: Result) -> SolverFigures | None:
+    """Return what solving took, or None where the inputs came from laws."""
+    text = result.provenance.get(_KEY)
+    return None if text is None else SolverFigures(**json.loads(text))

@@ -1,0 +1,248 @@
+"""Gains as files: everything that the law needs to run, and what the gain was made for."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from echelon.certificates.certificate import Certificate, Region
+from echelon.certificates.domain import Domain
+from echelon.core.errors import GainError, OutputError
+from echelon.core.numerics import precision
+from echelon.core.types import Matrix, PathLike
+from echelon.gains.gain import Gain
+from echelon.models.linearization import linearize
+from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
+
+FORMAT = "echelon gain 2"
+_SAME = 1e-9
+"""Relative difference beyond which two models or spectra are not the same."""
+_MOST_EDGES = 2000
+"""The edges of a larger graph are left out; its eigenvalues stand for it."""
+
+_ENDS = {"lower": -np.inf, "upper": np.inf, "input_lower": 0.0, "input_upper": 0.0}
+"""The bounds of a domain, and what None stands for in each."""
+
+
+def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str, Any]:
+    """Return a gain ready for JSON: the law, and all that its certificate rests on.
+
+    That is the model, the graph with its eigenvalues, the domain and the corners of the hull of
+    Jacobians; `verify` recomputes every promise from them. A bound that is infinite is None.
+    """
+    return {
+        "format": FORMAT,
+        "method": gain.method,
+        "coupling": gain.coupling,
+        "P": gain.P.tolist(),
+        "R": gain.R.tolist(),
+        "inner": None if gain.inner is None else gain.inner.tolist(),
+        "model": _model_as_mapping(model),
+        "graph": {
+            "agents": graph.agents,
+            "leaders": list(graph.leaders),
+            "edges": _edges(graph),
+            "spectrum": graph.grounded_spectrum().tolist(),
+        },
+        "certificate": _certificate_as_mapping(gain.certificate),
+    }
+
+
+def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
+    with precision("float64"):
+        linear = linearize(model)
+    return {
+        "class": f"{type(model).__module__}:{type(model).__qualname__}",
+        "parameters": _parameters(model),
+        "state_names": list(model.state_names),
+        "input_names": list(model.input_names),
+        "trim": [list(part) for part in model.trim],
+        "input_scale": [list(row) for row in model.input_scale],
+        "A": linear.A.tolist(),
+        "B": linear.B.tolist(),
+    }
+
+
+def _parameters(model: ControlAffine) -> dict[str, Any] | None:
+    """Return the fields of a model, or None where JSON cannot hold one of them."""
+    fields = [field.name for field in dataclasses.fields(model) if field.init]
+    told = {name: getattr(model, name) for name in fields}
+    try:
+        return json.loads(
+            json.dumps(told, allow_nan=False, default=lambda x: np.asarray(x).tolist())
+        )
+    except (TypeError, ValueError):
+        return None
+
+
+def _edges(graph: Graph) -> list[list[float]] | None:
+    if len(graph.edges) > _MOST_EDGES:
+        return None
+    return [[*map(int, e), float(w)] for e, w in zip(graph.edges, graph.weights, strict=True)]
+
+
+def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
+    region = certificate.region
+    return {
+        "kind": certificate.kind,
+        "lambda_min": certificate.lambda_min,
+        "lambda_max": certificate.lambda_max,
+        "abscissa": certificate.abscissa,
+        "modes": certificate.modes,
+        "edge": certificate.edge,
+        "observable": certificate.observable,
+        "region": None if region is None else _region_as_mapping(region),
+    }
+
+
+def _region_as_mapping(region: Region) -> dict[str, Any]:
+    domain = region.domain
+    return {
+        "kind": region.kind,
+        "theorem": region.theorem,
+        "rate": region.rate,
+        "radius": region.radius,
+        "strength": region.strength,
+        "domain": {name: _finite(getattr(domain, name)) for name in _ENDS},
+        "hull": _packed(region.hull),
+        "error": region.error.tolist(),
+    }
+
+
+def _finite(bounds: Matrix) -> list[float | None]:
+    return [x if np.isfinite(x) else None for x in bounds.tolist()]
+
+
+def _packed(matrices: Matrix) -> dict[str, Any]:
+    """Return many matrices as one, and what of it changes: most entries are the same in all."""
+    places = np.argwhere((matrices != matrices[0]).any(axis=0))
+    values = matrices[:, places[:, 0], places[:, 1]]
+    return {"base": matrices[0].tolist(), "places": places.tolist(), "values": values.tolist()}
+
+
+def _unpacked(told: Mapping[str, Any]) -> Matrix:
+    values, places = np.array(told["values"], float), np.array(told["places"], int).reshape(-1, 2)
+    matrices = np.repeat(np.array(told["base"], float)[None], len(values), axis=0)
+    matrices[:, places[:, 0], places[:, 1]] = values
+    return matrices
+
+
+def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) -> None:
+    """Write a gain as JSON.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    told = gain_as_mapping(gain, model, graph)
+    lines = [f"{json.dumps(key)}: {json.dumps(told[key], allow_nan=False)}" for key in told]
+    try:
+        Path(path).write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
+    except OSError as error:
+        raise OutputError(f"`{path}` cannot be written: {error.strerror or error}.") from error
+
+
+def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
+    """Return the gain of a file, for the model and the graph that it was made for.
+
+    Raises:
+        GainError: the file is no gain, holds a number that is not finite, or was made for another
+            model or graph; the message says what differs.
+    """
+    told = _read(path)
+    try:
+        _check_model(path, told["model"], model)
+        _check_graph(path, told["graph"], graph)
+        return _gain(told)
+    except (LookupError, TypeError, ValueError) as error:
+        raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
+
+
+def _read(path: PathLike) -> Mapping[str, Any]:
+    try:
+        told = json.loads(Path(path).read_text("utf-8"))
+    except OSError as error:
+        raise GainError(f"the gain file `{path}` cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise GainError(f"the gain file `{path}` is no JSON: {error}.") from error
+    form = told.get("format") if isinstance(told, dict) else None
+    if form != FORMAT:
+        older = isinstance(form, str) and form.startswith("echelon gain ")
+        advice = f"is `{form}`; make it again with `echelon design`" if older else "is missing"
+        raise GainError(
+            f"`{path}` is no gain file that this echelon reads: its `format` must be `{FORMAT}`, "
+            f"and {advice}."
+        )
+    return told
+
+
+def _gain(told: Mapping[str, Any]) -> Gain:
+    inner, region = told["inner"], told["certificate"]["region"]
+    parts = {**told["certificate"], "region": None if region is None else _region(region)}
+    return Gain(
+        np.array(told["P"], float),
+        np.array(told["R"], float),
+        float(told["coupling"]),
+        str(told["method"]),
+        Certificate(**parts),
+        inner=None if inner is None else np.array(inner, float),
+    )
+
+
+def _region(told: Mapping[str, Any]) -> Region:
+    bounds = [
+        [end if x is None else x for x in told["domain"][name]] for name, end in _ENDS.items()
+    ]
+    return Region(
+        kind=told["kind"],
+        rate=told["rate"],
+        theorem=told["theorem"],
+        domain=Domain(*(np.array(some, float) for some in bounds)),
+        radius=told["radius"],
+        strength=told["strength"],
+        hull=_unpacked(told["hull"]),
+        error=np.array(told["error"], float),
+    )
+
+
+def _check_model(path: PathLike, told: Mapping[str, Any], model: ControlAffine) -> None:
+    """Check that the model is the one that the gain was made for, near its trim."""
+    with precision("float64"):
+        linear = linearize(model)
+    name, made_for = f"`{type(model).__name__}`", str(told["class"]).rpartition(":")[2]
+    for what, ours in (("state_names", model.state_names), ("input_names", model.input_names)):
+        if tuple(told[what]) != tuple(ours):
+            raise GainError(
+                f"the gain in `{path}` was made for `{made_for}` with {what} "
+                f"{list(told[what])}, and the model is {name} with {list(ours)}."
+            )
+    compared = {
+        "input_scale": (told["input_scale"], model.input_scale),
+        "the trim input": (told["trim"][1], model.trim[1]),
+        "A at the trim": (told["A"], linear.A),
+        "B at the trim": (told["B"], linear.B),
+    }
+    for what, (theirs, ours) in compared.items():
+        theirs, ours = np.asarray(theirs, float), np.asarray(ours, float)
+        gap = float(np.abs(theirs - ours).max())
+        if not gap <= _SAME * max(1e-12, float(np.abs(ours).max())):
+            raise GainError(
+                f"the gain in `{path}` was made for another {name}: {what} differs by {gap:.3g}; "
+                "make it again for these parameters."
+            )
+
+
+def _check_graph(path: PathLike, told: Mapping[str, Any], graph: Graph) -> None:
+    """Check that the spectrum is the one that the coupling was chosen for."""
+    eigenvalues = graph.grounded_spectrum()
+    for what, end in (("lambda_min", 0), ("lambda_max", -1)):
+        theirs, ours = told["spectrum"][end], eigenvalues[end]
+        if not abs(theirs - ours) <= _SAME * ours:
+            raise GainError(
+                f"the gain in `{path}` was made for a graph of {told['agents']} agents with "
+                f"{what} = {theirs:.6g}, and this graph of {graph.agents} has {ours:.6g}; "
+                "make it again."
+            )

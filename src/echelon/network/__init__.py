@@ -1,0 +1,1 @@
+"""Who hears whom, and where each belongs: graphs and formations."""

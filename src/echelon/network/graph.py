@@ -1,0 +1,400 @@
+"""The communication graph (paper, Definition 2).
+
+It is undirected, weighted or not, with one or more leaders.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
+import scipy.sparse.linalg as spla
+
+from echelon.core.errors import GraphError
+from echelon.core.types import Matrix, States
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+# Below this many followers the dense eigenvalue routine is both faster and exact to rounding.
+_DENSE = 400
+
+
+@final
+class Graph:
+    """An immutable undirected graph on agents 0 .. N-1, some of which are leaders.
+
+    Attributes:
+        edges: (E, 2) integers, each edge once with the smaller agent first, in the order given.
+        weights: (E,) positive weights A_ij.
+        agents: the number N of agents, leaders included.
+        leaders: sorted agent numbers.
+        followers: all other agents, sorted.
+
+    Raises:
+        GraphError: an edge is a self-loop, repeated or out of range; a weight is not positive and
+            finite; there is no leader or nothing but leaders; the graph is disconnected.
+    """
+
+    def __init__(
+        self,
+        edges: Iterable[Sequence[float]],
+        leaders: Iterable[int] = (0,),
+        agents: int | None = None,
+    ) -> None:
+        """Check and keep the graph; an edge is (i, j) or (i, j, weight)."""
+        pairs, weights = _split(edges)
+        self.agents = _count_agents(pairs, agents)
+        self.edges, self.weights = _checked_edges(pairs, weights, self.agents)
+        self.leaders = _checked_leaders(leaders, self.agents)
+        self.followers = tuple(np.setdiff1d(np.arange(self.agents), self.leaders).tolist())
+        if not self.followers:
+            raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
+        self._check_connected()
+        self._spectrum: Matrix | None = None
+        for array in (self.edges, self.weights):
+            array.setflags(write=False)
+
+    @classmethod
+    def from_edges(
+        cls,
+        edges: Iterable[Sequence[float]],
+        leaders: Iterable[int] = (0,),
+        agents: int | None = None,
+    ) -> "Graph":
+        """Return the graph of the given edges.
+
+        `agents` is the largest number named, plus one, when left out.
+        """
+        return cls(edges, leaders, agents)
+
+    @classmethod
+    def from_networkx(cls, graph: "nx.Graph[Any]", leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1.
+
+        The edge attribute `weight` is read, and is 1 where it is missing.
+
+        Raises:
+            GraphError: the graph is directed or its nodes are not 0 .. N-1.
+        """
+        if graph.is_directed():
+            raise GraphError("the networkx graph is directed, and must be undirected.")
+        if set(graph.nodes) != set(range(len(graph))):
+            raise GraphError(
+                "the nodes of the networkx graph must be the whole numbers from 0 on, "
+                "without a gap."
+            )
+        edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
+        return cls(edges, leaders, len(graph))
+
+    @classmethod
+    def path(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the line 0 - 1 - ... - (agents - 1)."""
+        _at_least(agents, 2, "path")
+        return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents)
+
+    @classmethod
+    def ring(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the closed line."""
+        _at_least(agents, 3, "ring")
+        return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents)
+
+    @classmethod
+    def star(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the star with agent 0 in the middle."""
+        _at_least(agents, 2, "star")
+        return cls([(0, i) for i in range(1, agents)], leaders, agents)
+
+    @classmethod
+    def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return the graph with every edge."""
+        _at_least(agents, 2, "complete")
+        return cls(np.stack(np.triu_indices(agents, 1), axis=1), leaders, agents)
+
+    @classmethod
+    def grid(cls, rows: int, columns: int, leaders: Iterable[int] = (0,)) -> "Graph":
+        """Return rows x columns agents, numbered row by row, linked to the nearest four."""
+        _at_least(rows * columns, 2, "grid")
+        number = np.arange(rows * columns).reshape(rows, columns)
+        across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
+        down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
+        return cls(np.concatenate([across, down]), leaders, rows * columns)
+
+    @classmethod
+    def geometric(
+        cls, agents: int, radius: float, seed: int = 0, leaders: Iterable[int] = (0,)
+    ) -> "Graph":
+        """Return random points of the unit square, linked where closer than `radius`.
+
+        Raises:
+            GraphError: the radius is too small for the points to be connected.
+        """
+        from scipy.spatial import KDTree
+
+        _at_least(agents, 2, "geometric")
+        points = np.random.default_rng(seed).uniform(size=(agents, 2))
+        pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
+        return cls(pairs[np.lexsort(pairs.T[::-1])], leaders, agents)
+
+    def adjacency(self) -> sp.csr_array:
+        """Return the symmetric adjacency matrix (N, N), sparse."""
+        i, j = self.edges.T
+        both = (np.concatenate([i, j]), np.concatenate([j, i]))
+        values = np.concatenate([self.weights, self.weights])
+        return sp.csr_array(sp.coo_array((values, both), shape=(self.agents, self.agents)))
+
+    def laplacian(self) -> sp.csr_array:
+        """Return the Laplacian (N, N), sparse; its rows sum to zero."""
+        return sp.csr_array(csgraph.laplacian(self.adjacency()))
+
+    def grounded_laplacian(self) -> sp.csr_array:
+        """Return the follower block of the Laplacian, sparse and positive definite.
+
+        It is the paper's L of Lemma 1.
+        """
+        rows = np.asarray(self.followers)
+        return sp.csr_array(self.laplacian()[rows][:, rows])
+
+    def inverse_grounded(self) -> Matrix:
+        """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
+        return np.linalg.inv(self.grounded_laplacian().toarray())
+
+    def grounded_spectrum(self) -> Matrix:
+        """Return the eigenvalues of the grounded Laplacian, ascending; computed once, read-only.
+
+        All of them up to 400 followers, beyond that the smallest and the largest.
+        """
+        if self._spectrum is None:
+            L = self.grounded_laplacian()
+            small = len(self.followers) <= _DENSE
+            self._spectrum = np.linalg.eigvalsh(L.toarray()) if small else _extremes(L)
+            self._spectrum.setflags(write=False)
+        return self._spectrum
+
+    def neighbours(self, agent: int) -> tuple[int, ...]:
+        """Return the agents linked to `agent`, sorted."""
+        if not 0 <= agent < self.agents:
+            raise GraphError(
+                f"agent {agent} is not in this graph, whose agents are 0 to {self.agents - 1}."
+            )
+        i, j = self.edges.T
+        return tuple(sorted(np.concatenate([j[i == agent], i[j == agent]]).tolist()))
+
+    def nearest_leader(self) -> tuple[int, ...]:
+        """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
+        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+        return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
+
+    def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
+        """Return the agents by how far they are from the leaders, each with its earlier neighbours.
+
+        It is the order in which agents can plan when each needs the plans of those before it. Among
+        the equally far the lower number comes first; a leader has no earlier neighbours.
+        """
+        order = np.argsort(self.depths(), kind="stable").tolist()
+        known = {agent: order[:place] for place, agent in enumerate(order)}
+        return tuple(
+            (i, () if i in self.leaders else tuple(j for j in self.neighbours(i) if j in known[i]))
+            for i in order
+        )
+
+    def depths(self) -> Matrix:
+        """Return (N,) how many edges away each agent's nearest leader is."""
+        among = {"indices": self.leaders, "unweighted": True, "min_only": True}
+        return csgraph.dijkstra(self.adjacency(), **among).astype(int)
+
+    def parents(self) -> tuple[int, ...]:
+        """Return each agent's only neighbour that is nearer to a leader; leaders are their own.
+
+        Raises:
+            GraphError: the graph is no tree (edges between leaders aside).
+        """
+        depth, parents = self.depths(), np.arange(self.agents)
+        i, j = self.edges[depth[self.edges].max(axis=1) > 0].T
+        child, parent = np.where(depth[i] > depth[j], (i, j), (j, i))
+        # An edge between two that are equally far gives both of them one more way.
+        counted = np.concatenate([child, parent[depth[i] == depth[j]]])
+        several = np.flatnonzero(np.bincount(counted, minlength=self.agents) > 1)
+        if len(several):
+            raise GraphError(
+                f"the graph is no tree: {_some(several)} more than one way to a leader, and so no "
+                "one parent; the feed-forward `relay` needs none."
+            )
+        parents[child] = parent
+        return tuple(parents.tolist())
+
+    def exchange(self) -> "Exchange":
+        """Return the computation of the disagreement on this graph, ready for JAX."""
+        i, j = self.edges.T
+        return Exchange(
+            receivers=np.concatenate([i, j]),
+            senders=np.concatenate([j, i]),
+            weights=np.concatenate([self.weights, self.weights]),
+        )
+
+    def disagreement(self, y: States) -> States:
+        """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""
+        return self.exchange()(y, y)
+
+    def relabelled(self, order: Sequence[int]) -> "Graph":
+        """Return the same graph with agent i renamed to order[i]."""
+        renamed = np.asarray(order)
+        edges = np.column_stack([renamed[self.edges], self.weights])
+        return Graph(edges.tolist(), renamed[list(self.leaders)].tolist(), self.agents)
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether two graphs have the same agents, leaders and edges in the same order."""
+        return (
+            isinstance(other, Graph)
+            and (self.agents, self.leaders) == (other.agents, other.leaders)
+            and np.array_equal(self.edges, other.edges)
+            and np.array_equal(self.weights, other.weights)
+        )
+
+    def __hash__(self) -> int:
+        """Hash what `__eq__` compares."""
+        return hash((self.agents, self.leaders, self.edges.tobytes(), self.weights.tobytes()))
+
+    def __repr__(self) -> str:
+        """Say the size."""
+        return f"Graph({self.agents} agents, {len(self.edges)} edges, leaders {list(self.leaders)})"
+
+    def _check_connected(self) -> None:
+        count, label = csgraph.connected_components(self.adjacency(), directed=False)
+        if count == 1:
+            return
+        reached = np.isin(label, label[list(self.leaders)])
+        lost = np.flatnonzero(~reached)
+        if len(lost):
+            raise GraphError(
+                f"the graph is disconnected: {_some(lost)} no path to a leader ({_leaders(self)})."
+            )
+        apart = np.flatnonzero(label != label[0])
+        raise GraphError(f"the graph is disconnected: {_some(apart)} no path to agent 0.")
+
+
+class Exchange(eqx.Module):
+    """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
+
+    The agents' own values and the values that they said are separate arguments, since on a real
+    network the second may be old or lost.
+    """
+
+    receivers: Matrix
+    senders: Matrix
+    weights: Matrix
+
+    def __call__(self, own: States, said: States) -> States:
+        """Return z (N, n), z_i = sum_j A_ij (own_i - said_j)."""
+        weights = jnp.asarray(self.weights, own.dtype)[:, None]
+        # Differences before sums: at consensus they vanish exactly, while sums of positions would
+        # leave rounding.
+        differences = weights * (own[self.receivers] - said[self.senders])
+        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
+
+
+def _extremes(L: sp.csr_array) -> Matrix:
+    """Return the smallest and the largest eigenvalue of a sparse positive definite matrix."""
+    # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
+    symmetric = {"SymmetricMode": True}
+    factor = spla.splu(sp.csc_array(L), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    inverse = spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
+    smallest = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
+    largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
+    return np.concatenate([smallest, largest])
+
+
+def _split(edges: Iterable[Sequence[float]]) -> tuple[Matrix, Matrix]:
+    """Return pairs (E, 2) of whole numbers and weights (E,)."""
+    if isinstance(edges, np.ndarray) and edges.ndim == 2 and edges.shape[1] == 2:
+        return _whole(edges, "an edge is"), np.ones(len(edges))
+    edges = [tuple(edge) for edge in edges]
+    for edge in edges:
+        if len(edge) not in (2, 3):
+            raise GraphError(f"an edge is {list(edge)}, and must be [i, j] or [i, j, weight].")
+    weights = np.array([edge[2] if len(edge) == 3 else 1.0 for edge in edges], dtype=np.float64)
+    return _whole([edge[:2] for edge in edges], "an edge is").reshape(-1, 2), weights
+
+
+def _whole(values: Sequence[Any] | Matrix, what: str) -> Matrix:
+    """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
+    if not _are_whole(values):
+        for value in values:
+            if not _are_whole(value):
+                shown = list(value) if isinstance(value, tuple) else value
+                raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
+    return np.array(values, dtype=np.float64).astype(np.int64)
+
+
+def _are_whole(values: object) -> bool:
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return bool((numbers == np.round(numbers)).all() and np.isfinite(numbers).all())
+
+
+def _count_agents(pairs: Matrix, agents: int | None) -> int:
+    named = int(pairs.max(initial=0)) + 1
+    if agents is None:
+        agents = named
+    _at_least(agents, 2, "graph")
+    if named > agents:
+        raise GraphError(
+            f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}."
+        )
+    return agents
+
+
+def _checked_edges(pairs: Matrix, weights: Matrix, agents: int) -> tuple[Matrix, Matrix]:
+    """Return the edges with the smaller agent first, and their weights."""
+    edges = np.sort(pairs, axis=1)
+    for i, j in pairs[edges[:, 0] < 0][:1]:
+        raise GraphError(
+            f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
+        )
+    for i, j in edges[edges[:, 0] == edges[:, 1]][:1]:
+        raise GraphError(
+            f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents."
+        )
+    _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    for i, j in edges[np.sort(first[count > 1])][:1]:
+        raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
+    wrong = ~((weights > 0.0) & (weights < np.inf))
+    for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
+        raise GraphError(
+            f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive and finite."
+        )
+    return edges, weights
+
+
+def _checked_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
+    chosen = tuple(sorted(set(_whole(list(leaders), "a leader is").tolist())))
+    if not chosen:
+        raise GraphError("the graph has no leader; name at least one agent in `leaders`.")
+    for leader in chosen:
+        if not 0 <= leader < agents:
+            raise GraphError(
+                f"leader {leader} is no agent; agents are numbered from 0 to {agents - 1}."
+            )
+    return chosen
+
+
+def _at_least(agents: int, least: int, kind: str) -> None:
+    if agents < least:
+        raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
+
+
+def _some(agents: np.ndarray) -> str:
+    """Return a subject such as `agents 2, 3 have`, shortened when there are many."""
+    shown = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
+    return f"agent {shown} has" if len(agents) == 1 else f"agents {shown} have"
+
+
+def _leaders(graph: Graph) -> str:
+    kind = "leader" if len(graph.leaders) == 1 else "leaders"
+    return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"

@@ -1,0 +1,1 @@
+"""Agents that solve optimization problems: plans and receding horizons."""

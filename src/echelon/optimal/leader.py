@@ -1,0 +1,149 @@
+"""A leader that minimizes its tracking error, as the paper's does: a plan, and feedback on it.
+
+The plan is made once, before the run, from where the leader is to start. The feedback keeps wind
+and a false mass from adding up, as they would open loop.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.errors import LawError
+from echelon.core.numerics import precision, rk4
+from echelon.core.types import Input, Matrix, Scalar, State
+from echelon.gains.gain import Gain
+from echelon.gains.riccati import Riccati
+from echelon.laws.consensus import feedback
+from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
+from echelon.optimal.formation_plan import plan_tracking
+from echelon.optimal.objectives import Planning, grid, reference_targets
+from echelon.references.flatness import reference_warnings
+from echelon.references.reference import Reference
+
+_STEP = 0.005
+"""Runge-Kutta step of the plan, s."""
+_BETWEEN = 4
+"""Runge-Kutta steps from the beginning of an interval of the plan to now."""
+
+
+class OptimalTracking(Law):
+    """u_L = u_p(t) - S R^-1 (g S)'P (x - x_p(t)), with (x_p, u_p) a plan of least tracking error.
+
+    The plan minimizes the integral of the squared error of the outputs, plus a little of the
+    squared input. After its horizon the law follows the reference by the model's flatness map.
+
+    Args:
+        reference: the path to follow.
+        horizon: of the plan, s.
+        start_error: what is added to the leader's start, per state or group: where the plan begins.
+            A leader that starts elsewhere is brought to the plan by the feedback.
+        limits: whether the plan keeps to the actuators' limits.
+        planning: how the plan is posed.
+        gain: of the feedback, used with coupling 1; the model's Riccati gain when left out.
+    """
+
+    reference: Reference
+    gain: Gain | None
+    states: Matrix | None
+    inputs: Matrix | None
+    horizon: float = eqx.field(static=True)
+    start_error: tuple[tuple[str, float], ...] = eqx.field(static=True)
+    limits: bool = eqx.field(static=True)
+    planning: Planning = eqx.field(static=True)
+
+    def __init__(
+        self,
+        reference: Reference,
+        horizon: float = 10.0,
+        start_error: Mapping[str, float] | None = None,
+        limits: bool = True,
+        planning: Planning | None = None,
+        gain: Gain | None = None,
+    ) -> None:
+        """Keep the problem; `prepared` solves it."""
+        self.reference, self.gain, self.states, self.inputs = reference, gain, None, None
+        self.horizon, self.limits = horizon, limits
+        self.start_error = tuple((start_error or {}).items())
+        self.planning = Planning() if planning is None else planning
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The whole reference."""
+        return ("the reference, all of it before the start",)
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "OptimalTracking":
+        """Complete the gain and make the plan, once.
+
+        Raises:
+            PlanError: there is no plan, or the model cannot follow a reference.
+            MissingExtraError: casadi is not installed.
+        """
+        if self.states is not None:
+            return self
+        gain = Riccati(coupling=1.0).solve(model, graph) if self.gain is None else self.gain
+        check_gain_fits(self, model, gain.P.shape, gain.R.shape)
+        times = grid(self.horizon, _STEP, self.planning.interval)
+        targets = reference_targets(model, self.reference, times.times)
+        start = np.array(targets.states[0])
+        for name, error in sorted(self.start_error, key=lambda e: e[0] in model.state_names):
+            places = list(model.states_called(name))
+            start[places] = targets.states[0][places] + error
+        plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
+        unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
+        return eqx.tree_at(
+            lambda law: (law.gain, law.states, law.inputs),
+            self,
+            (unit, plan.states, plan.inputs),
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+        """Tell how much faster the reference is than the actuators allow, where limits hold."""
+        return reference_warnings(model, self.reference, self.horizon) if self.limits else ()
+
+    def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return (x_p, u_p) at time t, or the reference's (x_r, u_r) after the plan.
+
+        Raises:
+            LawError: there is no plan yet.
+        """
+        if self.states is None or self.inputs is None:
+            raise LawError(
+                "`OptimalTracking` has no plan yet; call `prepared(model, graph)` first."
+            )
+        follow = model.flat(self.reference.derivatives(t, model.flat_order, model.flat_outputs))
+        dtype, count = follow[0].dtype, len(self.inputs)
+        span = grid(self.horizon, _STEP, self.planning.interval).interval
+        # A time that rounding has left just before an interval belongs to it.
+        k = jnp.floor(t / span + 1e-4).astype(jnp.int32)
+        held = jnp.clip(k, 0, count - 1)
+        u = jnp.asarray(self.inputs, dtype)[held]
+        x, step = jnp.asarray(self.states, dtype)[held], jnp.maximum(t - held * span, 0.0)
+        x = jax.lax.fori_loop(
+            0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
+        )
+        planned = k < count
+        return jnp.where(planned, x, follow[0]), jnp.where(planned, u, follow[1])
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the reference's state at time zero."""
+        return jnp.asarray(reference_targets(model, self.reference, np.zeros(1)).states[0])
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
+        """Return the reference's states (T, n), which the plan comes close to."""
+        with precision("float64"):
+            return jnp.asarray(reference_targets(model, self.reference, np.asarray(times)).states)
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the leader's input."""
+        state, u = self.target(model, view.t)
+        if self.gain is None:
+            raise LawError("`OptimalTracking` has no gain yet; call `prepared` first.")
+        error = model.difference(view.x, state + view.offset)
+        v = feedback(self.gain, model, view.x, error)
+        return u - model.physical(v, trim=False), memory

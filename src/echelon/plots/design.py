@@ -1,0 +1,282 @@
+"""The pictures of `design`: the modes of a loop, and what is certified beside what is observed."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from echelon.core.errors import GainError, did_you_mean, listing
+from echelon.core.numerics import precision
+from echelon.core.types import Matrix
+from echelon.gains.gain import Gain
+from echelon.models.linearization import linearize
+from echelon.models.model import ControlAffine
+from echelon.plots import style as draw
+from echelon.promises.certified_set import certified_at_rest
+from echelon.promises.closed_loop import CheckedLoop
+from echelon.scenario.build import Parts
+from echelon.studies.basin import (
+    Slice,
+    Trial,
+    converged,
+    grid,
+    observed_radius,
+    side_of,
+    slice_of,
+    trial,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MOST = 500
+_LOST, _HELD = "#F0C9A8", "#CFE3F1"  # pale, so that the sets' outlines stand out on them
+_CERTIFIED, _OBSERVED = draw.COLOURS[2], draw.COLOURS[0]
+
+
+class Radii(NamedTuple):
+    """Both radii of sum_i delta_i'P delta_i, for a leader at rest at the trim, and the slice.
+
+    `certified` is None where no set is; `observed` counts only starts of the slice, and `largest`
+    is where the trying ended.
+    """
+
+    states: tuple[str, str]
+    certified: float | None
+    observed: float
+    largest: float
+    horizon: float
+
+    def sentence(self) -> str:
+        """Say both, side by side."""
+        proved = "none, since no set is certified"
+        if self.certified is not None:
+            proved = "everywhere" if self.certified == np.inf else f"{self.certified:.3g}"
+        seen = f"{self.observed:.3g}" if self.observed < self.largest else "all that was tried,"
+        seen += "" if self.observed < self.largest else f" up to {self.largest:.3g}"
+        return (
+            f"Radius r of sum_i delta_i'P delta_i <= r^2, leader at rest: certified {proved}; "
+            f"observed {seen}, for starts in `{self.states[0]}` and `{self.states[1]}` alone, "
+            f"run for {self.horizon:.3g} s."
+        )
+
+
+def chosen_slice(model: ControlAffine, gain: Gain, asked: str | None) -> tuple[int, int]:
+    """Return the two states of a slice: those asked for, as `y,roll`, or a telling pair.
+
+    That is a velocity with the angle that drives it; where there is none, the first two coordinates
+    of the position, or the first two states.
+
+    Raises:
+        GainError: those asked for are not two different states of the model.
+    """
+    names = model.state_names
+    if asked is not None:
+        parts = [part.strip() for part in asked.split(",")]
+        for name in parts:
+            if name not in names:
+                raise GainError(
+                    f"`--slice` names `{name}`, and the states are {listing(names)}"
+                    f"{did_you_mean(name, names)}."
+                )
+        if len(set(parts)) != 2 or len(parts) != 2:
+            raise GainError(f"`--slice` is `{asked}`, and must be two states such as `y,roll`.")
+        return names.index(parts[0]), names.index(parts[1])
+    if len(names) < 2:
+        raise GainError(f"a slice needs two states, and `{type(model).__name__}` has one.")
+    return _telling(model, gain)
+
+
+def _telling(model: ControlAffine, gain: Gain) -> tuple[int, int]:
+    """Return a pair of states in which the loop is seen to work."""
+    groups = model.state_groups
+    if "velocity" in groups and "attitude" in groups:
+        moved, turned = model.states_called("velocity"), model.states_called("attitude")
+        with precision("float64"):
+            push = np.abs(linearize(model).A[np.ix_(moved, turned)])
+        row, column = np.unravel_index(int(push.argmax()), push.shape)
+        return moved[row], turned[column]
+    places = model.position_indices()
+    return (places[0], places[1]) if len(places) > 1 else (0, 1)
+
+
+def save_design_figures(
+    loop: CheckedLoop, folder: Path, asked: str | None = None
+) -> tuple[list[Path], Radii | None]:
+    """Write `modes` and `certified_set` of a gain as PNG and PDF; return paths and both radii.
+
+    A model of one state has no slice, a loop that does not decay has nothing to show in one, and
+    more than 500 followers take too long to run: then the second figure and the radii are missing.
+
+    Raises:
+        GainError: the slice asked for is none of the model's.
+        OSError: the folder or a file cannot be written.
+    """
+    gain, parts = loop.gain, loop.parts
+    assert gain is not None
+    made, radii = {}, None
+    sliced = asked is not None or len(parts.model.state_names) > 1
+    states = chosen_slice(parts.model, gain, asked) if sliced else None
+    with draw.style():
+        made["modes"] = _modes(loop)
+        if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
+            made["certified_set"], radii = _certified_set(loop, gain, states)
+    return draw.save(made, folder), radii
+
+
+# ---- modes ------------------------------------------------------------------------------------
+
+
+def _modes(loop: CheckedLoop) -> "Figure":
+    """Return the poles of every mode looked at in the complex plane, coloured by lambda."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    closed = loop.closed
+    values = closed.strengths / closed.coupling
+    A, B = loop.linear
+    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
+    figure = Figure((7.0, 4.2), layout="constrained")
+    ax = figure.add_subplot()
+    colour = np.repeat(values, poles.shape[1])
+    norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
+    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
+    dots = ax.scatter(poles.real.ravel(), poles.imag.ravel(), 34, colour, **look)
+    ax.axvline(0.0, color=draw.EDGE, linewidth=0.9, zorder=2)
+    slowest = float(poles.real.max())
+    ax.axvline(slowest, color=draw.COLOURS[1], linewidth=0.9, linestyle=(0, (4, 2)), zorder=2)
+    _wide_axis(ax, poles.real, poles.imag)
+    ax.set_xlabel("real part (1/s)")
+    ax.set_ylabel("imaginary part (rad/s)")
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
+    text, place = f"slowest: {slowest:.3g} 1/s", (slowest, 1.0)
+    near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
+    ax.annotate(text, place, (4, -4), va="top", size=9, color=draw.COLOURS[1], **near)
+    bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
+    bar.set_label("eigenvalue λ of the grounded Laplacian")
+    _label_bar(bar, values)
+    return figure
+
+
+def _wide_axis(ax: Any, real: Matrix, imaginary: Matrix) -> None:
+    """Use scales that show slow and fast poles alike, and end a little right of the axis."""
+    from matplotlib.ticker import FuncFormatter
+
+    sizes, heights = np.abs(real), np.abs(imaginary)
+    least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
+    right = max(0.0, float(real.max()))
+    if most > 30.0 * least:
+        ax.set_xscale("symlog", linthresh=least, linscale=0.6)
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
+    else:
+        ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
+    turning = heights[heights > 1e-9 * most]
+    if turning.size and heights.max() > 30.0 * np.median(turning):
+        ax.set_yscale("symlog", linthresh=float(np.median(turning)))
+    if not turning.size:
+        ax.set_ylim(-1.0, 1.0)
+
+
+def _label_bar(bar: Any, values: Matrix) -> None:
+    """Name each eigenvalue on the colour bar where they are few, else only powers of ten."""
+    from matplotlib.ticker import NullLocator
+
+    if len(values) <= 8:
+        bar.set_ticks(values, labels=[f"{value:.3g}" for value in values])
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+
+
+# ---- sets -------------------------------------------------------------------------------------
+
+
+def _certified_set(
+    loop: CheckedLoop, gain: Gain, states: tuple[int, int]
+) -> "tuple[Figure, Radii]":
+    """Return starts of a slice by whether they converge, with the certified ellipse over them.
+
+    A certified set much smaller than the observed one is shown again in a panel of its own.
+    """
+    from matplotlib.figure import Figure
+
+    parts = loop.parts
+    run, plane = _prepared(parts, gain, states)
+    certified, observed = certified_at_rest(loop), observed_radius(run, plane)
+    named = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
+    radii = Radii(named, certified, observed, plane.largest, run.horizon)
+    wide = np.minimum(plane.reach, plane.extents(1.8 * max(observed, 1e-2 * plane.largest)))
+    panels = [wide]
+    if certified and certified < np.inf and (plane.extents(certified) < 0.3 * wide).all():
+        panels.append(plane.extents(1.5 * certified))
+    figure = Figure((7.0, 4.0), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for ax, half in zip(axes, panels, strict=True):
+        _starts(ax, run, plane, half)
+        _ellipses(ax, plane, radii, half)
+        for name, k in zip("xy", states, strict=True):
+            text = draw.label(
+                f"{parts.model.state_names[k]} off the goal", parts.model.state_units[k]
+            )
+            getattr(ax, f"set_{name}label")(text)
+    if len(panels) > 1:
+        axes[0].set_title("as far as it is observed", size=10)
+        axes[1].set_title("as far as it is certified", size=10)
+    _legend(figure, axes[0], radii, run)
+    return figure, radii
+
+
+def _prepared(parts: Parts, gain: Gain, states: tuple[int, int]) -> tuple[Trial, Slice]:
+    settings = parts.settings
+    run = trial(parts.model, parts.graph, gain, float(settings["dt"]), bool(settings["limits"]))
+    return run, slice_of(parts.model, gain, len(parts.graph.followers), states)
+
+
+def _starts(ax: Any, run: Trial, plane: Slice, half: Matrix) -> None:
+    """Colour a grid of starts by whether they converge."""
+    from matplotlib.colors import ListedColormap
+
+    side = side_of(len(run.laplacian))
+    x, y = grid(plane, half, side)
+    starts = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    held = converged(run, plane, starts).reshape(side, side)
+    look = {"cmap": ListedColormap([_LOST, _HELD]), "vmin": 0.0, "vmax": 1.0, "rasterized": True}
+    ax.pcolormesh(x, y, held.astype(float), shading="nearest", zorder=0, **look)
+    ax.plot(0.0, 0.0, **draw.dots("+", draw.EDGE, 6.0))
+    ax.grid(False)
+    ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+
+
+def _ellipses(ax: Any, plane: Slice, radii: Radii, half: Matrix) -> None:
+    """Draw the certified and the observed set where they fit into the axes."""
+    shown: list[Any] = [(radii.observed, _OBSERVED, (0, (5, 2)), "none")]
+    if radii.certified and radii.certified < np.inf:
+        shown.append((radii.certified, _CERTIFIED, "-", _CERTIFIED))
+    for radius, colour, dash, fill in shown:
+        if not radius or (plane.extents(radius) < 0.004 * half).any():
+            continue
+        points = plane.ellipse(radius, 400)
+        points = np.vstack([points, points[:1]])
+        ax.plot(*points.T, color=colour, linestyle=dash, linewidth=1.5, zorder=3)
+        if fill != "none":
+            ax.fill(*points.T, color=fill, alpha=0.25, linewidth=0.0, zorder=2)
+
+
+def _legend(figure: "Figure", ax: Any, radii: Radii, run: Trial) -> None:
+    """Name colours and lines above the panels."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    proved = "no set is certified"
+    if radii.certified is not None:
+        proved = "certified" + (" empty" if not radii.certified else f", r = {radii.certified:.3g}")
+        proved = "certified everywhere" if radii.certified == np.inf else proved
+    seen = f"all starts tried converge, r = {radii.observed:.3g}"
+    lost = f"error not below {100.0 * run.fallen:.2g} % after {run.horizon:.3g} s"
+    ink = _CERTIFIED if radii.certified else "none"
+    handles: list[Any] = [
+        Line2D([], [], color=ink, linewidth=1.5, label=proved),
+        Line2D([], [], color=_OBSERVED, linestyle=(0, (5, 2)), linewidth=1.5, label=seen),
+        Patch(facecolor=_HELD, edgecolor="0.7", linewidth=0.5, label="converges, leader at rest"),
+        Patch(facecolor=_LOST, edgecolor="0.7", linewidth=0.5, label=lost),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2)

@@ -1,0 +1,285 @@
+"""How figures look, and the canvases and lines that they share: no pyplot, so no shared state."""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from echelon.core.types import Matrix
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette, told apart by colour-blind readers; its black is the leader's, and its
+# yellow is too pale for a line on white.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+LEADER, REFERENCE, EDGE = "black", "0.7", "0.3"
+
+FLOOR = 1e-17
+"""The least error that a logarithmic axis shows: below the rounding of a metre in float64."""
+
+NAMED = 10
+"""With more agents than this, followers look alike and the legend names none of them."""
+
+_TOP = 1e9  # A logarithmic axis that reached further would flatten what is of interest.
+_POINTS = 2000  # a line's, more than the pixels that it covers
+_ALL_POINTS = 200_000  # of all lines of one figure
+_WIDTH = 7.0  # inches: two columns of a journal
+_SIDE = 4.3  # inches: what a space may fill
+_STYLE: dict[Any, Any] = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 10,
+    "axes.labelsize": 10,
+    "xtick.labelsize": 9,
+    "ytick.labelsize": 9,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.1,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "pdf.fonttype": 42,  # Journals refuse fonts of type 3.
+    "savefig.dpi": 150,
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw in echelon's style, and put matplotlib's settings back."""
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE), np.errstate(over="ignore", invalid="ignore"):
+        yield
+
+
+# ---- lines ------------------------------------------------------------------------------------
+
+
+def crowding(agents: int) -> float:
+    """Return one for as many agents as a legend can name, and less for more."""
+    return min(1.0, NAMED / agents)
+
+
+def pen(place: int | None, agents: int) -> dict[str, Any]:
+    """Return the look of an agent's line: a leader's for None, else that of a follower's place."""
+    crowd = crowding(agents)
+    if place is None:
+        return {"color": LEADER, "linewidth": 1.4, "zorder": 2.5 if crowd == 1.0 else 5.0}
+    if crowd < 1.0:
+        thinner = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
+        return {"color": COLOURS[0]} | thinner
+    dash = "-" if place < len(COLOURS) else (0, (3, 1.2))
+    return {"color": COLOURS[place % len(COLOURS)], "linestyle": dash}
+
+
+def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> dict[str, Any]:
+    """Return the look of points without a line."""
+    return {
+        "linestyle": "none",
+        "marker": shape,
+        "color": colour,
+        "markersize": size,
+        "markerfacecolor": "white" if hollow else colour,
+        "markeredgewidth": 0.2 * size,
+        "zorder": 4,
+    }
+
+
+def plot(ax: Any, *columns: Matrix, **look: Any) -> None:
+    """Draw a line through points, given as arrays (T, k) of coordinates; one point as a dot."""
+    points = np.column_stack(columns)
+    if len(points) == 1 and "marker" not in look:
+        look |= {"marker": "o", "markersize": 4.0}
+    # The box of a space leans out of its axes.
+    ax.plot(*points.T, clip_on=ax.name != "3d", **look)
+
+
+def thin(frames: int, lines: int = 1) -> Matrix:
+    """Return the frames to draw: all of them, or evenly spread ones with the first and the last."""
+    count = int(np.clip(_ALL_POINTS // max(lines, 1), 100, _POINTS))
+    return np.unique(np.linspace(0, frames - 1, min(frames, count)).round().astype(int))
+
+
+def bounded(values: Matrix, *anchors: Matrix) -> tuple[Matrix, bool]:
+    """Return values (..., k) with NaN where they have run away, and whether any has.
+
+    Some have when they are a million times farther off than the anchors (..., k) reach; what is
+    within ten times stays.
+    """
+    known = np.concatenate([anchor.reshape(-1, values.shape[-1]) for anchor in anchors])
+    low, high = known.min(axis=0), known.max(axis=0)
+    middle, reach = 0.5 * low + 0.5 * high, max(1.0, (0.5 * high - 0.5 * low).max())
+    away = np.abs(values - middle).max(axis=-1)
+    if away.max(initial=0.0) <= 1e6 * reach:
+        return values, False
+    return np.where(away[..., None] > 10.0 * reach, np.nan, values), True
+
+
+# ---- canvases ---------------------------------------------------------------------------------
+
+
+def label(name: str, unit: str) -> str:
+    """Return the text of an axis: the name, with the unit where there is one."""
+    name = name.replace("_", " ")
+    return f"{name} ({unit})" if unit else name
+
+
+def panels(times: Matrix, horizon: float, rows: int, height: float) -> "tuple[Figure, list[Any]]":
+    """Return panels above each other that share the axis of time, `height` inches each."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((_WIDTH, max(3.2, height * rows)), layout="constrained")
+    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    # A lone frame stands on no axis, where half of its dots would be cut off.
+    limits = (0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon)
+    axes[-1].set(xlabel="time (s)", xlim=limits)
+    return figure, axes
+
+
+def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
+    """Return one set of axes in the plane or in space, for two or three labels."""
+    from matplotlib.figure import Figure
+
+    if len(labels) == 2:
+        figure = Figure((_WIDTH, 4.2), layout="constrained")
+        ax: Any = figure.add_subplot()
+    else:
+        figure = Figure((_WIDTH, _WIDTH))
+        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d", computed_zorder=False)
+        ax.view_init(elev=30.0, azim=-60.0)
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+            axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+            axis.line.set_color("0.5")
+    for name, text in zip("xyz", labels, strict=False):
+        getattr(ax, f"set_{name}label")(text)
+    return figure, ax
+
+
+def frame(ax: Any, points: Matrix, alike: bool = True) -> None:
+    """Fit axes around points (..., 2 or 3), where `alike` with one scale for all directions."""
+    points = points.reshape(-1, points.shape[-1])
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = high - low
+    # A flat path still needs a box with some height; a lone point one of any size.
+    least = np.full_like(size, 0.25 * size.max()) if alike else 1e-3 * np.abs(high)
+    half = 0.54 * np.maximum(size, np.where(least > 0.0, least, 1.0))
+    for name, middle, reach in zip("xyz", 0.5 * low + 0.5 * high, half, strict=False):
+        getattr(ax, f"set_{name}lim")(middle - reach, middle + reach)
+    if len(half) == 3:
+        _fit_box(ax, half)
+    elif alike:
+        ax.set_aspect("equal")
+        ax.figure.set_figheight(np.clip(0.7 + 5.0 * half[1] / half[0], 2.4, 5.2))
+
+
+def _fit_box(ax: Any, half: Matrix) -> None:
+    """Let the box of a space fill the width or the height, and the figure be no higher than it."""
+    room, left = np.array([_SIDE, _SIDE]), 0.5
+    ax.set_position((0.0, 0.0, _SIDE / _WIDTH, _SIDE / _WIDTH))
+    ax.set_box_aspect(half / half.max())
+    zoom = 1.0
+    # Perspective makes the size not quite proportional to the zoom, so it is corrected once more.
+    for _ in range(2):
+        low, high = _box_on_paper(ax)
+        zoom *= (room / (high - low)).min()
+        ax.set_box_aspect(half / half.max(), zoom=zoom)
+    low, high = _box_on_paper(ax)
+    height = high[1] - low[1] + 0.75
+    corner = np.array([left + 0.5 * (room[0] - high[0] + low[0]), 0.45]) - low
+    ax.figure.set_figheight(height)
+    ax.set_position((corner[0] / _WIDTH, corner[1] / height, _SIDE / _WIDTH, _SIDE / height))
+    _label_box(ax, half)
+
+
+def _label_box(ax: Any, half: Matrix) -> None:
+    """Choose the ticks of a box, and set their labels and the axes' off by the same on any box."""
+    from matplotlib.ticker import MaxNLocator
+
+    for k, name in enumerate("xyz"):
+        axis, count = getattr(ax, f"{name}axis"), 5 if half[k] > 0.4 * half.max() else 3
+        axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
+        # Matplotlib measures these distances in widths of the box.
+        stretch = _SIDE / 5.6 * half.max() / np.delete(half, k).max()
+        axis.labelpad = 24.5 * stretch - 21.0
+        ax.tick_params(axis=name, pad=11.0 * stretch - 8.0)
+
+
+def _box_on_paper(ax: Any) -> tuple[Matrix, Matrix]:
+    """Return the lower left and upper right of a space's box, in inches from the axes' corner."""
+    ax.apply_aspect()
+    corners = list(itertools.product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim(), [1.0]))
+    x, y, _, scale = ax.get_proj() @ np.array(corners).T
+    pixels = ax.transData.transform(np.column_stack([x, y]) / scale[:, None]) - ax.bbox.p0
+    inches = pixels / ax.figure.dpi
+    return inches.min(axis=0), inches.max(axis=0)
+
+
+def logarithmic(ax: Any, *values: Matrix) -> None:
+    """Make the value axis logarithmic, with room for the finite values and a sensible top."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    finite = np.concatenate([np.ravel(value) for value in values])
+    finite = finite[np.isfinite(finite) & (finite > 0.0)]
+    ends = np.log10([finite.min(), finite.max()]) if finite.size else np.array([-1.0, 0.0])
+    low, high = np.minimum(ends, np.log10(_TOP))
+    margin = 0.03 * (high - low)
+    # With less than two powers of ten between them, whole ones carry the labels.
+    low, high = (low - margin, high + margin) if high - low > 2 else (np.floor(low), np.ceil(high))
+    ax.set_autoscaley_on(False)
+    ax.set(yscale="log", ylim=(10.0**low, 10.0 ** max(high, low + 1.0)))
+    ax.yaxis.set_major_locator(LogLocator(numticks=8))
+    ax.yaxis.set_minor_locator(NullLocator())
+
+
+def save(figures: "Mapping[str, Figure]", folder: Path) -> list[Path]:
+    """Write each figure as PNG (150 dpi) and PDF into a folder, made if need be; return the paths.
+
+    Raises:
+        OSError: the folder or a file cannot be written.
+    """
+    paths = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        png, pdf = (folder / f"{name}.{kind}" for kind in ("png", "pdf"))
+        with style():
+            figure.savefig(png)
+            # Without its date, the same run writes the same file.
+            figure.savefig(pdf, metadata={"CreationDate": None})
+        paths += [png, pdf]
+    return paths
+
+
+def finish(figure: "Figure", cut: bool = False, once: bool = False) -> "Figure":
+    """Add legends, only the first where `once`, and the note on what is left out.
+
+    The layout is settled here, and not again for each format, which saves time.
+    """
+    for ax in figure.axes[:1] if once else figure.axes:
+        if not ax.get_legend_handles_labels()[1]:
+            continue
+        if ax.name == "3d":
+            figure.legend(loc="upper right", bbox_to_anchor=(0.995, 0.97))
+        else:
+            ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
+    if cut:
+        figure.suptitle("The run grew beyond these axes; what lies farther is not drawn.", size=9)
+    engine: Any = figure.get_layout_engine()
+    if engine is not None:
+        figure.align_ylabels()
+        engine.set(w_pad=0.07, h_pad=0.07)
+        # Axes of equal scales change their shape, and so their labels' places, with each pass.
+        for _ in range(1 if figure.axes[0].get_aspect() == "auto" else 4):
+            engine.execute(figure)
+        figure.set_layout_engine("none")
+    return figure

@@ -1,0 +1,151 @@
+"""The closed loop that `check` looks at, and the lines in which it says what it found."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.certificates.certificate import Certificate, Kind, Region, certify, parent_modes
+from echelon.certificates.margins import ClosedLoop, decays_between
+from echelon.core.types import Matrix
+from echelon.gains.gain import Gain
+from echelon.models.linearization import Linearization, linearize
+from echelon.scenario.build import Parts
+
+SHOWN = 32
+"""Of more eigenvalues of the graph than these, so many stand for all in the margins."""
+
+
+class Line(NamedTuple):
+    """One statement: its verdict, the kind of argument, the number behind it, what to change."""
+
+    statement: str
+    verdict: str
+    kind: Kind | str
+    number: str
+    text: str
+
+
+class Checked(NamedTuple):
+    """All lines, whether the closed loop is promised anything, and the promise in a sentence."""
+
+    lines: tuple[Line, ...]
+    promised: bool
+    promise: str
+
+
+class CheckedLoop(NamedTuple):
+    """What every line reads: the parts, and their closed loop near the trim.
+
+    Attributes:
+        parts: of the scenario.
+        linear: A (with the inner loop closed) and B at the trim.
+        closed: the modes that margins are taken of.
+        where: which eigenvalues of the graph those are, in words.
+        every: whether the modes of all eigenvalues of the graph decay, not only of those.
+        certificate: of the linearization.
+        broken: offsets that are no symmetries, by agent.
+    """
+
+    parts: Parts
+    linear: Linearization
+    closed: ClosedLoop
+    where: str
+    every: bool
+    certificate: Certificate
+    broken: dict[int, str]
+
+    @property
+    def gain(self) -> Gain | None:
+        """The followers' gain, where their law has one."""
+        gain = getattr(self.parts.follower, "gain", None)
+        return gain if isinstance(gain, Gain) else None
+
+    @property
+    def region(self) -> Region | None:
+        """What the gain promises on a domain; nothing where parents' inputs are fed forward.
+
+        The modes are then no longer those of a symmetric matrix, which its proof rests on.
+        """
+        if self.gain is None or self.fed_by_parents:
+            return None
+        return self.gain.certificate.region
+
+    @property
+    def fed_by_parents(self) -> bool:
+        """Whether each follower is told the input of its parent."""
+        return self.parts.follower.asks() == "parent"
+
+    @property
+    def inner(self) -> Matrix:
+        """The inner loop K (m, n) that is closed in A; zero without one."""
+        gain = self.gain
+        shape = self.linear.B.T.shape
+        return np.zeros(shape) if gain is None or gain.inner is None else gain.inner
+
+    @property
+    def governed(self) -> bool:
+        """Whether the followers run a law that this page speaks of, u = u_ff - c R^-1 g'P z."""
+        return self.parts.follower.metric(self.parts.model) is not None
+
+    @property
+    def trimmed(self) -> bool:
+        """Whether the law applies the trim input, or there is none."""
+        trim = np.asarray(self.parts.model.trim[1], float)
+        return getattr(self.parts.follower, "trim", True) or not trim.any()
+
+    @property
+    def disturbed(self) -> str:
+        """What the scenario adds that no promise covers, in words; empty without any."""
+        told = []
+        if self.parts.settings.get("disturbance") is not None:
+            told.append("wind or noise acts on the agents")
+        if self.parts.settings.get("plant") is not None:
+            told.append("the agents differ from the model")
+        return " and ".join(told)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the leader has a reference to follow."""
+        leader, model = self.parts.leader, self.parts.model
+        return leader.reference_states(model, jnp.zeros(1)) is not None
+
+    @property
+    def matched(self) -> bool:
+        """Whether the followers are told an input, or the leader has none beyond the trim."""
+        return self.parts.follower.asks() != "none" or not self.moving
+
+
+def checked_loop(parts: Parts) -> CheckedLoop:
+    """Return the closed loop of built parts, in float64."""
+    model, graph = parts.model, parts.graph
+    gain = getattr(parts.follower, "gain", None)
+    n, m = len(model.state_names), len(model.input_names)
+    A, B = linearize(model)
+    P, R, c, edge = parts.follower.metric(model), np.eye(m), 1.0, None
+    if isinstance(gain, Gain):
+        R, c, edge = gain.R, gain.coupling, gain.certificate.edge
+        A = A if gain.inner is None else A - B @ gain.inner
+    linear, P = Linearization(A, B), np.eye(n) if P is None else P
+    modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
+    if parts.follower.asks() == "parent":
+        edge = None if edge is None else edge * modes[0]
+        modes = parent_modes(graph)
+        edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"
+    certificate = certify(linear, graph, P, R, c, edge, modes=modes)
+    values, where = _looked_at(modes, count, kind)
+    closed = ClosedLoop(A, B, P, R, c, values)
+    every = certificate.stable and (certificate.modes == count or decays_between(closed))
+    broken = parts.formation.broken_symmetries(model)
+    return CheckedLoop(parts, linear, closed, where, every, certificate, broken)
+
+
+def _looked_at(spectrum: Matrix, count: int, kind: str) -> tuple[Matrix, str]:
+    """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
+    if len(spectrum) < count:
+        values = np.geomspace(spectrum[0], spectrum[-1], SHOWN)
+        return values, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
+    if len(spectrum) <= SHOWN:
+        return spectrum, f"all {kind} of the graph"
+    places = np.linspace(0, len(spectrum) - 1, SHOWN).round().astype(int)
+    return spectrum[places], f"{SHOWN} of {count} {kind}, the extreme ones among them"

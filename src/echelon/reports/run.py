@@ -1,0 +1,123 @@
+"""The report of a run on the screen.
+
+A table like the paper's Table II, and what it shows, in sentences.
+"""
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from echelon.engine.result import Result
+from echelon.reports.explain import explain
+from echelon.reports.printed import PRINTED, ROUNDING, is_papers_experiment
+from echelon.results.metrics import FollowerMetrics, LeaderMetrics, Metrics, metrics
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+# Above this many followers the table shows the best, the median and the worst instead of all.
+_MANY = 12
+
+
+def report(result: Result, steady_window: float | None = None) -> str:
+    """Return the report of a run as plain text.
+
+    Args:
+        result: the run.
+        steady_window: the last part of the run that counts as steady, s; a fifth of the horizon
+            when left out.
+    """
+    from rich.console import Console
+
+    text = io.StringIO()
+    # Called a terminal so that sentences wrap; without colours it is plain text all the same.
+    console = Console(file=text, width=100, color_system=None, force_terminal=True)
+    print_report(console, result, metrics(result, steady_window))
+    return text.getvalue().rstrip("\n")
+
+
+def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
+    """Print the report of a run on a rich console."""
+    scenario, model = result.provenance.get("scenario", ""), type(result.model).__name__
+    printed = is_papers_experiment(scenario, model, result.graph.agents)
+    console.print(_table(result, numbers, printed))
+    sentences = [*explain(result, numbers), *(f"Warning: {text}" for text in result.warnings)]
+    for sentence in [*sentences, ROUNDING] if printed else sentences:
+        say(console, sentence)
+
+
+def say(console: "Console", sentence: str) -> None:
+    """Print a sentence as an item of a list, on one line where the output is no terminal."""
+    console.print(f"- {sentence}", highlight=False, markup=False, soft_wrap=not console.is_terminal)
+
+
+def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
+    from rich import box
+    from rich.table import Table
+
+    unit = "" if result.unit == "state" else f", {result.unit}"
+    steady = f"steady{unit}\n(last {numbers.steady_window:.3g} s)"
+    settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
+    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
+    if printed:
+        columns += ["printed,\nconsensus", "printed,\noptimiz."]
+    title = f"{_title(result)}, {result.settings.horizon:g} s, seed {result.settings.seed}"
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
+    for row in _rows(result, numbers, printed):
+        table.add_row(*row)
+    return table
+
+
+def _title(result: Result) -> str:
+    return (
+        result.provenance.get("scenario")
+        or f"{result.graph.agents} x {type(result.model).__name__}"
+    )
+
+
+def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
+    leaders, followers = result.graph.leaders, numbers.followers
+    limited = float(result.saturated[leaders[0]])
+    rows = [_leader_row(numbers.leader, limited)]
+    chosen = followers if len(followers) <= _MANY else _representatives(followers)
+    labels = [f"follower {each.agent}" for each in chosen]
+    if len(followers) > _MANY:
+        labels = [
+            f"{kind} ({label})"
+            for kind, label in zip(("best", "median", "worst"), labels, strict=True)
+        ]
+    rows += [_follower_row(label, each) for label, each in zip(labels, chosen, strict=True)]
+    if printed:
+        for k, row in enumerate(rows):
+            row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
+    return rows
+
+
+def _representatives(followers: Sequence[FollowerMetrics]) -> list[FollowerMetrics]:
+    def key(each: FollowerMetrics) -> float:
+        return float("inf") if each.steady_rmse is None else each.steady_rmse
+
+    ordered = sorted(followers, key=key)
+    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
+
+
+def _leader_row(leader: LeaderMetrics, limited: float) -> list[str]:
+    return ["leader", _number(leader.rmse), _number(leader.steady_rmse), "", "", _percent(limited)]
+
+
+def _follower_row(label: str, each: FollowerMetrics) -> list[str]:
+    settled = "never" if each.settling_time is None else f"{each.settling_time:.4g}"
+    settled = "-" if each.rmse is None else settled
+    errors = [_number(each.rmse), _number(each.steady_rmse)]
+    return [label, *errors, settled, _number(each.effort), _percent(each.saturated)]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _percent(value: float) -> str:
+    return f"{100.0 * value:.3g}"

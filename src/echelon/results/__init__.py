@@ -1,0 +1,1 @@
+"""Numbers of a `Result`: metrics, the Lyapunov function, the dataset."""

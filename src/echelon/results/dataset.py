@@ -1,0 +1,146 @@
+"""The dataset of a run, labelled, with units and provenance, and its summary.
+
+The dataset is one netCDF file, the summary is JSON.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from echelon.engine.result import Result
+from echelon.gains.gain import Gain
+from echelon.results.lyapunov import lyapunov
+from echelon.results.metrics import Metrics, metrics
+from echelon.world.plant import differences
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def dataset(result: Result) -> "xr.Dataset":
+    """Return a run as a dataset with dimensions time, agent, state, input, edge.
+
+    Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
+    `offset`, `reference`, `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`,
+    `edge_agents`, `edge_weight`.
+    """
+    import xarray as xr
+
+    model, per_agent = result.model, ("time", "agent", "state")
+    variables: dict[str, Any] = {
+        "states": (per_agent, result.states),
+        "error": (per_agent, result.errors),
+        "inputs": (("time", "agent", "input"), result.inputs),
+        "offset": (("agent", "state"), result.formation.offsets),
+        "saturated": ("agent", result.saturated),
+        "is_leader": (
+            "agent",
+            np.isin(np.arange(result.graph.agents), result.graph.leaders).astype(np.int8),
+        ),
+        "edge_agents": (("edge", "end"), result.graph.edges),
+        "edge_weight": ("edge", result.graph.weights),
+    }
+    if result.reference is not None:
+        variables["reference"] = (("time", "state"), result.reference)
+    v = lyapunov(result)
+    if v is not None:
+        variables |= {"lyapunov": ("time", v.value), "lyapunov_rate": ("time", v.rate)}
+        variables["lyapunov_drift"] = ("time", v.drift)
+    coordinates = {
+        "time": ("time", result.times, {"units": "s"}),
+        "agent": np.arange(result.graph.agents),
+        "state": list(model.state_names),
+        "state_unit": ("state", list(model.state_units)),
+        "input": list(model.input_names),
+        "input_unit": ("input", list(model.input_units)),
+    }
+    return xr.Dataset(variables, coordinates, _attributes(result))
+
+
+def _attributes(result: Result) -> dict[str, Any]:
+    """Return provenance and settings as attributes that netCDF can hold."""
+    settings = {
+        key: int(v) if isinstance(v, bool) else v for key, v in result.settings._asdict().items()
+    }
+    laws = {
+        f"{role}_needs": "; ".join(law.needs) or "nothing"
+        for role, law in (("leader", result.leader), ("follower", result.follower))
+    }
+    told = {key: text for key, text in imperfections(result).items() if text is not None}
+    told |= {"outcome": result.outcome.name.lower(), "message": result.message}
+    warnings = {"warnings": "\n".join(result.warnings)}
+    return {
+        **result.provenance,
+        **told,
+        **warnings,
+        **settings,
+        **laws,
+        "model": type(result.model).__name__,
+    }
+
+
+def imperfections(result: Result) -> dict[str, str | None]:
+    """Return in words how the plant differs from the model, and what disturbed it; else None."""
+    plant, disturbance = result.plant, result.disturbance
+    return {
+        "plant": None if plant is None else differences(result.model, plant),
+        "disturbance": None if disturbance is None else str(disturbance),
+    }
+
+
+def save_dataset(result: Result, path: Path) -> None:
+    """Write the dataset of a run as netCDF."""
+    dataset(result).to_netcdf(path, engine="h5netcdf")
+
+
+def gain_of(result: Result) -> Gain | None:
+    """Return the followers' gain, where their law has one."""
+    gain = getattr(result.follower, "gain", None)
+    return gain if isinstance(gain, Gain) else None
+
+
+def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
+    """Return the run's summary, ready for JSON; what does not exist is None."""
+    numbers = metrics(result) if numbers is None else numbers
+    gain = gain_of(result)
+    eigenvalues = result.graph.grounded_spectrum()
+    return {
+        "scenario": result.provenance.get("scenario", ""),
+        "outcome": {"name": result.outcome.name.lower(), "message": result.message},
+        "agents": result.graph.agents,
+        "unit": result.unit,
+        "horizon_s": result.settings.horizon,
+        "dt_s": result.settings.dt,
+        "seed": result.settings.seed,
+        **imperfections(result),
+        "leader": numbers.leader._asdict(),
+        "followers": [_follower(each._asdict()) for each in numbers.followers],
+        "edges": [
+            {"edge": list(each.edge), "distance_rmse": each.distance_rmse} for each in numbers.edges
+        ],
+        "gain": None
+        if gain is None
+        else {
+            "method": gain.method,
+            "coupling": gain.coupling,
+            "P": gain.P.tolist(),
+            "R": gain.R.tolist(),
+        },
+        "lambda_min": float(eigenvalues[0]),
+        "lambda_max": float(eigenvalues[-1]),
+        "minimum_distance": numbers.minimum_distance,
+        "saturation_fraction": numbers.saturation_fraction,
+        "steady_window_s": numbers.steady_window,
+        "warnings": list(result.warnings),
+        "wall_time_s": result.wall_time,
+        "versions": {
+            key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
+        },
+    }
+
+
+def _follower(entry: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "settling_time_s" if key == "settling_time" else key: value for key, value in entry.items()
+    }

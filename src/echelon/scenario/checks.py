@@ -1,0 +1,280 @@
+"""Faults of a scenario that no single key shows: keys at odds with others, agents not there.
+
+The checks read the plain data of the file and step around whatever is malformed (the schema reports
+that), so one fault never hides another. Each check yields the path of a fault and its sentence.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+
+from echelon.scenario.registry import LEADER_LAWS
+from echelon.scenario.yaml import Document, KeyPath, are, shown
+
+Fault = tuple[KeyPath, str]
+Part = Mapping[object, object]
+
+# Of these two keys a section has one at most; True where it must have one.
+_TRACKS = ("tracking", "optimal-tracking")
+"""The leader laws that follow a reference."""
+
+_SOURCES: dict[str, tuple[str, str, bool]] = {
+    "model": ("name", "python", True),
+    "graph": ("edges", "name", True),
+    "formation": ("offsets", "name", False),
+    "initial": ("spread", "states", False),
+}
+
+# What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
+_Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
+_GRAPH_KEYS: _Taken = {
+    "edges": ((), ("agents",)),
+    "path": (("agents",), ()),
+    "ring": (("agents",), ()),
+    "star": (("agents",), ()),
+    "complete": (("agents",), ()),
+    "grid": (("rows", "columns"), ("agents",)),
+    "geometric": (("agents", "radius"), ("seed",)),
+}
+_FORMATION_KEYS: _Taken = {
+    "offsets": ((), ()),
+    "triangle": ((), ("spacing",)),
+    "line": ((), ("spacing",)),
+    "wedge": ((), ("spacing",)),
+    "circle": ((), ("spacing",)),
+    "grid": ((), ("spacing", "columns")),
+}
+_GAIN_KEYS: _Taken = {
+    "riccati": ((), ("Q", "R", "coupling")),
+    "given": (("P",), ("R", "coupling")),
+    "inner-loop": ((), ("coupling", "symmetry_weight")),
+    "monotone": (("domain",), ("coupling",)),
+    "robust-lqr": (("domain",), ("Q", "R", "coupling", "exact")),
+    "contraction": (("domain", "rate"), ("coupling", "exact")),
+    "file": ((), ()),
+}
+
+
+def _section(data: Part, *path: str) -> Part:
+    """Return the mapping at `path`; an empty one where there is none."""
+    for key in path:
+        inner = data.get(key)
+        data = inner if isinstance(inner, dict) else {}
+    return data
+
+
+def number_of(value: object) -> float | None:
+    """Return a real number as a float, anything else (a truth value too) as None."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _whole(value: object) -> int | None:
+    return value if type(value) is int else None
+
+
+def _infinite(value: object, path: KeyPath) -> Iterator[Fault]:
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _infinite(item, (*path, key))
+        return
+    number = number_of(value)
+    if number is not None and not math.isfinite(number):
+        yield path, f"got {shown(value)}, allowed is a finite number."
+
+
+def _sources(data: Part) -> Iterator[Fault]:
+    for name, (one, other, required) in _SOURCES.items():
+        part = data.get(name)
+        if not isinstance(part, dict):
+            continue
+        given = [key for key in (one, other) if part.get(key) is not None]
+        if len(given) == 2:
+            yield (name,), f"got both `{one}` and `{other}`, allowed is one of them."
+        elif required and not given:
+            yield (name,), f"got neither `{one}` nor `{other}`, allowed is exactly one of them."
+
+
+def _choice(part: Part, free: str) -> object:
+    """Return what a section is made from, the key `free` or its name; None where both stand."""
+    if part.get(free) is None:
+        return part.get("name")
+    return free if part.get("name") is None else None
+
+
+def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator[Fault]:
+    """Yield keys that `choice` lacks, and keys that belong to another choice."""
+    if not isinstance(choice, str) or choice not in table:
+        return
+    needed, optional = table[choice]
+    for key in needed:
+        if part.get(key) is None:
+            yield (*path, key), f"got nothing, `{choice}` needs this key."
+    foreign = {key for pair in table.values() for keys in pair for key in keys}
+    allowed = are(needed + optional) if needed + optional else "is no other key"
+    for key in part:
+        if key in foreign - {*needed, *optional}:
+            yield (
+                (*path, str(key)),
+                f"got a key that `{choice}` does not take, allowed beside it {allowed}.",
+            )
+
+
+def _choices(data: Part) -> Iterator[Fault]:
+    graph, formation = _section(data, "graph"), _section(data, "formation")
+    yield from _taken(("graph",), graph, _choice(graph, "edges"), _GRAPH_KEYS)
+    yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
+    for role in ("leader", "follower"):
+        gain = _section(data, role, "gain")
+        if gain.get("file") is not None and gain.get("method") is not None:
+            yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
+        made_by = "file" if gain.get("file") is not None else gain.get("method", "riccati")
+        yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
+
+
+def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
+    """Yield the place in the list, and the smaller and larger agent, of every well-formed edge."""
+    edges = graph.get("edges")
+    for index, edge in enumerate(edges if isinstance(edges, list) else ()):
+        if not isinstance(edge, list) or len(edge) < 2:
+            continue
+        i, j = _whole(edge[0]), _whole(edge[1])
+        if i is not None and j is not None and i != j and min(i, j) >= 0:
+            yield index, (min(i, j), max(i, j))
+
+
+def _edges(document: Document) -> Iterator[Fault]:
+    graph = _section(document.data, "graph")
+    agents = _whole(graph.get("agents"))
+    first: dict[tuple[int, int], int] = {}
+    for index, pair in _pairs(graph):
+        path = ("graph", "edges", index)
+        if pair in first:
+            at = document.place(("graph", "edges", first[pair]))
+            said = (
+                f"got agents `{pair[0]}` and `{pair[1]}` again, allowed is one edge for each pair"
+            )
+            yield path, f"{said}, and theirs stands at {at}."
+        first.setdefault(pair, index)
+        if agents is not None and pair[1] >= agents > 0:
+            yield path, f"got agent `{pair[1]}`, {_range(agents)}."
+
+
+def _range(agents: int) -> str:
+    return f"allowed are agents `0` to `{agents - 1}`" if agents > 1 else "allowed is agent `0`"
+
+
+def _numbered(graph: Part) -> int | None:
+    """Return the largest number in the edges, plus one; None where an edge cannot be read."""
+    edges, pairs = graph.get("edges"), list(_pairs(graph))
+    if not isinstance(edges, list) or len(pairs) != len(edges):
+        return None
+    return max((pair[1] + 1 for _, pair in pairs), default=None)
+
+
+def _agents(graph: Part) -> int | None:
+    """Return how many agents the graph has, as far as the file tells; None where it does not."""
+    agents = _whole(graph.get("agents"))
+    rows, columns = _whole(graph.get("rows")), _whole(graph.get("columns"))
+    if graph.get("name") == "grid":
+        agents = None if rows is None or columns is None else rows * columns
+    elif agents is None and graph.get("name") is None:
+        agents = _numbered(graph)
+    return agents if agents is not None and agents > 0 else None
+
+
+def _grid(data: Part) -> Iterator[Fault]:
+    graph = _section(data, "graph")
+    agents, size = _whole(graph.get("agents")), _agents(graph)
+    if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
+        said = f"got `{agents}`, allowed is rows times columns, `{size}`"
+        yield ("graph", "agents"), f"{said}, or no such key."
+
+
+def _unknown(
+    path: KeyPath, what: str, numbers: Iterable[tuple[str | int, object]], agents: int
+) -> Iterator[Fault]:
+    """Yield every one of `numbers` (the key it stands at, and its value) that is no agent."""
+    for key, value in numbers:
+        agent = _whole(value)
+        if agent is not None and not 0 <= agent < agents:
+            yield (*path, key), f"got {what} `{agent}`, {_range(agents)}."
+
+
+def _members(data: Part) -> Iterator[Fault]:
+    """Yield leaders, offsets and starts of agents that the graph does not have."""
+    agents = _agents(_section(data, "graph"))
+    leaders = _section(data, "graph").get("leaders", [0])
+    leaders = leaders if isinstance(leaders, list) else [0]
+    if not leaders:
+        yield ("graph", "leaders"), "got no leader, allowed is a list of at least one agent."
+    for index, leader in enumerate(leaders):
+        if _whole(leader) is not None and leader in leaders[:index]:
+            yield (
+                ("graph", "leaders", index),
+                f"got leader `{leader}` again, allowed is each agent once.",
+            )
+    if agents is None:
+        return
+    yield from _unknown(("graph", "leaders"), "leader", enumerate(leaders), agents)
+    for section, key, what in (
+        ("formation", "offsets", "an offset for agent"),
+        ("initial", "states", "a state for agent"),
+    ):
+        given = _section(data, section, key)
+        numbers = ((number, number) for number in given if isinstance(number, int))
+        yield from _unknown((section, key), what, numbers, agents)
+
+
+def _following(data: Part) -> Iterator[Fault]:
+    """Yield a leader that tracks nothing, and a reference that nobody tracks."""
+    law, given = _section(data, "leader").get("law"), data.get("reference") is not None
+    if law in _TRACKS and not given:
+        yield (
+            ("leader", "law"),
+            f"got `{law}` without a `reference`, a leader that tracks needs one.",
+        )
+    if given and isinstance(law, str) and law in LEADER_LAWS and law not in _TRACKS:
+        said = f"got a reference for a leader whose law is `{law}`"
+        allowed = " or ".join(f"`{name}`" for name in _TRACKS)
+        yield ("reference",), f"{said}, allowed is one only with the law {allowed}."
+
+
+def _changed(data: Part) -> Iterator[Fault]:
+    """Yield parameters of the plant that are both given and scaled."""
+    given, scaled = (_section(data, "plant", key) for key in ("parameters", "scale"))
+    for name in (name for name in scaled if isinstance(name, str) and name in given):
+        said = "got a factor on a parameter that `plant.parameters` gives"
+        yield ("plant", "scale", name), f"{said}, allowed is one of them."
+
+
+def _durations(data: Part) -> Iterator[Fault]:
+    simulation = _section(data, "simulation")
+    horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
+    if horizon is not None and dt is not None and 0 < horizon < dt:
+        said = f"got {shown(simulation['horizon'])}, allowed is at least one step"
+        yield (
+            ("simulation", "horizon"),
+            f"{said}, and `simulation.dt` is {shown(simulation['dt'])}.",
+        )
+
+
+def cross_faults(document: Document) -> Iterator[Fault]:
+    """Yield the path and the sentence of every fault that takes more than one key to see.
+
+    Numbers that are not finite come first: where the schema stumbles over the same number, the
+    sentence found here counts.
+    """
+    data = document.data
+    yield from _infinite(data, ())
+    yield from _sources(data)
+    yield from _choices(data)
+    yield from _edges(document)
+    yield from _grid(data)
+    yield from _members(data)
+    yield from _following(data)
+    yield from _changed(data)
+    yield from _durations(data)

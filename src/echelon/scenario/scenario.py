@@ -1,0 +1,282 @@
+"""The scenario file: how it is read, and how its faults are told.
+
+Every fault of a file is reported at once, a line each: `file:line: field: what was got, what is
+allowed`.
+"""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, NoReturn, final, get_args
+
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError
+from pydantic_core import ErrorDetails
+
+from echelon.core.errors import ScenarioError, did_you_mean, listing
+from echelon.scenario.checks import cross_faults, number_of
+from echelon.scenario.sections import (
+    STRICT,
+    DisturbanceSpec,
+    FollowerSpec,
+    FormationSpec,
+    GraphSpec,
+    InitialSpec,
+    LeaderSpec,
+    ModelSpec,
+    PlantSpec,
+    ReferenceSpec,
+    ReportSpec,
+    SimulationSpec,
+)
+from echelon.scenario.values import CLASS_IN_FILE, FOLDER_NAME, Seed
+from echelon.scenario.yaml import (
+    Document,
+    KeyPath,
+    apply_overrides,
+    are,
+    dump_yaml,
+    read_yaml,
+    shown,
+)
+
+_BUNDLED = Path(__file__).parent / "bundled"
+
+
+@final
+class Scenario(BaseModel):
+    """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
+
+    model_config = STRICT
+
+    name: Annotated[str, Field(pattern=FOLDER_NAME)] = Field(description="Name of its folder.")
+    model: ModelSpec
+    plant: PlantSpec | None = None
+    graph: GraphSpec
+    formation: FormationSpec = Field(default_factory=FormationSpec)
+    reference: ReferenceSpec | None = None
+    leader: LeaderSpec = Field(default_factory=LeaderSpec)
+    follower: FollowerSpec = Field(default_factory=FollowerSpec)
+    initial: InitialSpec = Field(default_factory=InitialSpec)
+    disturbance: DisturbanceSpec | None = None
+    simulation: SimulationSpec
+    report: ReportSpec = Field(default_factory=ReportSpec)
+    seed: Seed = Field(default=0, description="Seed of everything random in the run.")
+
+    _document: Document = PrivateAttr(Document({}, {(): "scenario"}))
+    _text: str = PrivateAttr("")
+    _folder: Path = PrivateAttr(Path())
+
+    @property
+    def text(self) -> str:
+        """The effective YAML, overrides included."""
+        return self._text
+
+    @property
+    def folder(self) -> Path:
+        """The folder to which the paths in the file are relative."""
+        return self._folder
+
+    def place(self, *path: str | int) -> str:
+        """Return where a key stands, as in `paper.yaml:4`; else its parent's place."""
+        return self._document.place(path)
+
+
+class Fault(NamedTuple):
+    """One fault of a scenario: where it stands, its key (joined by dots), and a sentence."""
+
+    place: str
+    field: str
+    message: str
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in self if part)
+
+
+_ALLOWED = {
+    "float_type": "is a number",
+    "int_type": "is a whole number",
+    "bool_type": "is `true` or `false`",
+    "string_type": "is text",
+    "dict_type": "is a mapping",
+    "model_type": "is a mapping",
+    "tuple_type": "is a list",
+    "greater_than": "is a number above {gt:g}",
+    "greater_than_equal": "is a number from {ge:g} on",
+    "less_than": "is a number below {lt}",
+    "too_short": "is a list of at least {min_length} number",
+}
+_PATTERNS = {
+    FOLDER_NAME: "are up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit",
+    CLASS_IN_FILE: "is a file and a class in it, as in `pendulum.py:Pendulum`",
+}
+
+
+def _keys(path: KeyPath) -> list[str]:
+    """Return the keys that the section at `path` takes."""
+    part: type[BaseModel] = Scenario
+    for key in path:
+        annotation = part.model_fields[str(key)].annotation
+        kinds = (annotation, *get_args(annotation))
+        part = next(k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel))
+    return list(part.model_fields)
+
+
+def _allowed(kind: str, got: object, context: Mapping[str, Any]) -> str | None:
+    if kind == "literal_error":
+        names = re.findall("'([^']*)'", context["expected"])
+        return are(names) + did_you_mean(got, names)
+    if kind == "string_pattern_mismatch":
+        return _PATTERNS[context["pattern"]]
+    phrase = _ALLOWED.get(kind)
+    return phrase and phrase.format(**context)
+
+
+def _told(error: ErrorDetails) -> tuple[KeyPath, str]:
+    """Return the path of a fault that the schema found, and its sentence."""
+    path, kind, got = error["loc"], error["type"], error["input"]
+    if path and path[-1] == "[key]":
+        kind = "a whole number, an agent's" if kind == "int_type" else "a name"
+        return path[:-1], f"got the key {shown(path[-2])}, allowed is {kind}."
+    if kind == "missing":
+        return path, "got nothing, this key is required."
+    if kind in ("extra_forbidden", "invalid_key"):
+        keys = _keys(path[:-1])
+        return path, f"got an unknown key, allowed {are(keys)}{did_you_mean(path[-1], keys)}."
+    allowed = _allowed(kind, got, error.get("ctx", {}))
+    return path, f"got {shown(got)}, allowed {allowed}." if allowed else error["msg"]
+
+
+def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return the data with the defaults that hang on another section; an empty section is none."""
+    filled = {key: value for key, value in data.items() if value is not None}
+    leader, report = filled.get("leader", {}), filled.get("report", {})
+    if isinstance(leader, dict):
+        law = "tracking" if "reference" in filled else "passive"
+        filled["leader"] = {"law": law, **leader}
+    simulation = filled.get("simulation")
+    horizon = number_of(simulation.get("horizon")) if isinstance(simulation, dict) else None
+    if horizon is not None and horizon > 0 and isinstance(report, dict):
+        window = report.get("steady_window", horizon / 5)
+        asked = number_of(window)
+        # A window as long as the run would count its transient as steady.
+        fitting = horizon / 5 if asked is not None and asked >= horizon else window
+        filled["report"] = {**report, "steady_window": fitting}
+    return filled
+
+
+def _schema_faults(data: Mapping[Any, Any]) -> Iterator[tuple[KeyPath, str]]:
+    try:
+        Scenario.model_validate(_filled(data))
+    except ValidationError as error:
+        yield from map(_told, error.errors(include_url=False))
+
+
+def by_line(fault: Fault) -> tuple[bool, int]:
+    """Sort by line, what the command line set last."""
+    line = fault.place.rpartition(":")[2]
+    overridden = fault.place.startswith("--set ")
+    return overridden, int(line) if line.isdigit() and not overridden else 0
+
+
+def _faults(document: Document) -> list[Fault]:
+    """Return all faults, at most one for each path from the schema and the checks together."""
+    found: dict[KeyPath, str] = {}
+    for path, message in (*cross_faults(document), *_schema_faults(document.data)):
+        found.setdefault(path, message)
+    faults = [(path, document.place(path), message) for path, message in found.items()]
+    listed = (
+        Fault(place, ".".join(map(str, path)), message)
+        for path, place, message in (*document.problems, *faults)
+    )
+    return sorted(listed, key=by_line)
+
+
+def _refuse(faults: Sequence[Fault]) -> NoReturn:
+    error = ScenarioError("\n".join(map(str, faults)))
+    setattr(error, "faults", tuple(faults))
+    raise error
+
+
+def _scenario(document: Document, text: str, folder: Path) -> Scenario:
+    data = {} if document.data is None else document.data
+    if not isinstance(data, dict):
+        said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
+        _refuse([Fault(document.place(()), "", said)])
+    document = document._replace(data=data)
+    faults = _faults(document)
+    if faults:
+        _refuse(faults)
+    scenario = Scenario.model_validate(_filled(data))
+    scenario._document, scenario._text, scenario._folder = document, text, folder
+    return scenario
+
+
+def bundled_scenarios() -> dict[str, str]:
+    """Return the bundled scenarios: each name with the line that says what it is."""
+    names = sorted(file.stem for file in _BUNDLED.glob("*.yaml"))
+    texts = {name: (_BUNDLED / f"{name}.yaml").read_text("utf-8") for name in names}
+    return {name: text.partition("\n")[0].lstrip("# ") for name, text in texts.items()}
+
+
+def _found(source: str | Path) -> tuple[Path, str]:
+    """Return the file that `source` means and the name under which messages show it."""
+    names = list(bundled_scenarios())
+    if str(source) in names:
+        return _BUNDLED / f"{source}.yaml", f"{source}.yaml"
+    if Path(source).is_file():
+        return Path(source), str(source)
+    said = f"no such file exists, allowed is a file or a bundled scenario: {listing(names)}"
+    close = did_you_mean(Path(source).stem, names)
+    raise ScenarioError(f"got the scenario `{source}`, {said}{close}.")
+
+
+def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+    """Read and check a scenario.
+
+    Args:
+        source: Path to a YAML file, or the name of a bundled scenario (which wins over a file).
+        overrides: Texts such as `simulation.horizon=10`, laid over the file before it is checked.
+
+    Raises:
+        ScenarioError: There is no such scenario, or it has faults: one line for each of them, which
+            the error's `faults` holds as `Fault` records too.
+    """
+    file, name = _found(source)
+    try:
+        text = file.read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{name}: this file cannot be read as UTF-8 text: {error}.") from error
+    document = read_yaml(text, name)
+    if overrides:
+        document = apply_overrides(document, overrides)
+        text = dump_yaml(document.data)
+    return _scenario(document, text, file.parent)
+
+
+def _plain(value: object) -> object:
+    """Return lists for tuples and arrays, and Python's own numbers for NumPy's."""
+    to_list: Callable[[], object] | None = getattr(value, "tolist", None)
+    value = value if to_list is None else to_list()
+    if isinstance(value, Mapping):
+        return {_plain(key): _plain(item) for key, item in value.items()}
+    return list(map(_plain, value)) if isinstance(value, list | tuple) else value
+
+
+def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> Scenario:
+    """Check a scenario given as a mapping, with the keys of the file.
+
+    Args:
+        data: The scenario; tuples and NumPy arrays stand for lists.
+        folder: The folder to which `model.python` is relative.
+
+    Raises:
+        ScenarioError: The scenario has faults, as in `load_scenario`.
+    """
+    plain = _plain(data)
+    return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder))
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of the scenario file, which editors can check and complete with."""
+    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return draft | Scenario.model_json_schema()

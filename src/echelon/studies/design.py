@@ -1,0 +1,165 @@
+"""All gain methods on one scenario, side by side, and one of them recommended."""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from echelon.certificates import margins
+from echelon.certificates.certificate import Kind
+from echelon.core.errors import EchelonError
+from echelon.core.numerics import longest_step, precision
+from echelon.gains.gain import Gain
+from echelon.gains.synthesize import synthesize
+from echelon.laws.consensus import Consensus
+from echelon.network.topology import shorter
+from echelon.promises.certified_set import CertifiedSet, certified_set
+from echelon.promises.closed_loop import CheckedLoop, checked_loop
+from echelon.scenario import registry
+from echelon.scenario.build import Parts, resolve
+from echelon.scenario.scenario import Scenario
+
+_NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
+_ADVISED = 100
+_RATE = 0.1
+"""Rate that `contraction` is asked for where the scenario names none, 1/s."""
+_STRENGTH: dict[Kind, int] = {"proof": 3, "vertices": 2, "samples": 1, "linearization": 0}
+
+
+class Design(NamedTuple):
+    """One method on the scenario: its gain and what is known of it, or why there is none.
+
+    Attributes:
+        method: its name.
+        gain: None where there is none, and then `reason` says why.
+        reason: empty where there is a gain.
+        fastest: largest modulus of a pole of the loop, 1/s.
+        step: the longest step (s) with inputs held with which every mode looked at decays.
+        factors: the interval of factors on the coupling that it bears; None if unstable.
+        delay: of all disagreements that it bears, s; None if unstable.
+        certified: the certified set, less the leader's excursion; None without one.
+        advice: what else a user of the method should know.
+        seconds: what the synthesis took.
+    """
+
+    method: str
+    gain: Gain | None
+    reason: str = ""
+    fastest: float | None = None
+    step: float | None = None
+    factors: margins.GainMargin | None = None
+    delay: float | None = None
+    certified: CertifiedSet | None = None
+    advice: str = ""
+    seconds: float = 0.0
+
+
+def designs(scenario: Scenario, parts: Parts, only: str | None = None) -> tuple[Design, ...]:
+    """Try the methods on a built scenario, or `only` one of them."""
+    names = [only] if only else [name for name in registry.METHODS if name != "given"]
+    return tuple(_design(name, scenario, parts) for name in names)
+
+
+def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
+    """Return the stable design with the strongest promise, the fastest decay deciding a tie.
+
+    One that needs a step shorter than `dt` comes after those that do not.
+    """
+    stable = [d for d in tried if d.gain is not None and d.gain.certificate.stable]
+    return max(stable, key=lambda d: _merit(d, dt)) if stable else None
+
+
+def because(best: Design, tried: tuple[Design, ...], dt: float) -> str:
+    """Return why a design is recommended, in a sentence."""
+    assert best.gain is not None and best.step is not None
+    certificate, region = best.gain.certificate, best.gain.certificate.region
+    stable = sum(d.gain is not None and d.gain.certificate.stable for d in tried)
+    why = "it is the only one whose loop is stable"
+    if stable > 1 and _merit(best, dt)[1]:
+        assert region is not None
+        why = f"it promises most: {region.rate:.3g} 1/s on its domain ({region.kind}, "
+        why += f"{region.theorem})"
+    elif stable > 1:
+        why = f"of {stable} stable loops, none with more than a promise at the trim, its slowest "
+        why += f"mode is the fastest, {certificate.abscissa:.3g} 1/s"
+    step = f"the scenario's step of {dt:g} s is short enough for it"
+    if best.step <= dt:
+        step = f"it needs a step below {best.step:.3g} s, and the scenario's is {dt:g} s"
+    return f"Recommended: {best.method}, because {why}; {step}."
+
+
+def _merit(design: Design, dt: float) -> tuple[bool, int, float]:
+    assert design.gain is not None and design.step is not None
+    certificate = design.gain.certificate
+    region = certificate.region
+    strength = _STRENGTH[region.kind] if region is not None and region.rate > 0.0 else 0
+    return design.step > dt, strength, -certificate.abscissa
+
+
+def _design(name: str, scenario: Scenario, parts: Parts) -> Design:
+    """Try one method; an optional part that is missing is a reason like any other."""
+    options = _options(name, scenario)
+    if name in _NEEDS_DOMAIN and "domain" not in options:
+        return Design(name, None, "give `follower.gain.domain` to try it")
+    began = time.perf_counter()
+    try:
+        gain = synthesize(parts.model, parts.graph, resolve(registry.METHODS[name])(**options))
+    except EchelonError as error:
+        return Design(name, None, str(error), seconds=time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    with precision("float64"):
+        return _known(name, with_gain(parts, gain))._replace(seconds=seconds)
+
+
+def with_gain(parts: Parts, gain: Gain) -> CheckedLoop:
+    """Return the closed loop of the scenario under another gain, the feed-forward kept."""
+    asked = parts.follower.asks()
+    trim = getattr(parts.follower, "trim", True)
+    law = Consensus(gain, feedforward=asked, trim=trim)
+    with precision("float64"):
+        return checked_loop(parts._replace(follower=law))
+
+
+def _known(name: str, loop: CheckedLoop) -> Design:
+    """Return what is known of a gain."""
+    closed, (A, B) = loop.closed, loop.linear
+    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
+    found = Design(name, loop.gain, fastest=float(np.abs(poles).max()))
+    if not loop.every:
+        return found._replace(step=0.0)
+    ends = closed.strengths[[0, -1]]
+    gains = loop.inner + ends[:, None, None] * closed.K
+    return found._replace(
+        step=longest_step(A + B @ loop.inner, B, list(gains)),
+        factors=margins.gain_margin(closed),
+        delay=margins.delay_margin(closed).delay,
+        certified=certified_set(loop),
+        advice=_advice(name, loop),
+    )
+
+
+def _advice(name: str, loop: CheckedLoop) -> str:
+    """Return what else to know: for `inner-loop`, an edge or a leader that makes it faster.
+
+    Any graph keeps it stable, and so the graph alone sets its rate. A swarm would take minutes.
+    """
+    graph, gain = loop.parts.graph, loop.gain
+    followers, free = len(graph.followers), graph.agents * (graph.agents - 1) // 2
+    if name != "inner-loop" or gain is None or followers > _ADVISED:
+        return ""
+    more = int(followers > 1), int(len(graph.edges) < free)
+    return shorter(loop.parts.model, graph, gain, *more).sentence()
+
+
+def _options(name: str, scenario: Scenario) -> dict[str, Any]:
+    """Return what the scenario says of this method, and its domain for those that need one."""
+    spec = scenario.follower.gain
+    given: dict[str, Any] = {}
+    if spec.method == name and spec.file is None:
+        fields = spec.model_dump().items()
+        given = {key: value for key, value in fields if value is not None and key != "method"}
+    elif name in _NEEDS_DOMAIN and spec.domain is not None:
+        given["domain"] = spec.domain
+    if name == "contraction":
+        given.setdefault("rate", _RATE)
+    return given

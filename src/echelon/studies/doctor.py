@@ -1,0 +1,147 @@
+"""Self-checks of an installation: versions, devices, and whether the physics holds here."""
+
+import importlib
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core import numerics
+from echelon.core.provenance import versions
+from echelon.engine.simulate import simulate
+from echelon.gains.riccati import Riccati
+from echelon.gains.synthesize import synthesize
+from echelon.laws.consensus import Consensus
+from echelon.laws.tracking import Tracking
+from echelon.models import ControlAffine, Pendulum, Quadrotor
+from echelon.models.check import check_model
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
+from echelon.references import Lemniscate
+from echelon.results.metrics import metrics
+from echelon.scenario import registry
+
+
+class Check(NamedTuple):
+    """One self-check: what is claimed, whether it holds, and the number behind it."""
+
+    claim: str
+    holds: bool
+    found: str
+
+
+def facts() -> dict[str, str]:
+    """Return versions and devices."""
+    devices = ", ".join(
+        f"{device.platform}:{device.id} ({device.device_kind})" for device in jax.devices()
+    )
+    return {**versions(), "devices": devices}
+
+
+def checks() -> Iterator[Check]:
+    """Run the self-checks one after the other."""
+    tests: tuple[Callable[[], Check], ...] = (
+        _double_precision,
+        _flags_untouched,
+        _models,
+        _spectra,
+        _order,
+        _flatness,
+        _closed_loop,
+    )
+    for test in tests:
+        with numerics.precision("float64"):
+            check = test()
+        yield check
+
+
+def _double_precision() -> Check:
+    third = float(jnp.asarray(1.0) / 3.0)
+    return Check(
+        "computing is in float64 without a flag",
+        third == 1.0 / 3.0,
+        f"1/3 is off by {abs(third - 1 / 3):.1g}",
+    )
+
+
+def _flags_untouched() -> Check:
+    before = jax.config.read("jax_enable_x64")
+    with numerics.precision("float32"):
+        single = jnp.asarray(1.0).dtype == jnp.float32
+    return Check(
+        "float32 is there by choice", bool(single), f"jax_enable_x64 is {before} inside a verb"
+    )
+
+
+def _models() -> Check:
+    count = 0
+    for entry in registry.MODELS.values():
+        if entry.target.endswith(":Linear"):
+            continue
+        module, _, name = entry.target.partition(":")
+        make: Callable[[], ControlAffine] = getattr(importlib.import_module(module), name)
+        check_model(make())
+        count += 1
+    return Check(
+        "every bundled model is finite, with its trim an equilibrium", True, f"{count} models"
+    )
+
+
+def _spectra() -> Check:
+    tree = Graph.from_edges([(0, 1), (1, 2), (1, 3)]).grounded_spectrum()
+    off = float(np.abs(tree - np.array([2.0 - np.sqrt(3.0), 1.0, 2.0 + np.sqrt(3.0)])).max())
+    return Check(
+        "the tree's grounded spectrum is 2 - sqrt 3, 1, 2 + sqrt 3",
+        off < 1e-12,
+        f"off by {off:.1g}",
+    )
+
+
+def _order() -> Check:
+    """Measure the order of the Runge-Kutta step on the pendulum."""
+    model, x, u = Pendulum(), jnp.array([1.0, 0.0]), jnp.zeros(1)
+
+    def end(steps: int) -> jax.Array:
+        step = lambda _, x: numerics.rk4(model.velocity, x, u, 1.0 / steps)  # noqa: E731
+        return jax.lax.fori_loop(0, steps, step, x)
+
+    coarse, fine, finest = (end(steps) for steps in (20, 40, 80))
+    order = float(np.log2(jnp.linalg.norm(coarse - fine) / jnp.linalg.norm(fine - finest)))
+    return Check("the Runge-Kutta step has order 4", order > 3.8, f"measured {order:.2f}")
+
+
+def _flatness() -> Check:
+    """Compare the rate of the quadrotor's flat state with its dynamics."""
+    model, reference = Quadrotor.crazyflie(), Lemniscate()
+
+    def flat(t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
+
+    t = jnp.asarray(1.3)
+    (x, u), (rate, _) = jax.jvp(flat, (t,), (jnp.ones_like(t),))
+    off = float(jnp.abs(rate - model.velocity(x, u)).max())
+    return Check(
+        "the quadrotor's flatness map solves its equations", off < 1e-9, f"residual {off:.1g}"
+    )
+
+
+def _closed_loop() -> Check:
+    model, graph = Quadrotor.crazyflie(), Graph.path(3)
+    formation = Formation.from_offsets(model, graph, {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)})
+    result = simulate(
+        model,
+        graph,
+        formation,
+        leader=Tracking(Lemniscate()),
+        follower=Consensus(synthesize(model, graph, Riccati()), feedforward="relay"),
+        initial={"position": 0.5, "attitude": 0.2},
+        horizon=30.0,
+        dt=0.01,
+        store_every=10,
+    )
+    worst = metrics(result, 2.0).worst_steady or float("inf")
+    return Check(
+        "two followers join a flying leader", worst < 1e-6, f"{worst:.1g} m off after 30 s"
+    )

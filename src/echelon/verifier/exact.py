@@ -1,0 +1,109 @@
+"""Signs of leading minors in exact arithmetic, and the inequality of a rate proved with them.
+
+By Sylvester's criterion a symmetric matrix is positive definite exactly when its leading minors
+are positive. Every float is a fraction; rows are cleared of denominators, and the minors of whole
+numbers are found without fractions (Bareiss).
+"""
+
+import math
+from collections.abc import Iterable
+from fractions import Fraction
+from typing import TypeAlias
+
+from echelon.core.types import Matrix
+
+Rows: TypeAlias = list[list[Fraction]]
+
+
+def rows_of(matrix: Matrix) -> Rows:
+    """Return a matrix of floats as the fractions that they are."""
+    return [[Fraction(float(x)) for x in row] for row in matrix]
+
+
+def is_positive_definite(matrix: Rows) -> bool:
+    """Tell exactly whether a symmetric matrix is positive definite."""
+    if any(matrix[i][j] != matrix[j][i] for i in range(len(matrix)) for j in range(i)):
+        return False
+    # A positive factor on a row changes the sign of no minor.
+    rest, last = [_whole(row) for row in matrix], 1
+    while rest:
+        (pivot, *tail), *below = rest
+        if pivot <= 0:
+            return False
+        rest = [
+            [(pivot * x - row[0] * y) // last for x, y in zip(row[1:], tail, strict=True)]
+            for row in below
+        ]
+        last = pivot
+    return True
+
+
+def _whole(row: list[Fraction]) -> list[int]:
+    shared = math.lcm(*(x.denominator for x in row))
+    return [x.numerator * (shared // x.denominator) for x in row]
+
+
+def product(left: Rows, right: Rows) -> Rows:
+    """Return the matrix product, exactly."""
+    columns = list(zip(*right, strict=True))
+    return [[_dot(row, column) for column in columns] for row in left]
+
+
+def _dot(row: Iterable[Fraction], column: Iterable[Fraction]) -> Fraction:
+    return sum((x * y for x, y in zip(row, column, strict=True) if x and y), Fraction(0))
+
+
+def transposed(matrix: Rows) -> Rows:
+    """Return the transpose."""
+    return [list(column) for column in zip(*matrix, strict=True)]
+
+
+def inverse(matrix: Rows) -> Rows:
+    """Return the inverse of a positive definite matrix, exactly (Gauss and Jordan)."""
+    size = len(matrix)
+    work = [[*row, *(Fraction(i == j) for j in range(size))] for i, row in enumerate(matrix)]
+    for k in range(size):
+        work[k] = [x / work[k][k] for x in work[k]]
+        for i in range(size):
+            if i != k and work[i][k]:
+                work[i] = [x - work[i][k] * y for x, y in zip(work[i], work[k], strict=True)]
+    return [row[size:] for row in work]
+
+
+def first_unproved(
+    P: Matrix, B: Matrix, R: Matrix, hull: Matrix, error: Matrix, strength: Fraction, rate: float
+) -> int | None:
+    """Return the first corner A at which the rate is not proved, or None where all hold.
+
+    Proved is P A + A'P - strength P B R^-1 B'P + 2 rate P < 0, and the same for every matrix within
+    +- error of A. Such a change adds at most |P| error + its transpose, entry by entry, and the
+    row sums of that on the diagonal outweigh it whatever its signs (Gershgorin).
+
+    Args:
+        P: (n, n), symmetric to the bit and positive definite.
+        B: (n, m).
+        R: (m, m), symmetric positive definite.
+        hull: (K, n, n).
+        error: (n, n).
+        strength: 2 c lambda_min, a lower bound of it.
+        rate: 1/s.
+    """
+    metric, moved = rows_of(P), rows_of(abs(error))
+    pull = product(metric, rows_of(B))
+    held = product(product(pull, inverse(rows_of(R))), transposed(pull))
+    spread = product(rows_of(abs(P)), moved)
+    fixed = [
+        [strength * held[i][j] - 2 * Fraction(rate) * metric[i][j] for j in range(len(metric))]
+        for i in range(len(metric))
+    ]
+    for i, row in enumerate(spread):
+        fixed[i][i] -= sum(row) + sum(other[i] for other in spread)
+    for number, corner in enumerate(hull):
+        turned = product(metric, rows_of(corner))
+        slope = [
+            [fixed[i][j] - turned[i][j] - turned[j][i] for j in range(len(fixed))]
+            for i in range(len(fixed))
+        ]
+        if not is_positive_definite(slope):
+            return number
+    return None

@@ -1,0 +1,291 @@
+"""A saved gain as a checker reads it: nothing is believed, and every shape is asked for."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from echelon.core.errors import GainError, listing
+from echelon.core.types import Matrix, PathLike
+
+_FORMAT = "echelon gain 2"
+_KINDS = ("proof", "vertices", "samples", "linearization")
+_LARGEST = 1e50
+"""Larger numbers are no part of a gain, and their products no numbers."""
+_MOST_EDGES = 2000
+_THEOREMS = ("T1", "T2", "A5")
+
+
+class SavedModel(NamedTuple):
+    """The agents: `parameters` is None where the file could not hold them."""
+
+    path: str
+    parameters: Mapping[str, Any] | None
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    state: Matrix
+    input: Matrix
+    scale: Matrix
+    A: Matrix
+    B: Matrix
+
+
+class SavedGraph(NamedTuple):
+    """The graph: `edges` (E, 3) of i, j and weight, or None where they were too many."""
+
+    agents: int
+    leaders: tuple[int, ...]
+    edges: Matrix | None
+    spectrum: Matrix
+
+
+class SavedRegion(NamedTuple):
+    """The promise on a domain; `hull` (K, n, p) and `error` (n, p), p = 2n where g varies."""
+
+    kind: str
+    theorem: str
+    rate: float
+    radius: float | None
+    strength: float
+    lower: Matrix
+    upper: Matrix
+    input_lower: Matrix
+    input_upper: Matrix
+    hull: Matrix
+    error: Matrix
+
+
+class SavedGain(NamedTuple):
+    """All that a gain file says."""
+
+    method: str
+    coupling: float
+    P: Matrix
+    R: Matrix
+    inner: Matrix | None
+    model: SavedModel
+    graph: SavedGraph
+    kind: str
+    lambda_min: float
+    lambda_max: float
+    abscissa: float
+    modes: int
+    edge: float | None
+    observable: int
+    region: SavedRegion | None
+
+
+@final
+class _Part:
+    """A mapping of the file; each method returns an entry of one type, or refuses the file."""
+
+    def __init__(self, file: PathLike, told: object, name: str = "") -> None:
+        self.file, self.name = file, name
+        if not isinstance(told, dict):
+            raise self.fault(name, "must be a mapping")
+        self.told: dict[str, Any] = told
+
+    def fault(self, name: str, must: str) -> GainError:
+        return GainError(f"`{self.file}` is no gain that can be verified: `{name}` {must}.")
+
+    def entry(self, key: str) -> tuple[Any, str]:
+        """Return an entry and its full name."""
+        name = f"{self.name}.{key}" if self.name else key
+        if key not in self.told:
+            raise self.fault(name, "is missing")
+        return self.told[key], name
+
+    def part(self, key: str) -> "_Part":
+        value, name = self.entry(key)
+        return _Part(self.file, value, name)
+
+    def optional(self, key: str) -> bool:
+        """Tell whether there is something to read."""
+        return self.entry(key)[0] is not None
+
+    def number(self, key: str) -> float:
+        value, name = self.entry(key)
+        if not _is_number(value):
+            raise self.fault(name, "must be a finite number (to 1e50)")
+        return float(value)
+
+    def maybe(self, key: str) -> float | None:
+        return self.number(key) if self.optional(key) else None
+
+    def whole(self, key: str, least: int = 0) -> int:
+        value, name = self.entry(key)
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 10**9:
+            raise self.fault(name, f"must be a whole number from {least} on (to 1e9)")
+        return value
+
+    def text(self, key: str, allowed: tuple[str, ...] = ()) -> str:
+        value, name = self.entry(key)
+        if not isinstance(value, str) or allowed and value not in allowed:
+            must = f"must be one of {listing(allowed)}" if allowed else "must be text"
+            raise self.fault(name, must)
+        return value
+
+    def names(self, key: str) -> tuple[str, ...]:
+        value, name = self.entry(key)
+        if not isinstance(value, list) or not value or not all(isinstance(x, str) for x in value):
+            raise self.fault(name, "must be a list of names")
+        return tuple(value)
+
+    def array(self, key: str, *shape: int) -> Matrix:
+        """Return finite numbers of a shape, in which -1 is any length."""
+        value, name = self.entry(key)
+        found = _array(value)
+        fits = found is not None and found.ndim == len(shape)
+        if (
+            found is None
+            or not fits
+            or any(wanted not in (-1, got) for got, wanted in zip(found.shape, shape, strict=True))
+        ):
+            wanted = " x ".join("any" if size < 0 else str(size) for size in shape)
+            raise self.fault(name, f"must be {wanted} finite numbers (to 1e50)")
+        return found
+
+    def bounds(self, key: str, size: int, absent: float) -> Matrix:
+        """Return numbers, some of which may be None for an infinite bound."""
+        value, name = self.entry(key)
+        numbers = [absent if x is None else x for x in value] if isinstance(value, list) else []
+        fine = all(x is None or _is_number(x) for x in value) if len(numbers) == size else False
+        if not fine:
+            raise self.fault(name, f"must be {size} finite numbers or null")
+        return np.array(numbers, float)
+
+
+def _is_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return -_LARGEST <= value <= _LARGEST
+
+
+def _array(value: object) -> Matrix | None:
+    """Return nested lists of finite numbers as an array, or None where they are anything else."""
+
+    def plain(x: object) -> bool:
+        return all(map(plain, x)) if isinstance(x, list) else _is_number(x)
+
+    try:
+        return np.array(value, float) if isinstance(value, list) and plain(value) else None
+    except (ValueError, RecursionError):
+        return None
+
+
+def read(file: PathLike) -> SavedGain:
+    """Return what a gain file says.
+
+    Raises:
+        GainError: it cannot be read, is no JSON, no gain, or lacks a part; the part is named.
+    """
+    top = _Part(file, _json(file), "the file")
+    top.name = ""
+    if top.told.get("format") != _FORMAT:
+        raise GainError(
+            f"`{file}` is no gain file that can be verified; its `format` must be `{_FORMAT}`."
+        )
+    model = _model(top.part("model"))
+    n, m = len(model.state_names), len(model.input_names)
+    certificate = top.part("certificate")
+    return SavedGain(
+        method=top.text("method"),
+        coupling=top.number("coupling"),
+        P=top.array("P", n, n),
+        R=top.array("R", m, m),
+        inner=top.array("inner", m, n) if top.optional("inner") else None,
+        model=model,
+        graph=_graph(top.part("graph")),
+        kind=certificate.text("kind", _KINDS),
+        lambda_min=certificate.number("lambda_min"),
+        lambda_max=certificate.number("lambda_max"),
+        abscissa=certificate.number("abscissa"),
+        modes=certificate.whole("modes", 1),
+        edge=certificate.maybe("edge"),
+        observable=certificate.whole("observable"),
+        region=_region(certificate.part("region"), n, m)
+        if certificate.optional("region")
+        else None,
+    )
+
+
+def _json(file: PathLike) -> object:
+    try:
+        return json.loads(Path(file).read_text("utf-8"))
+    except OSError as error:
+        raise GainError(f"the gain file `{file}` cannot be read: {error.strerror}.") from error
+    except (ValueError, RecursionError) as error:
+        raise GainError(f"the gain file `{file}` is no JSON: {error}.") from error
+
+
+def _model(told: _Part) -> SavedModel:
+    states, inputs = told.names("state_names"), told.names("input_names")
+    n, m = len(states), len(inputs)
+    trim, name = told.entry("trim")
+    if not isinstance(trim, list) or len(trim) != 2:
+        raise told.fault(name, "must be a state and an input")
+    point = _Part(told.file, {"0": trim[0], "1": trim[1]}, name)
+    parameters = told.part("parameters").told if told.optional("parameters") else None
+    return SavedModel(
+        path=told.text("class"),
+        parameters=parameters,
+        state_names=states,
+        input_names=inputs,
+        state=point.array("0", n),
+        input=point.array("1", m),
+        scale=told.array("input_scale", m, m),
+        A=told.array("A", n, n),
+        B=told.array("B", n, m),
+    )
+
+
+def _graph(told: _Part) -> SavedGraph:
+    agents = told.whole("agents", 2)
+    leaders = told.array("leaders", -1)
+    edges = told.array("edges", -1, 3) if told.optional("edges") else None
+    if edges is not None and len(edges) > _MOST_EDGES:
+        raise told.fault("graph.edges", f"must be null for more than {_MOST_EDGES} edges")
+    numbers = leaders if edges is None else np.append(leaders, edges[:, :2])
+    if not len(leaders) or not all(x == int(x) and 0 <= x < agents for x in numbers):
+        raise told.fault("graph", f"must name agents from 0 to {agents - 1}, one leader at least")
+    spectrum = told.array("spectrum", -1)
+    if not len(spectrum):
+        raise told.fault("graph.spectrum", "must hold a number")
+    return SavedGraph(agents, tuple(sorted({int(x) for x in leaders})), edges, spectrum)
+
+
+def _region(told: _Part, n: int, m: int) -> SavedRegion:
+    domain, theorem = told.part("domain"), told.text("theorem", _THEOREMS)
+    wide = 2 * n if theorem == "T2" else n
+    return SavedRegion(
+        kind=told.text("kind", _KINDS[:3]),
+        theorem=theorem,
+        rate=told.number("rate"),
+        radius=told.maybe("radius"),
+        strength=told.number("strength"),
+        lower=domain.bounds("lower", n, -math.inf),
+        upper=domain.bounds("upper", n, math.inf),
+        input_lower=domain.array("input_lower", m),
+        input_upper=domain.array("input_upper", m),
+        hull=_unpacked(told.part("hull"), n, wide),
+        error=told.array("error", n, wide),
+    )
+
+
+def _unpacked(told: _Part, n: int, wide: int) -> Matrix:
+    """Return the matrices of which the file holds one whole, and the changes of the others."""
+    base = told.array("base", n, wide)
+    if told.entry("places")[0] == []:
+        return base[None]
+    places = told.array("places", -1, 2)
+    values = told.array("values", -1, len(places))
+    inside = (places == np.floor(places)) & (places >= 0) & (places < [n, wide])
+    if not inside.all() or not len(values):
+        raise told.fault(f"{told.name}.places", f"must be entries of a {n} x {wide} matrix")
+    matrices = np.repeat(base[None], len(values), axis=0)
+    rows, columns = places.astype(int).T
+    matrices[:, rows, columns] = values
+    return matrices

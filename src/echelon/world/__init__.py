@@ -1,0 +1,1 @@
+"""What the laws do not know: wind, noise, a plant that differs from the model."""
