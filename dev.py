@@ -30,7 +30,7 @@ HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
   setup   set up .venv with all extras; does nothing when nothing changed
   demo    run the paper's experiment: echelon run paper [ARGUMENT ...]
   test    run the tests: pytest [ARGUMENT ...], on all cores
-  lint    check style and layout: ruff
+  lint    check style, layout and who imports whom: ruff, import-linter
   types   check types: pyright
   docs    build the documentation into site/: mkdocs"""
 NO_PIP = (
@@ -86,7 +86,11 @@ VERBS = {
     "setup": lambda rest: [],
     "demo": lambda rest: [[str(BIN / f"echelon{SUFFIX}"), "run", "paper", *rest]],
     "test": tests,
-    "lint": lambda rest: [tool("ruff", "check", *rest), tool("ruff", "format", "--check", *rest)],
+    "lint": lambda rest: [
+        tool("ruff", "check", *rest),
+        tool("ruff", "format", "--check", *rest),
+        [str(BIN / f"lint-imports{SUFFIX}")],
+    ],
     "types": lambda rest: [tool("pyright", *rest)],
     "docs": lambda rest: [tool("mkdocs", "build", "--strict", *rest)],
 }

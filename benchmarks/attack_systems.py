@@ -283,17 +283,17 @@ def random_method(system: System, name: str, rng: np.random.Generator) -> ech.Me
     exact, domain = bool(rng.random() < 0.5), system.domain()
     Q, R = np.exp(rng.normal(size=n)), _definite(rng, m)
     if name == "monotone":
-        return ech.Monotone(domain, coupling=coupling or 1.0)
+        return ech.gains.Monotone(domain, coupling=coupling or 1.0)
     if name == "robust-lqr":
-        return ech.RobustLQR(domain, Q=Q, R=R, coupling=coupling, exact=exact)
+        return ech.gains.RobustLQR(domain, Q=Q, R=R, coupling=coupling, exact=exact)
     if name == "contraction":
         rate = float(np.exp(rng.uniform(np.log(0.05), np.log(2.0))))
-        return ech.Contraction(domain, rate=rate, coupling=coupling, exact=exact)
+        return ech.gains.Contraction(domain, rate=rate, coupling=coupling, exact=exact)
     if name == "riccati":
-        return ech.Riccati(Q=Q, R=R, coupling=coupling)
+        return ech.gains.Riccati(Q=Q, R=R, coupling=coupling)
     if name == "inner-loop":
-        return ech.InnerLoop(coupling=coupling or 3.0)
-    return ech.Given(P=_definite(rng, n), R=R, coupling=coupling or 1.0)
+        return ech.gains.InnerLoop(coupling=coupling or 3.0)
+    return ech.gains.FixedGain(P=_definite(rng, n), R=R, coupling=coupling or 1.0)
 
 
 def _definite(rng: np.random.Generator, n: int) -> np.ndarray:

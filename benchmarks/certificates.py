@@ -23,8 +23,8 @@ import planted_faults
 
 import echelon as ech
 from echelon.core.provenance import versions
-from echelon.network.topology import time_constant
 from echelon.results.metrics import formation_errors
+from echelon.studies.speedup import time_constant
 
 HERE = Path(__file__).resolve().parent
 PAGE = HERE.parent / "docs" / "certificates.md"
@@ -124,10 +124,10 @@ def planted(all_faults: bool) -> list[Row]:
 
 def crazyflie() -> list[Row]:
     """Time the gains and the check of the Crazyflie."""
-    model = ech.Quadrotor.crazyflie()
-    _, first = timed(lambda: ech.synthesize(model, LINE, ech.Riccati()))
+    model = ech.models.Quadrotor.crazyflie()
+    _, first = timed(lambda: ech.synthesize(model, LINE, ech.gains.Riccati()))
     begun = time.process_time()
-    again = [timed(lambda: ech.synthesize(model, LINE, ech.Riccati()))[1] for _ in range(50)]
+    again = [timed(lambda: ech.synthesize(model, LINE, ech.gains.Riccati()))[1] for _ in range(50)]
     busy = (time.process_time() - begun) / len(again)
     command, before = [sys.executable, "-m", "echelon", "check", "paper"], _children()
     done, seconds = timed(lambda: subprocess.run(command, capture_output=True, text=True))
@@ -156,10 +156,10 @@ def _children() -> float:
 
 def euler() -> list[Row]:
     """Measure the 12 states in Euler rates, whose thrust turns with the vehicle."""
-    model, bounds = ech.QuadrotorEuler(), tilted(20.0, 10.0, 2.0)
-    gain, seconds = timed(lambda: ech.synthesize(model, LINE, ech.RobustLQR(bounds)))
+    model, bounds = ech.models.QuadrotorEuler(), tilted(20.0, 10.0, 2.0)
+    gain, seconds = timed(lambda: ech.synthesize(model, LINE, ech.gains.RobustLQR(bounds)))
     low = float(LINE.grounded_spectrum()[0])
-    at_edge = ech.RobustLQR(bounds, coupling=0.5 / low)
+    at_edge = ech.gains.RobustLQR(bounds, coupling=0.5 / low)
     what = "robust LQR, 12 states, tilt 20, yaw 10 deg, +-2 m/s^2"
     return [
         (f"{what}: promise", promise(gain), "0.2 1/s"),
@@ -175,14 +175,14 @@ def euler() -> list[Row]:
 
 def thrust() -> list[Row]:
     """Measure the 13 states, whose input map is constant: proofs in exact arithmetic."""
-    model, rows = ech.QuadrotorThrust(), list[Row]()
+    model, rows = ech.models.QuadrotorThrust(), list[Row]()
     for bounds, where in (
         (tilted(20.0, 10.0, 2.0), "tilt 20, yaw 10 deg, +-2 m/s^2"),
         (tilted(30.0, 20.0, 3.0), "tilt 30, yaw 20 deg, +-3 m/s^2"),
     ):
         for name, method in (
-            ("robust LQR", ech.RobustLQR(bounds, exact=True)),
-            ("contraction at 0.095 1/s", ech.Contraction(bounds, rate=0.095)),
+            ("robust LQR", ech.gains.RobustLQR(bounds, exact=True)),
+            ("contraction at 0.095 1/s", ech.gains.Contraction(bounds, rate=0.095)),
         ):
             gain, seconds = timed(lambda method=method: ech.synthesize(model, LINE, method))
             rows.append(
@@ -207,16 +207,16 @@ def promise(gain: ech.Gain) -> str:
 
 def inner_loops(lengths: Sequence[tuple[int, float]]) -> list[Row]:
     """Fly lines of quadrotors by the inner-loop gain: one coupling and one step for all."""
-    model, rows = ech.Quadrotor.crazyflie(), list[Row]()
+    model, rows = ech.models.Quadrotor.crazyflie(), list[Row]()
     for followers, horizon in lengths:
         graph = ech.Graph.path(followers + 1)
-        gain = ech.synthesize(model, graph, ech.InnerLoop())
+        gain = ech.synthesize(model, graph, ech.gains.InnerLoop())
         result = ech.simulate(
             model,
             graph,
             ech.Formation.line(model, graph, 0.5),
-            leader=ech.Tracking(ech.FigureEight()),
-            follower=ech.Consensus(gain, feedforward="relay"),
+            leader=ech.laws.Tracking(ech.references.FigureEight()),
+            follower=ech.laws.Consensus(gain, feedforward="relay"),
             initial={"position": 1.0, "attitude": 0.3},
             horizon=horizon,
             dt=0.005,
@@ -240,7 +240,7 @@ def inner_loops(lengths: Sequence[tuple[int, float]]) -> list[Row]:
 
 def growth() -> tuple[str, str]:
     """Return the table of time constants over lengths, and a graph that shortens one."""
-    model = ech.Quadrotor.crazyflie()
+    model = ech.models.Quadrotor.crazyflie()
     lines = [
         "| followers in a line | time constant, inner loop at c = 3 | plain Riccati: coupling that "
         "it needs |",
@@ -248,12 +248,12 @@ def growth() -> tuple[str, str]:
     ]
     for followers in (3, 10, 30, 100):
         graph = ech.Graph.path(followers + 1)
-        constant = time_constant(model, graph, ech.synthesize(model, graph, ech.InnerLoop()))
+        constant = time_constant(model, graph, ech.synthesize(model, graph, ech.gains.InnerLoop()))
         needed = 0.5 / float(graph.grounded_spectrum()[0])
         lines.append(f"| {followers} | {constant:.3g} s | {needed:.3g} |")
     graph = ech.Graph.path(31)
-    gain = ech.synthesize(model, graph, ech.InnerLoop())
-    told = ech.shorter(model, graph, gain, leaders=2, edges=2)
+    gain = ech.synthesize(model, graph, ech.gains.InnerLoop())
+    told = ech.speedup(model, graph, gain, leaders=2, edges=2)
     return "\n".join(lines), f"On the line of 30: {told.sentence()}"
 
 
@@ -264,12 +264,16 @@ def assumption_five() -> list[Row]:
     """Time the refusals, and find the edges of the pendulum."""
     rows = list[Row]()
     for name, model, bounds in (
-        ("double integrator", ech.DoubleIntegrator(3), {}),
-        ("drag-free quadrotor as printed", ech.PrintedQuadrotor(), {"attitude": 0.2, "rate": 0.5}),
+        ("double integrator", ech.models.DoubleIntegrator(3), {}),
+        (
+            "drag-free quadrotor as printed",
+            ech.models.PrintedQuadrotor(),
+            {"attitude": 0.2, "rate": 0.5},
+        ),
     ):
 
         def refused(model: ech.ControlAffine = model, bounds: dict[str, float] = bounds) -> str:
-            return refusal(lambda: ech.synthesize(model, LINE, ech.Monotone(bounds)))
+            return refusal(lambda: ech.synthesize(model, LINE, ech.gains.Monotone(bounds)))
 
         timed(refused)
         told, seconds = timed(refused)
@@ -281,10 +285,10 @@ def assumption_five() -> list[Row]:
                 "infeasible, 1 s",
             )
         )
-    soft = ech.Pendulum(damping=0.5, stiffness=1.0)
-    metric = ech.synthesize(soft, LINE, ech.Monotone({"angle": 1.0}))
-    beyond = refusal(lambda: ech.synthesize(soft, LINE, ech.Monotone({"angle": 1.6})))
-    low, high = _edge(ech.Pendulum(damping=0.5, stiffness=9.81))
+    soft = ech.models.Pendulum(damping=0.5, stiffness=1.0)
+    metric = ech.synthesize(soft, LINE, ech.gains.Monotone({"angle": 1.0}))
+    beyond = refusal(lambda: ech.synthesize(soft, LINE, ech.gains.Monotone({"angle": 1.6})))
+    low, high = _edge(ech.models.Pendulum(damping=0.5, stiffness=9.81))
     return [
         *rows,
         (
@@ -310,7 +314,7 @@ def _edge(model: ech.ControlAffine) -> tuple[float, float]:
     low, high = 0.5, 1.2
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
-        method = ech.Monotone({"angle": middle})
+        method = ech.gains.Monotone({"angle": middle})
         feasible = refusal(lambda method=method: ech.synthesize(model, LINE, method))
         low, high = (middle, high) if feasible == "no refusal" else (low, middle)
     return low, high
@@ -337,8 +341,8 @@ def large() -> list[Row]:
 
 def certified_and_observed() -> list[Row]:
     """Push one follower out of place, as far as the promise reaches and as far as it comes back."""
-    model, rows = ech.QuadrotorThrust(), list[Row]()
-    gain = ech.synthesize(model, LINE, ech.RobustLQR(tilted(20.0, 10.0, 2.0), exact=True))
+    model, rows = ech.models.QuadrotorThrust(), list[Row]()
+    gain = ech.synthesize(model, LINE, ech.gains.RobustLQR(tilted(20.0, 10.0, 2.0), exact=True))
     region = gain.certificate.region
     assert region is not None and region.radius is not None
     for name, unit, tries in (
@@ -371,8 +375,8 @@ def _comes_back(model: ech.ControlAffine, gain: ech.Gain, name: str, size: float
             model,
             LINE,
             formation,
-            leader=ech.Passive(),
-            follower=ech.Consensus(gain, feedforward="relay"),
+            leader=ech.laws.TrimInput(),
+            follower=ech.laws.Consensus(gain, feedforward="relay"),
             initial=states,
             horizon=60.0,
             dt=0.002,

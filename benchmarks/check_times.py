@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 import echelon as ech
-from echelon.certificates.bounds import disturbance_ellipsoid, disturbance_l1
+from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
 from echelon.certificates.margins import ClosedLoop, delay_margin, gain_margin, string_gain
 from echelon.core.numerics import precision
 from echelon.models.linearization import linearize
@@ -48,7 +48,7 @@ def refused(model: ech.ControlAffine, **domain: float) -> Callable[[], object]:
 
     def act() -> str:
         try:
-            ech.synthesize(model, GRAPH, ech.Monotone(domain))
+            ech.synthesize(model, GRAPH, ech.gains.Monotone(domain))
         except ech.EchelonError as error:
             return str(error)
         raise AssertionError("a P was found")
@@ -59,10 +59,10 @@ def refused(model: ech.ControlAffine, **domain: float) -> Callable[[], object]:
 def main() -> None:
     """Print one figure a line."""
     print(f"echelon check paper: {command('check', 'paper')}")
-    agent = ech.Quadrotor()
+    agent = ech.models.Quadrotor()
     with precision("float64"):
-        riccati = milliseconds(lambda: ech.Riccati().solve(agent, GRAPH))
-        gain, (A, B) = ech.Riccati().solve(agent, GRAPH), linearize(agent)
+        riccati = milliseconds(lambda: ech.gains.Riccati().solve(agent, GRAPH))
+        gain, (A, B) = ech.gains.Riccati().solve(agent, GRAPH), linearize(agent)
     print(f"riccati: {riccati:.1f} ms")
     loop = ClosedLoop(A, B, gain.P, gain.R, gain.coupling, GRAPH.grounded_spectrum())
     push = np.eye(len(A))[:, 3:6]
@@ -70,9 +70,9 @@ def main() -> None:
         "gain margin": lambda: gain_margin(loop),
         "delay margin": lambda: delay_margin(loop),
         "string gain": lambda: string_gain(loop),
-        "disturbance, ellipsoid": lambda: disturbance_ellipsoid(loop, push),
-        "disturbance, exact L1": lambda: disturbance_l1(loop, push),
-        "no P, double integrator": refused(ech.DoubleIntegrator()),
+        "disturbance, ellipsoid": lambda: invariant_ellipsoid(loop, push),
+        "disturbance, exact L1": lambda: peak_gain(loop, push),
+        "no P, double integrator": refused(ech.models.DoubleIntegrator()),
         "no P, quadrotor": refused(agent, attitude=0.35, rate=1.0, thrust=2.0),
     }.items():
         print(f"{name}: {milliseconds(act):.1f} ms")

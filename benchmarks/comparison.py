@@ -71,14 +71,14 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def planar() -> Iterator[Sequence[str]]:
     """Yield the planar baseline, printed and repaired."""
     start = [-np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]
-    literal, repaired = ech.PlanarBaseline.literal, ech.PlanarBaseline.repaired
+    literal, repaired = ech.optimal.PlanarBaseline.literal, ech.optimal.PlanarBaseline.repaired
     for name, problem, known in (
         ("as printed, 100 steps", literal(steps=100), "0.480"),
         ("as printed, 400 steps", literal(steps=400), "0.467"),
         ("without the terminal cost, 100 steps", literal(steps=100, terminal="none"), "0.181"),
         ("terminal cost on the error, 100 steps", repaired(steps=100), "-"),
     ):
-        found = ech.plan(problem.leader(), start, problem.reference)
+        found = ech.optimal.solve(problem.leader(), start, problem.reference)
         yield f"leader {name}: RMSE", f"{problem.tracking_rmse(found.states):.4f} m", known
     tree = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
     offsets = np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.5, -0.5]])

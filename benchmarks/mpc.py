@@ -15,10 +15,11 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.errors import PlanError
+from echelon.models.inputs import normalized, physical
 from echelon.optimal.horizon import Course, Horizon
-from echelon.optimal.objectives import normalized, physical, reference_targets
+from echelon.references.flatness import reference_targets
 
-MODEL = ech.Quadrotor.crazyflie()
+MODEL = ech.models.Quadrotor.crazyflie()
 STEPS, DT = 50, 0.02
 Step = Callable[[np.ndarray, Course, Course], tuple[Course | None, int]]
 
@@ -49,7 +50,7 @@ NONLINEAR: dict[str, dict[str, Any]] = {
 
 def real_time(solver: str) -> Step:
     """Return one linearization and one quadratic program a period."""
-    horizon = Horizon(MODEL, ech.MPC(solver=solver), STEPS, DT, limits=True)
+    horizon = Horizon(MODEL, ech.optimal.MPC(solver=solver), STEPS, DT, limits=True)
 
     def step(start: np.ndarray, targets: Course, near: Course) -> tuple[Course | None, int]:
         return horizon.solve(start, targets, near).course, 1
@@ -59,8 +60,8 @@ def real_time(solver: str) -> Step:
 
 def nonlinear(solver: str) -> Step:
     """Return the same problem solved as a nonlinear program from the shifted solution."""
-    Q, R = (jnp.asarray(w) for w in ech.MPC().weights(MODEL))
-    weight = Horizon(MODEL, ech.MPC(), 1, DT, limits=False)._weight.toarray()[-12:, -12:]
+    Q, R = (jnp.asarray(w) for w in ech.optimal.MPC().weights(MODEL))
+    weight = Horizon(MODEL, ech.optimal.MPC(), 1, DT, limits=False)._weight.toarray()[-12:, -12:]
     inverse = jnp.linalg.inv(jnp.asarray(np.array(MODEL.input_scale)))
     trim = jnp.asarray(np.array(MODEL.trim[1]))
 
@@ -68,7 +69,7 @@ def nonlinear(solver: str) -> Step:
         e, w = x - p[:12], inverse @ (u - trim) - p[12:]
         return jnp.sum(Q * e * e) + jnp.sum(R * w * w)
 
-    problem = ech.OptimalControl(
+    problem = ech.optimal.OptimalControl(
         MODEL,
         STEPS * DT,
         STEPS,
@@ -76,7 +77,7 @@ def nonlinear(solver: str) -> Step:
         lambda x, p: (x - p[:12]) @ jnp.asarray(weight) @ (x - p[:12]),
         parameters=16,
     )
-    planner = ech.Planner(problem, solver.split("+")[0], NONLINEAR[solver])
+    planner = ech.optimal.Solver(problem, solver.split("+")[0], NONLINEAR[solver])
 
     def step(start: np.ndarray, targets: Course, near: Course) -> tuple[Course | None, int]:
         v = np.vstack([targets.inputs, targets.inputs[-1:]])
@@ -92,12 +93,12 @@ def nonlinear(solver: str) -> Step:
 def fly(step: Step, periods: int) -> tuple[np.ndarray, np.ndarray, int, float]:
     """Return milliseconds and iterations of each period, failures, and the last error, m."""
     times = DT * np.arange(periods + STEPS + 1)
-    every = reference_targets(MODEL, ech.Lemniscate(), times)
+    every = reference_targets(MODEL, ech.references.Lemniscate(), times)
     rng = np.random.default_rng(0)
     x = every.states[0].copy()
     x[:3] += rng.uniform(-1.0, 1.0, 3)
     x[6:9] += 0.3 * rng.uniform(-1.0, 1.0, 3)
-    helper = Horizon(MODEL, ech.MPC(), STEPS, DT, limits=True)
+    helper = Horizon(MODEL, ech.optimal.MPC(), STEPS, DT, limits=True)
     near = Course(every.states[: STEPS + 1], every.inputs[:STEPS])
     took, counts, failures = [], [], 0
     for k in range(periods):

@@ -11,26 +11,18 @@ import casadi as ca
 import numpy as np
 
 import echelon as ech
+from echelon.models.inputs import physical
 from echelon.optimal.formation_plan import plan_tracking
-from echelon.optimal.objectives import (
-    Grid,
-    Planning,
-    Targets,
-    coarse,
-    grid,
-    physical,
-    reference_targets,
-    shifted_targets,
-    tracking,
-)
+from echelon.optimal.objectives import Grid, TrackingOptions, coarse, grid, tracking
 from echelon.optimal.problem import OptimalControl
+from echelon.references.flatness import Targets, reference_targets, shifted_targets
 
-MODEL, LOOP = ech.Quadrotor.crazyflie(), ech.Lemniscate()
+MODEL, LOOP = ech.models.Quadrotor.crazyflie(), ech.references.Lemniscate()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])
 OFFSETS = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
 DRAWN = ech.Formation.from_offsets(MODEL, TREE, OFFSETS)
 FLIGHT = {"reference": LOOP, "horizon": 10.0, "dt": 0.005}
-SHARP = Planning(interval=0.02, input_weight=3e-6)
+SHARP = TrackingOptions(interval=0.02, input_weight=3e-6)
 """For followers without limits, whose error shall be gone within a sample of the paper."""
 
 Row = tuple[str, str, str]
@@ -82,10 +74,10 @@ def least(start: np.ndarray, targets: Targets, times: Grid, seeds: Sequence[int]
 
     The input costs nothing, and the solver begins at the targets and at other motions.
     """
-    planning = Planning(interval=times.interval, input_weight=0.0)
+    planning = TrackingOptions(interval=times.interval, input_weight=0.0)
     problem: OptimalControl = tracking(MODEL, planning, times, limits=True, fine=False)
     problem = dataclasses.replace(problem, substeps=max(1, coarse(times)))
-    planner = ech.Planner(problem, options={"ipopt.max_iter": 500})
+    planner = ech.optimal.Solver(problem, options={"ipopt.max_iter": 500})
     p = np.hstack([targets.outputs, targets.inputs, np.zeros((len(targets.inputs), 1))])
     found = []
     for seed in seeds:
@@ -188,15 +180,17 @@ def times_and_mpc() -> Iterator[Row]:
     times = grid(10.0, 0.005, 0.1)
     targets = reference_targets(MODEL, LOOP, times.times)
     began = time.process_time()
-    made = plan_tracking(MODEL, starts()[0], targets, times, Planning(interval=0.1), True)
+    made = plan_tracking(MODEL, starts()[0], targets, times, TrackingOptions(interval=0.1), True)
     yield (
         "plan of one agent over 10 s in 100 steps: process time, solver made ready, both solutions",
         f"{time.process_time() - began:.1f} s ({'solved' if made.solved else made.message})",
         "5 s",
     )
     for limits in (True, False):
-        result = ech.simulate_mpc(MODEL, TREE, DRAWN, initial=starts(), limits=limits, **FLIGHT)
-        figures, numbers = ech.solver_figures(result), ech.metrics(result)
+        result = ech.optimal.simulate_mpc(
+            MODEL, TREE, DRAWN, initial=starts(), limits=limits, **FLIGHT
+        )
+        figures, numbers = ech.optimal.solver_stats(result), ech.metrics(result)
         assert figures is not None and numbers.worst_steady is not None
         name = "MPC, motor limits" if limits else "MPC, inputs unconstrained"
         e = off_reference(result)
@@ -221,9 +215,9 @@ def times_and_mpc() -> Iterator[Row]:
 def rows() -> Iterator[Row]:
     """Yield all rows of the table."""
     initial = starts()
-    within = ech.simulate_plans(MODEL, TREE, DRAWN, initial=initial, **FLIGHT)
-    free = ech.simulate_plans(MODEL, TREE, DRAWN, initial=initial, limits=False, **FLIGHT)
-    sharp = ech.simulate_plans(
+    within = ech.optimal.simulate_plans(MODEL, TREE, DRAWN, initial=initial, **FLIGHT)
+    free = ech.optimal.simulate_plans(MODEL, TREE, DRAWN, initial=initial, limits=False, **FLIGHT)
+    sharp = ech.optimal.simulate_plans(
         MODEL, TREE, DRAWN, planning=SHARP, initial=initial, limits=False, **FLIGHT
     )
     yield from leader(free, within)

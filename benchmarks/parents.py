@@ -14,22 +14,22 @@ from echelon.core.numerics import precision
 from echelon.models.linearization import linearize
 from echelon.results.metrics import formation_errors
 
-MODEL = ech.Quadrotor()
+MODEL = ech.models.Quadrotor()
 LAWS = [("relay", None), ("parent", 1.0), ("parent", 2.5), ("parent", 10.0)]
 
 
 def converged(followers: int, feedforward: str, coupling: float | None, seeds: int) -> int:
     """Return how many starts bring every follower of a line within 1 cm by 60 s."""
     graph = ech.Graph.path(followers + 1)
-    gain = ech.synthesize(MODEL, graph, ech.Riccati(coupling=coupling))
+    gain = ech.synthesize(MODEL, graph, ech.gains.Riccati(coupling=coupling))
     count = 0
     for seed in range(seeds):
         run = ech.simulate(
             MODEL,
             graph,
             ech.Formation.line(MODEL, graph),
-            leader=ech.Tracking(ech.Lemniscate()),
-            follower=ech.Consensus(gain, feedforward=feedforward),  # pyright: ignore
+            leader=ech.laws.Tracking(ech.references.Lemniscate()),
+            follower=ech.laws.Consensus(gain, feedforward=feedforward),  # pyright: ignore
             initial={"position": 1.0, "attitude": 0.3},
             horizon=60.0,
             dt=0.005,
@@ -46,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     seeds = parser.parse_args().seeds
-    gain = ech.synthesize(MODEL, ech.Graph.path(2), ech.Riccati(coupling=1.0))
+    gain = ech.synthesize(MODEL, ech.Graph.path(2), ech.gains.Riccati(coupling=1.0))
     with precision("float64"):
         A, B = linearize(MODEL)
     lines = (3, 10, 20)

@@ -49,51 +49,51 @@ class Soft(ech.ControlAffine):
 Case = tuple[ech.ControlAffine, ech.Graph, ech.Method]
 
 SMALL: dict[str, Case] = {
-    "riccati, pendulum": (ech.Pendulum(), LINE, ech.Riccati()),
+    "riccati, pendulum": (ech.models.Pendulum(), LINE, ech.gains.Riccati()),
     "given, linear": (
-        ech.Linear([[0.0, 1.0], [-1.0, -0.2]], [[0.0], [1.0]]),
+        ech.models.Linear([[0.0, 1.0], [-1.0, -0.2]], [[0.0], [1.0]]),
         TREE,
-        ech.Given(P=[[2.0, 0.3], [0.3, 1.0]], coupling=2.0),
+        ech.gains.FixedGain(P=[[2.0, 0.3], [0.3, 1.0]], coupling=2.0),
     ),
-    "inner loop, double integrator": (ech.DoubleIntegrator(2), TREE, ech.InnerLoop()),
-    "monotone, pendulum": (ech.Pendulum(), LINE, ech.Monotone({"angle": 0.6})),
+    "inner loop, double integrator": (ech.models.DoubleIntegrator(2), TREE, ech.gains.InnerLoop()),
+    "monotone, pendulum": (ech.models.Pendulum(), LINE, ech.gains.Monotone({"angle": 0.6})),
     "robust LQR, pendulum, proof": (
-        ech.Pendulum(),
+        ech.models.Pendulum(),
         LINE,
-        ech.RobustLQR({"angle": (-0.6, 0.8)}, exact=True),
+        ech.gains.RobustLQR({"angle": (-0.6, 0.8)}, exact=True),
     ),
     "contraction, pendulum, proof": (
-        ech.Pendulum(),
+        ech.models.Pendulum(),
         TREE,
-        ech.Contraction({"angle": 1.0}, rate=0.5),
+        ech.gains.Contraction({"angle": 1.0}, rate=0.5),
     ),
     "contraction, Van der Pol": (
-        ech.VanDerPol(),
+        ech.models.VanDerPol(),
         LINE,
-        ech.Contraction({"position": 1.0, "velocity": 1.0}, rate=0.3, exact=False),
+        ech.gains.Contraction({"position": 1.0, "velocity": 1.0}, rate=0.3, exact=False),
     ),
-    "robust LQR, spring, samples": (Soft(), LINE, ech.RobustLQR({"place": 1.0})),
+    "robust LQR, spring, samples": (Soft(), LINE, ech.gains.RobustLQR({"place": 1.0})),
     "robust LQR, planar quadrotor, T2": (
-        ech.PlanarQuadrotor(),
+        ech.models.PlanarQuadrotor(),
         LINE,
-        ech.RobustLQR({"roll": 0.2, "thrust": 1.0}),
+        ech.gains.RobustLQR({"roll": 0.2, "thrust": 1.0}),
     ),
 }
 
 LARGE: dict[str, Case] = {
-    "riccati, quadrotor": (ech.Quadrotor.crazyflie(), LINE, ech.Riccati()),
-    "inner loop, quadrotor": (ech.Quadrotor.crazyflie(), TREE, ech.InnerLoop()),
+    "riccati, quadrotor": (ech.models.Quadrotor.crazyflie(), LINE, ech.gains.Riccati()),
+    "inner loop, quadrotor": (ech.models.Quadrotor.crazyflie(), TREE, ech.gains.InnerLoop()),
     "robust LQR, quadrotor with thrust, proof": (
-        ech.QuadrotorThrust(),
+        ech.models.QuadrotorThrust(),
         LINE,
-        ech.RobustLQR(
+        ech.gains.RobustLQR(
             {"roll": 20 * DEG, "pitch": 20 * DEG, "yaw": 10 * DEG, "thrust": 2.0}, exact=True
         ),
     ),
     "robust LQR, quadrotor in Euler rates, T2": (
-        ech.QuadrotorEuler(),
+        ech.models.QuadrotorEuler(),
         LINE,
-        ech.RobustLQR({"roll": 10 * DEG, "pitch": 10 * DEG, "yaw": 10 * DEG, "thrust": 1.0}),
+        ech.gains.RobustLQR({"roll": 10 * DEG, "pitch": 10 * DEG, "yaw": 10 * DEG, "thrust": 1.0}),
     ),
 }
 

@@ -147,16 +147,16 @@ def what_fails(seeds: Sequence[int]) -> list[Row]:
 
 def inner_loops() -> list[Row]:
     """Quadrotors in a line by the inner-loop gain: the same coupling and step for all lengths."""
-    model, rows = ech.Quadrotor.crazyflie(), list[Row]()
+    model, rows = ech.models.Quadrotor.crazyflie(), list[Row]()
     for followers, horizon in ((3, 40.0), (10, 120.0), (30, 700.0)):
         graph = ech.Graph.path(followers + 1)
         result = ech.simulate(
             model,
             graph,
             ech.Formation.line(model, graph, 0.5),
-            leader=ech.Tracking(ech.FigureEight()),
-            follower=ech.Consensus(
-                ech.synthesize(model, graph, ech.InnerLoop()), feedforward="relay"
+            leader=ech.laws.Tracking(ech.references.FigureEight()),
+            follower=ech.laws.Consensus(
+                ech.synthesize(model, graph, ech.gains.InnerLoop()), feedforward="relay"
             ),
             initial={"position": 1.0, "attitude": 0.3},
             horizon=horizon,
@@ -179,13 +179,15 @@ def inner_loops() -> list[Row]:
 
 def chain_lag() -> Row:
     """Single integrators on the chain L-1-2-3 behind a leader at 1 m/s."""
-    model, graph = ech.SingleIntegrator(1), ech.Graph.path(4)
+    model, graph = ech.models.SingleIntegrator(1), ech.Graph.path(4)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {}),
-        leader=ech.Tracking(ech.Line(start=(0.0, 0.0, 0.0), velocity=(1.0, 0.0, 0.0))),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        leader=ech.laws.Tracking(
+            ech.references.Line(start=(0.0, 0.0, 0.0), velocity=(1.0, 0.0, 0.0))
+        ),
+        follower=ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.FixedGain("identity"))),
         horizon=200.0,
         dt=0.01,
         store_every=100,
@@ -201,13 +203,13 @@ def chain_lag() -> Row:
 
 def offset_drift() -> Row:
     """The counterexample to the theorem: xdot = -x + u, P = 1, one follower with offset d."""
-    model, graph = ech.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
+    model, graph = ech.models.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
-        leader=ech.Passive(),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.FixedGain("identity"))),
         horizon=40.0,
         dt=0.01,
         store_every=100,
@@ -221,13 +223,13 @@ def offset_drift() -> Row:
 
 def algorithm_one() -> Row:
     """The growth a step of Algorithm 1 as printed, on the chain of single integrators."""
-    model, graph = ech.SingleIntegrator(1), ech.Graph.path(4)
+    model, graph = ech.models.SingleIntegrator(1), ech.Graph.path(4)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {}),
-        leader=ech.Passive(),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.FixedGain("identity"))),
         initial={"position": 1.0},
         horizon=100.0,
         dt=1.0,

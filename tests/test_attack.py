@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.certificates.jacobians import model_jacobian
 from echelon.core.numerics import precision
-from echelon.enclosure.hull import model_jacobian
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from attack import attack, promise_of, study  # noqa: E402
@@ -62,7 +62,7 @@ def tight():
             continue
         try:
             gain = ech.synthesize(
-                system.model, system.graph, ech.Contraction(system.domain(), rate=1.0)
+                system.model, system.graph, ech.gains.Contraction(system.domain(), rate=1.0)
             )
         except ech.EchelonError:
             continue
@@ -95,7 +95,7 @@ def test_a_false_promise_does_not(tight, name):
 
 def test_simulation_alone_finds_a_drift_that_expands():
     system = random_system(0, 9)
-    gain = ech.synthesize(system.model, system.graph, ech.RobustLQR(system.domain()))
+    gain = ech.synthesize(system.model, system.graph, ech.gains.RobustLQR(system.domain()))
     promise = promise_of(system, gain)
     found = attack(replace(promise, coupling=-promise.coupling), np.random.default_rng(0))
     assert {told.partition(":")[0] for told in found.violations} == {"state", "set", "run"}
@@ -104,12 +104,12 @@ def test_simulation_alone_finds_a_drift_that_expands():
 def test_a_varying_input_map_certifies_no_set():
     # From the boundary of {sum delta'P delta <= r^2} of this system a follower leaves the domain.
     system = random_system(1, 50)
-    method = ech.Contraction(system.domain(), rate=0.2, exact=False)
+    method = ech.gains.Contraction(system.domain(), rate=0.2, exact=False)
     region = ech.synthesize(system.model, system.graph, method).certificate.region
     assert (region.theorem, region.radius) == ("T2", None)
 
 
 def test_a_drift_that_contracts_by_itself_takes_any_coupling():
-    model, graph = ech.Linear(-np.eye(2), np.eye(2)), ech.Graph.path(3)
-    gain = ech.synthesize(model, graph, ech.Contraction({"x1": 1.0}, rate=0.5))
+    model, graph = ech.models.Linear(-np.eye(2), np.eye(2)), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.gains.Contraction({"x1": 1.0}, rate=0.5))
     assert gain.coupling > 0.0 and gain.certificate.region.rate >= 0.5

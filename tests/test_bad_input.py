@@ -15,9 +15,9 @@ from echelon.core.errors import (
     SimulationError,
 )
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Agreement, Consensus, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.models import (
     DoubleIntegrator,
     Linear,
@@ -42,8 +42,8 @@ PAIR, PATH = Graph.path(2), Graph.path(4)
 def run(model=ONE, graph=PAIR, **options):
     """A run of two single integrators, spoiled by what is given."""
     parts = {
-        "leader": Passive(),
-        "follower": Passive(),
+        "leader": TrimInput(),
+        "follower": TrimInput(),
         "horizon": 1.0,
         "dt": 0.1,
         "formation": Formation(np.zeros((graph.agents, len(model.state_names)))),
@@ -53,7 +53,7 @@ def run(model=ONE, graph=PAIR, **options):
 
 
 def gain_of(model, graph=PAIR, **options):
-    return synthesize(model, graph, Given(**options))
+    return synthesize(model, graph, FixedGain(**options))
 
 
 # What is done -> the kind of error, and the whole sentence.
@@ -539,7 +539,9 @@ REFUSED = {
         "`Linear`",
     ),
     "a path that a vehicle cannot follow": (
-        lambda: run(Unicycle(), leader=Tracking(Hover(), synthesize(Unicycle(), PAIR, Given()))),
+        lambda: run(
+            Unicycle(), leader=Tracking(Hover(), synthesize(Unicycle(), PAIR, FixedGain()))
+        ),
         "`Hover`",
     ),
     "a negative seed": (lambda: run(seed=-1, initial={"x": 1.0}), "`seed`"),

@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.core.numerics import longest_step, precision
-from echelon.promises.certified_set import killing_residual
+from echelon.core.linear import longest_step
+from echelon.core.numerics import precision
 from echelon.studies.check import check
 from echelon.studies.finite_condition import pair_values
+from echelon.studies.region import killing_residual
 
 PATH = ech.Graph.path(4)
 LOW, _, HIGH = PATH.grounded_spectrum()
@@ -35,7 +36,7 @@ class Line1(ech.ControlAffine):
         return jnp.ones((1, 1), x.dtype)
 
 
-class Weakening(ech.Pendulum):
+class Weakening(ech.models.Pendulum):
     """A pendulum whose input loses strength away from the trim."""
 
     def input_map(self, x):
@@ -103,7 +104,7 @@ def test_the_sign_is_that_of_goals_that_pull_together():
 
 
 def test_goals_that_f_does_not_tell_apart_make_it_empty():
-    agent = ech.Quadrotor()
+    agent = ech.models.Quadrotor()
     formation = ech.Formation.from_offsets(agent, PATH, {1: (1, 0, 0), 2: (0, 3, 0)})
     assert ech.finite_condition(np.eye(12), agent, formation).verdict == "vacuous"
     # Smaller than I it is refused even then, and a multiple of it is not.
@@ -119,7 +120,7 @@ def test_the_condition_is_linear_in_p(seed, factor):
     P, Q = ((M @ M.T) + np.eye(3) for M in rng.normal(size=(2, 3, 3)))
     both = pair_values(P, d, f) + factor * pair_values(Q, d, f)
     assert pair_values(P + factor * Q, d, f) == pytest.approx(both, rel=1e-9, abs=1e-9)
-    model = ech.Linear(A=A.tolist(), B=np.eye(3).tolist())
+    model = ech.models.Linear(A=A.tolist(), B=np.eye(3).tolist())
     formation = ech.Formation(rng.normal(size=(5, 3)))
     verdicts = [ech.finite_condition(M, model, formation).verdict for M in (P, Q, P + Q)]
     # What two pass, their sum passes.
@@ -132,7 +133,7 @@ def test_the_largest_pair_is_the_largest(seed):
     rng = np.random.default_rng(seed)
     A, xi = rng.normal(size=(2, 2)), rng.normal(size=(150, 2))
     found = ech.finite_condition(
-        np.eye(2), ech.Linear(A=A.tolist(), B=[[0.0], [1.0]]), ech.Formation(xi)
+        np.eye(2), ech.models.Linear(A=A.tolist(), B=[[0.0], [1.0]]), ech.Formation(xi)
     )
     pairs = [(xi[i] - xi[j]) @ A @ (xi[i] - xi[j]) for i in range(150) for j in range(i)]
     assert found.largest == pytest.approx(max(pairs), rel=1e-9)
@@ -241,7 +242,7 @@ def test_a_linear_agent_is_certified_everywhere():
 def test_turning_the_input_stretches_distances_by_half():
     # g S = (cos, -sin; sin, cos; 0, 1/l): dg_k/dheading is a unit vector, so in P = diag(1, 1, w)
     # it stretches by half of 1 / sqrt(w), whatever the heading is.
-    agent = ech.UnicyclePoint()
+    agent = ech.models.UnicyclePoint()
     domain = ech.Domain.about(agent, {"heading": 1.0})
     for weight in (0.25, 1.0, 9.0):
         with precision("float64"):
@@ -250,7 +251,7 @@ def test_turning_the_input_stretches_distances_by_half():
 
 
 def test_a_constant_input_map_is_a_proof():
-    agent = ech.QuadrotorThrust()
+    agent = ech.models.QuadrotorThrust()
     domain = ech.Domain.about(agent, {"attitude": 0.3, "thrust": 1.0})
     with precision("float64"):
         assert killing_residual(agent, np.eye(13), domain) == (0.0, "proof")

@@ -106,14 +106,16 @@ def test_a_users_own_agent_runs_as_from_python(here, echelon):
     told = json.loads(out)
     assert told["unit"] == "state" and told["leader"]["rmse"] is None
     assert told["minimum_distance"] is None
-    agent = ech.Pendulum(damping=0.5)
+    agent = ech.models.Pendulum(damping=0.5)
     graph = ech.Graph.path(4)
     result = ech.simulate(
         agent,
         graph,
         ech.Formation.from_offsets(agent, graph, {}),
-        leader=ech.Passive(),
-        follower=ech.Consensus(ech.synthesize(agent, graph, ech.Riccati()), feedforward="relay"),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(
+            ech.synthesize(agent, graph, ech.gains.Riccati()), feedforward="relay"
+        ),
         initial={"angle": 0.5},
         horizon=1.0,
         dt=0.01,

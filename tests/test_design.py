@@ -8,8 +8,8 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon.plots.design import chosen_slice, save_design_figures
-from echelon.studies.basin import converged, observed_radius, side_of, slice_of, trial
+from echelon.plots.design import save_design_figures
+from echelon.studies.basin import chosen_slice, converged, observed_radius, side_of, slice_of, trial
 from echelon.studies.design import because, designs, recommended, with_gain
 
 PATH = ech.Graph.path(4)
@@ -58,7 +58,7 @@ def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon)
     rows = {row["method"]: row for row in told["methods"]}
     assert (code, err) == (0, "")
     assert set(rows) >= {"riccati", "inner-loop", "monotone", "robust-lqr", "contraction"}
-    gain = ech.synthesize(ech.Pendulum(), PATH, ech.RobustLQR({"angle": 0.5}))
+    gain = ech.synthesize(ech.models.Pendulum(), PATH, ech.gains.RobustLQR({"angle": 0.5}))
     row, region = rows["robust-lqr"], gain.certificate.region
     assert row["condition"] == pytest.approx(np.linalg.cond(gain.P), rel=1e-4)
     assert row["radius"] == pytest.approx(region.radius, rel=1e-4)
@@ -74,9 +74,9 @@ def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon)
 def test_the_step_that_is_told_is_the_longest(echelon):
     _, out, _ = echelon("design", "mine.yaml", "--method", "riccati", "--json")
     (row,) = json.loads(out)["methods"]
-    gain = ech.synthesize(ech.Pendulum(), PATH, ech.Riccati())
+    gain = ech.synthesize(ech.models.Pendulum(), PATH, ech.gains.Riccati())
     A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
-    A[1, 0], A[1, 1] = -ech.Pendulum().stiffness, -ech.Pendulum().damping
+    A[1, 0], A[1, 1] = -ech.models.Pendulum().stiffness, -ech.models.Pendulum().damping
     K = np.linalg.solve(gain.R, B.T @ gain.P)
 
     def grows(dt):
@@ -112,14 +112,14 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelo
 def test_an_inner_loop_comes_with_what_would_shorten_it(echelon):
     _, out, _ = echelon("design", "paper-line", "--method", "inner-loop", "--json")
     (row,) = json.loads(out)["methods"]
-    wanted = ech.shorter(*parts_of("paper-line")[:2], inner_loop_gain("paper-line")).sentence()
+    wanted = ech.speedup(*parts_of("paper-line")[:2], inner_loop_gain("paper-line")).sentence()
     assert row["advice"] == wanted and "as a leader too" in wanted
     _, out, _ = echelon("design", "paper-line", "--method", "inner-loop")
     assert f"- inner-loop: {wanted}" in out
 
 
 def inner_loop_gain(scenario):
-    return ech.synthesize(*parts_of(scenario)[:2], ech.InnerLoop())
+    return ech.synthesize(*parts_of(scenario)[:2], ech.gains.InnerLoop())
 
 
 def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
@@ -133,7 +133,7 @@ def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
 
 @pytest.fixture(scope="module")
 def cubic():
-    gain = ech.synthesize(Cubic(), PATH, ech.Given(P=[1.0, 1.0]))
+    gain = ech.synthesize(Cubic(), PATH, ech.gains.FixedGain(P=[1.0, 1.0]))
     return trial(Cubic(), PATH, gain, 0.01, True), slice_of(Cubic(), gain, 3, (0, 1))
 
 
@@ -155,8 +155,8 @@ def test_the_ellipse_has_the_radius_that_it_says(cubic):
 
 
 def test_a_slice_stays_inside_the_chart():
-    agent = ech.Quadrotor()
-    gain = ech.synthesize(agent, PATH, ech.Riccati())
+    agent = ech.models.Quadrotor()
+    gain = ech.synthesize(agent, PATH, ech.gains.Riccati())
     plane = slice_of(agent, gain, 3, (0, agent.state_names.index("pitch")))
     assert plane.reach[1] < np.pi / 2 and plane.reach[0] == 30.0
 
@@ -174,8 +174,8 @@ def test_a_slice_runs_the_loop_that_simulate_runs():
             model,
             parts.graph,
             ech.Formation.from_offsets(model, parts.graph, {}),
-            leader=ech.Passive(),
-            follower=ech.Consensus(gain, feedforward="relay"),
+            leader=ech.laws.TrimInput(),
+            follower=ech.laws.Consensus(gain, feedforward="relay"),
             initial=states,
             horizon=run.horizon,
             dt=0.005,
@@ -188,15 +188,15 @@ def test_a_slice_runs_the_loop_that_simulate_runs():
 
 
 def test_the_pair_is_the_one_asked_for_or_a_telling_one():
-    quad, cart = ech.Quadrotor(), ech.VanDerPol()
-    gain = ech.synthesize(quad, PATH, ech.Riccati())
+    quad, cart = ech.models.Quadrotor(), ech.models.VanDerPol()
+    gain = ech.synthesize(quad, PATH, ech.gains.Riccati())
     assert chosen_slice(quad, gain, " roll , y ") == (6, 1)
     velocity, angle = chosen_slice(quad, gain, None)
     assert (quad.state_names[velocity], quad.state_names[angle]) in {
         ("vx", "pitch"),
         ("vy", "roll"),
     }
-    assert chosen_slice(cart, ech.synthesize(cart, PATH, ech.Riccati()), None) == (0, 1)
+    assert chosen_slice(cart, ech.synthesize(cart, PATH, ech.gains.Riccati()), None) == (0, 1)
 
 
 @pytest.mark.parametrize(
@@ -209,9 +209,9 @@ def test_the_pair_is_the_one_asked_for_or_a_telling_one():
     ],
 )
 def test_a_slice_that_is_none_is_one_sentence(asked, sentence):
-    gain = ech.synthesize(ech.Quadrotor(), PATH, ech.Riccati())
+    gain = ech.synthesize(ech.models.Quadrotor(), PATH, ech.gains.Riccati())
     with pytest.raises(ech.EchelonError) as caught:
-        chosen_slice(ech.Quadrotor(), gain, asked)
+        chosen_slice(ech.models.Quadrotor(), gain, asked)
     assert sentence in str(caught.value) and "`--slice`" in str(caught.value)
 
 
@@ -228,7 +228,7 @@ def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
     }
     assert (tmp_path / "figs" / "modes.png").read_bytes()[:4] == b"\x89PNG"
     said = out.splitlines()[-1]
-    gain = ech.synthesize(ech.Pendulum(), PATH, ech.RobustLQR({"angle": 0.5}))
+    gain = ech.synthesize(ech.models.Pendulum(), PATH, ech.gains.RobustLQR({"angle": 0.5}))
     assert f"certified {gain.certificate.region.radius:.3g}; observed" in said
     code, _, err = echelon(*call, "--slice", "angle,rat")
     assert code == 2 and "did you mean `rate`?" in err and err.count("\n") == 1
@@ -238,7 +238,7 @@ def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
 
 
 def test_where_nothing_is_certified_the_picture_says_so(tmp_path):
-    gain = ech.synthesize(Cubic(), PATH, ech.Given(P=[1.0, 1.0]))
+    gain = ech.synthesize(Cubic(), PATH, ech.gains.FixedGain(P=[1.0, 1.0]))
     told = {"model": {"name": "van-der-pol"}, "graph": {"name": "path", "agents": 4}}
     scenario = ech.scenario_from_mapping(
         {"name": "n", "simulation": {"horizon": 1.0, "dt": 0.01}, "leader": {"law": "passive"}}

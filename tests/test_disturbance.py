@@ -11,9 +11,9 @@ from oracles import laplacian
 
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Consensus, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Consensus, Tracking, TrimInput
 from echelon.models import (
     DoubleIntegrator,
     Linear,
@@ -43,7 +43,7 @@ def drift(model=CART, agents=3, **options):
     graph = Graph.path(agents)
     settings = {"horizon": 2.0, "dt": 0.01} | options
     nothing = Formation.from_offsets(model, graph, {})
-    return simulate(model, graph, nothing, leader=Passive(), follower=Passive(), **settings)
+    return simulate(model, graph, nothing, leader=TrimInput(), follower=TrimInput(), **settings)
 
 
 def accelerations(run):
@@ -93,13 +93,13 @@ def test_linear_agents_settle_where_the_linear_system_says():
     A, B = rng.normal(size=(3, 3)) - 3.5 * np.eye(3), rng.normal(size=(3, 1))
     assert np.linalg.eigvals(A).real.max() < -0.3
     model = Linear(A, B, names=("a", "b", "c"))
-    gain = synthesize(model, TREE, Given(coupling=0.7))
+    gain = synthesize(model, TREE, FixedGain(coupling=0.7))
     force, leak = np.array([0.3, -0.1, 0.5]), 1.04
     run = simulate(
         model,
         TREE,
         Formation.from_offsets(model, TREE, {}),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(gain),
         plant=varied(model, {}, {"B": leak}),
         disturbance=Disturbance(constant={"a": 0.3, "b": -0.1, "c": 0.5}),
@@ -155,7 +155,7 @@ def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
         CART,
         Graph.path(3),
         Formation.from_offsets(CART, Graph.path(3), {}),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=law,
         initial={"position": 1.0},
         disturbance=GUSTS,
@@ -246,7 +246,7 @@ def test_a_plant_like_the_model_changes_no_bit(model):
             model,
             TREE,
             Formation.from_offsets(model, TREE, {}),
-            leader=Passive(),
+            leader=TrimInput(),
             follower=Consensus(synthesize(model, TREE, Riccati())),
             initial=dict.fromkeys(model.state_names, 0.3),
             horizon=1.0,
@@ -315,8 +315,8 @@ def test_a_law_made_for_another_class_of_the_same_states_flies_it():
         printed,
         TREE,
         Formation.from_offsets(printed, TREE, {}),
-        leader=Passive(),
-        follower=Passive(),
+        leader=TrimInput(),
+        follower=TrimInput(),
         plant=Quadrotor(),
         horizon=1.0,
         dt=0.01,

@@ -9,9 +9,9 @@ from oracles import laplacian
 
 from echelon.core.errors import EchelonError, ScenarioError
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Consensus, Law, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Consensus, Law, Tracking, TrimInput
 from echelon.models import (
     DoubleIntegrator,
     Linear,
@@ -65,7 +65,7 @@ def test_a_tree_knows_parents_and_depths_and_leaders_are_their_own():
 )
 def test_a_graph_that_is_no_tree_is_refused_for_parents(graph, who):
     model = SingleIntegrator(1)
-    law = Consensus(synthesize(model, graph, Given()), feedforward="parent")
+    law = Consensus(synthesize(model, graph, FixedGain()), feedforward="parent")
     with pytest.raises(EchelonError) as caught:
         law.prepared(model, graph)
     assert str(caught.value) == (
@@ -81,7 +81,7 @@ def test_a_graph_that_is_no_tree_is_refused_for_parents(graph, who):
 def test_the_effective_matrix_of_a_tree_has_its_weights_as_eigenvalues(weights):
     graph = Graph([(*edge, w) for edge, w in zip(BUSH, weights, strict=True)], leaders=[3])
     model, c = SingleIntegrator(1), 1.7
-    law = Consensus(synthesize(model, graph, Given(coupling=c)), feedforward="parent")
+    law = Consensus(synthesize(model, graph, FixedGain(coupling=c)), feedforward="parent")
     rows = list(graph.followers)
     columns = []
     for k in rows:
@@ -91,7 +91,7 @@ def test_the_effective_matrix_of_a_tree_has_its_weights_as_eigenvalues(weights):
             model,
             graph,
             Formation(np.zeros((8, 1))),
-            leader=Passive(),
+            leader=TrimInput(),
             follower=law,
             initial=start,
             horizon=0.1,
@@ -183,7 +183,7 @@ def test_errors_decay_at_one_rate_on_any_branch_where_the_coupling_is_a_half():
         model,
         graph,
         Formation(np.zeros((13, 2))),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(gain, feedforward="parent"),
         initial={"position": 1.0},
         horizon=200.0,
@@ -204,7 +204,7 @@ def test_the_parent_says_what_its_actuators_delivered():
         model,
         graph,
         Formation.from_offsets(model, graph, {}),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(synthesize(model, graph, Riccati()), feedforward="parent"),
         initial=start,
         horizon=0.5,
@@ -222,7 +222,8 @@ class Counting(Law):
 
     size: int = eqx.field(default=1, static=True)
 
-    def asks(self):
+    @property
+    def feedforward(self):
         return "parent"
 
     def init(self):
@@ -238,7 +239,7 @@ def test_each_agent_acts_once_a_step_and_remembers():
         model,
         TREE,
         Formation(np.zeros((8, 1))),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Counting(),
         horizon=0.5,
         dt=0.1,
@@ -278,7 +279,7 @@ def test_a_long_path_compiles_as_a_short_one_and_runs():
         graph,
         Formation(np.zeros((400, 1))),
         leader=Tracking(Circle((0, 0, 0), 1.0, 0.5)),
-        follower=Consensus(synthesize(model, graph, Given()), feedforward="parent"),
+        follower=Consensus(synthesize(model, graph, FixedGain()), feedforward="parent"),
         horizon=0.5,
         dt=0.01,
         store_every=10,
@@ -293,7 +294,7 @@ def test_the_law_says_what_it_needs_and_by_how_much_a_branch_amplifies():
     model = DoubleIntegrator(1)
     graph = Graph.path(11)
     law = Consensus(synthesize(model, graph, Riccati(coupling=1.0)), feedforward="parent")
-    assert law.needs == ("neighbours' states", "its parent's input of the same step")
+    assert law.information == ("neighbours' states", "its parent's input of the same step")
     # One axis with Q = R = I: K = (1, sqrt 3), so T = (sqrt 3 s + 1) / (s^2 + sqrt 3 s + 1).
     s = 1j * np.linspace(0.0, 10.0, 10**6)
     T = np.abs((np.sqrt(3.0) * s + 1.0) / (s**2 + np.sqrt(3.0) * s + 1.0)).max()
@@ -301,7 +302,7 @@ def test_the_law_says_what_it_needs_and_by_how_much_a_branch_amplifies():
         model,
         graph,
         Formation(np.zeros((11, 2))),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=law,
         horizon=0.1,
         dt=0.1,
@@ -311,7 +312,7 @@ def test_the_law_says_what_it_needs_and_by_how_much_a_branch_amplifies():
         f"||T|| = {T:.3g}, and the 10 agents up from agent 10 by up to {T**10:.3g}; "
         "a stronger coupling brings ||T|| nearer to 1."
     ) in run.warnings
-    weak = Consensus(synthesize(model, graph, Given(P=[1.0, 1.0])), feedforward="parent")
+    weak = Consensus(synthesize(model, graph, FixedGain(P=[1.0, 1.0])), feedforward="parent")
     assert "too weak: a mode of the formation does not decay." in weak.warnings(model, graph)[0]
     assert Consensus(law.gain).warnings(model, graph) == ()
 
@@ -323,7 +324,7 @@ def test_the_report_promises_the_modes_that_parents_leave():
         model,
         graph,
         Formation(np.zeros((5, 2))),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(gain, feedforward="parent"),
         horizon=1.0,
         dt=0.1,
@@ -338,7 +339,7 @@ def test_the_report_promises_the_modes_that_parents_leave():
 
 def test_a_scenario_may_ask_for_it_and_is_told_where_it_cannot():
     parts = build(load_scenario("paper", ["follower.feedforward=parent"]))
-    assert parts.follower.asks() == "parent"
+    assert parts.follower.feedforward == "parent"
     asked = ["follower.feedforward=parent", "graph={name: ring, agents: 4}"]
     with pytest.raises(ScenarioError, match="follower: the graph is no tree: agent 2 has more"):
         build(load_scenario("paper", asked))
@@ -390,7 +391,7 @@ def test_behind_a_leader_that_backs_up_its_velocity_leads_and_its_input_misleads
 
     def end(feedforward):
         # A heading of so little weight leaves the position to be matched.
-        gain = synthesize(model, graph, Given(P=[1.0, 1.0, 1e-9], coupling=2.0))
+        gain = synthesize(model, graph, FixedGain(P=[1.0, 1.0, 1e-9], coupling=2.0))
         run = simulate(
             model,
             graph,
@@ -425,4 +426,4 @@ def test_where_the_input_map_is_constant_the_velocity_says_what_the_input_does()
 
     assert np.abs(run("relay").states - run("relay-velocity").states).max() <= 1e-11
     told = Consensus(gain, feedforward="relay-velocity")
-    assert told.needs[1] == "the velocity that the leader's input of the same step makes"
+    assert told.information[1] == "the velocity that the leader's input of the same step makes"

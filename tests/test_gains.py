@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from echelon.core import numerics
 from echelon.core.errors import GainError
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
+from echelon.core.linear import observability_rank
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -231,7 +232,7 @@ def test_a_position_without_weight_cannot_be_held():
 
 def test_the_paper_s_gain_sees_four_of_twelve_states():
     for model in (QUAD, PrintedQuadrotor()):
-        gain = synthesize(model, TREE, Given())
+        gain = synthesize(model, TREE, FixedGain())
         assert np.array_equal(gain.P, np.eye(12)) and np.array_equal(gain.R, np.eye(4))
         assert (gain.coupling, gain.method) == (1.0, "given")
         assert gain.certificate.observable == 4 and gain.certificate.edge is None
@@ -243,17 +244,17 @@ def test_rank_of_observability_agrees_with_counting_modes_that_never_enter_the_i
     C = B.T
     stacked = np.vstack([C @ np.linalg.matrix_power(A, k) for k in range(12)])
     assert np.linalg.matrix_rank(stacked) == 4
-    seen = numerics.observability_rank(A, B.T @ synthesize(QUAD, TREE, Riccati()).P)
+    seen = observability_rank(A, B.T @ synthesize(QUAD, TREE, Riccati()).P)
     assert seen == 12
 
 
 def test_given_matrices_are_kept_as_they_are():
     P, R = np.array([[2.0, 0.1], [0.1, 1.0]]), [[4.0]]
-    gain = synthesize(Pendulum(), LINE, Given(P=P, R=R, coupling=3))
+    gain = synthesize(Pendulum(), LINE, FixedGain(P=P, R=R, coupling=3))
     assert np.array_equal(gain.P, P) and np.array_equal(gain.R, [[4.0]])
     assert gain.R_inverse == pytest.approx(np.array([[0.25]]))
     assert gain.coupling == 3.0 and isinstance(gain.coupling, float)
-    assert np.array_equal(synthesize(Pendulum(), LINE, Given(P=[2, 3])).P, np.diag([2.0, 3.0]))
+    assert np.array_equal(synthesize(Pendulum(), LINE, FixedGain(P=[2, 3])).P, np.diag([2.0, 3.0]))
 
 
 class Shifted(ControlAffine):

@@ -13,10 +13,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from echelon.certificates.jacobians import model_jacobian
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.enclosure.curves import power_points, wave_points
-from echelon.enclosure.hull import Box, jacobian_hull, model_jacobian
+from echelon.enclosure.hull import Box, jacobian_hull
 from echelon.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
 from echelon.enclosure.polynomial import Atoms, constant, corner_values
 from echelon.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol

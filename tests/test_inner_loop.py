@@ -12,9 +12,9 @@ from echelon.models.linearization import linearize
 from echelon.results.metrics import formation_errors
 
 AGENTS = {
-    "double integrator": ech.DoubleIntegrator(2),
-    "planar quadrotor": ech.PlanarQuadrotor(),
-    "quadrotor": ech.Quadrotor.crazyflie(),
+    "double integrator": ech.models.DoubleIntegrator(2),
+    "planar quadrotor": ech.models.PlanarQuadrotor(),
+    "quadrotor": ech.models.Quadrotor.crazyflie(),
 }
 
 
@@ -28,7 +28,9 @@ def closed(model, gain):
 @pytest.fixture(scope="module")
 def gains():
     graph = ech.Graph.path(4)
-    return {name: ech.synthesize(model, graph, ech.InnerLoop()) for name, model in AGENTS.items()}
+    return {
+        name: ech.synthesize(model, graph, ech.gains.InnerLoop()) for name, model in AGENTS.items()
+    }
 
 
 @pytest.mark.parametrize("name", AGENTS)
@@ -63,8 +65,8 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
         model,
         graph,
         ech.Formation.line(model, graph, 0.5),
-        leader=ech.Tracking(ech.FigureEight()),
-        follower=ech.Consensus(gains["quadrotor"], feedforward="relay"),
+        leader=ech.laws.Tracking(ech.references.FigureEight()),
+        follower=ech.laws.Consensus(gains["quadrotor"], feedforward="relay"),
         initial={"position": 1.0, "attitude": 0.3},
         horizon=20.0,
         dt=0.005,
@@ -76,8 +78,8 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
         model,
         graph,
         ech.Formation.line(model, graph, 0.5),
-        leader=ech.Tracking(ech.FigureEight()),
-        follower=ech.Consensus(gains["quadrotor"], feedforward="relay"),
+        leader=ech.laws.Tracking(ech.references.FigureEight()),
+        follower=ech.laws.Consensus(gains["quadrotor"], feedforward="relay"),
         start_error={"x": 0.7},
         horizon=3.0,
         dt=0.005,
@@ -86,13 +88,15 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
 
 
 def test_v_never_rises_where_the_drift_is_linear():
-    model, graph = ech.DoubleIntegrator(2), ech.Graph.ring(5)
+    model, graph = ech.models.DoubleIntegrator(2), ech.Graph.ring(5)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.circle(model, graph),
-        leader=ech.Tracking(ech.Circle()),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.InnerLoop()), feedforward="relay"),
+        leader=ech.laws.Tracking(ech.references.Circle()),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.InnerLoop()), feedforward="relay"
+        ),
         initial={"position": 1.0, "velocity": 1.0},
         horizon=5.0,
         dt=0.01,
@@ -105,6 +109,8 @@ def test_v_never_rises_where_the_drift_is_linear():
 def test_an_agent_without_symmetric_states_is_refused():
     graph = ech.Graph.path(3)
     with pytest.raises(ech.EchelonError, match="`Pendulum` has no state that its dynamics ignore"):
-        ech.synthesize(ech.Pendulum(), graph, ech.InnerLoop())
+        ech.synthesize(ech.models.Pendulum(), graph, ech.gains.InnerLoop())
     with pytest.raises(ech.EchelonError, match=r"`symmetry_weight` is \[-1.0, -1.0\]"):
-        ech.synthesize(ech.DoubleIntegrator(2), graph, ech.InnerLoop(symmetry_weight=-1.0))
+        ech.synthesize(
+            ech.models.DoubleIntegrator(2), graph, ech.gains.InnerLoop(symmetry_weight=-1.0)
+        )

@@ -10,9 +10,9 @@ from oracles import adjacency, connected, disagreements, laplacian, quadrotor_in
 
 from echelon.core import numerics
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Agreement, Consensus, LocalView, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Agreement, Consensus, LocalView, Tracking, TrimInput
 from echelon.models import (
     DoubleIntegrator,
     Linear,
@@ -83,7 +83,7 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
     n, m = len(model.state_names), len(model.input_names)
     x, xi = rng.uniform(-1.0, 1.0, (2, agents, n))
     P, R, c = spd(rng, n), spd(rng, m), rng.uniform(0.5, 3.0)
-    law = Consensus(synthesize(model, graph, Given(P=P, R=R, coupling=c)))
+    law = Consensus(synthesize(model, graph, FixedGain(P=P, R=R, coupling=c)))
     formation = Formation(xi)
 
     # The block form over followers: u = -c (I kron R^-1) G^T (I kron P) (e + d), in normalized
@@ -108,14 +108,14 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
 def test_at_unit_coupling_and_weight_it_is_the_printed_law():
     model, rng = Linear(np.eye(2), [[1.0, 0.5], [0.0, 2.0]]), np.random.default_rng(0)
     P = spd(rng, 2)
-    law = Consensus(synthesize(model, LINE, Given(P=P)))
+    law = Consensus(synthesize(model, LINE, FixedGain(P=P)))
     z = rng.normal(size=2)
     wanted = -np.array([[1.0, 0.0], [0.5, 2.0]]) @ P @ z
     assert input_of(law, model, x=np.ones(2), z=z) == pytest.approx(wanted)
 
 
 def test_on_a_quadrotor_the_printed_law_is_weighted_by_the_squares_of_its_scale():
-    law = Consensus(synthesize(QUAD, LINE, Given()), trim=False)
+    law = Consensus(synthesize(QUAD, LINE, FixedGain()), trim=False)
     x, z = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 12))
     S = np.diag([QUAD.mass, *QUAD.inertia])
     wanted = -S @ S @ quadrotor_input_map(x, QUAD.mass, QUAD.inertia).T @ z
@@ -124,7 +124,7 @@ def test_on_a_quadrotor_the_printed_law_is_weighted_by_the_squares_of_its_scale(
 
 @every_model
 def test_the_trim_and_what_the_leader_says_are_added(model):
-    gain = synthesize(model, LINE, Given(coupling=2.0))
+    gain = synthesize(model, LINE, FixedGain(coupling=2.0))
     rng = np.random.default_rng(2)
     n, m = len(model.state_names), len(model.input_names)
     x, z, said = rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), rng.uniform(-1, 1, m)
@@ -137,14 +137,18 @@ def test_the_trim_and_what_the_leader_says_are_added(model):
 
 
 def test_a_law_says_what_it_needs_from_others():
-    gain = synthesize(QUAD, LINE, Given())
+    gain = synthesize(QUAD, LINE, FixedGain())
     others, leader = "neighbours' states", "the leader's input of the same step"
-    assert Consensus(gain).needs == (others,)
-    assert Consensus(gain, feedforward="relay").needs == (others, leader)
-    assert Agreement().needs == (others,) and Passive().needs == ()
-    assert Tracking(Hover()).needs == ("the reference",)
-    assert Tracking(Hover(), reaction=gain).needs == ("the reference", others)
-    asked = [Consensus(gain).asks(), Consensus(gain, "relay").asks(), Passive().asks()]
+    assert Consensus(gain).information == (others,)
+    assert Consensus(gain, feedforward="relay").information == (others, leader)
+    assert Agreement().information == (others,) and TrimInput().information == ()
+    assert Tracking(Hover()).information == ("the reference",)
+    assert Tracking(Hover(), reaction=gain).information == ("the reference", others)
+    asked = [
+        Consensus(gain).feedforward,
+        Consensus(gain, "relay").feedforward,
+        TrimInput().feedforward,
+    ]
     assert asked == ["none", "relay", "none"]
 
 
@@ -152,7 +156,7 @@ def test_laws_carry_the_metric_of_their_lyapunov_function():
     gain = synthesize(QUAD, LINE, Riccati())
     assert np.array_equal(Consensus(gain).metric(QUAD), gain.P)
     assert np.array_equal(Agreement().metric(SingleIntegrator(2)), np.eye(2))
-    assert Passive().metric(QUAD) is None and Tracking(Hover()).metric(QUAD) is None
+    assert TrimInput().metric(QUAD) is None and Tracking(Hover()).metric(QUAD) is None
 
 
 # ---- the leader's law ----
@@ -163,8 +167,8 @@ def test_the_leader_tracks_with_unit_coupling_and_reacts_with_the_followers_gain
     rng = np.random.default_rng(3)
     model = DoubleIntegrator(2, drag=0.4)
     P, R, Pr, Rr = spd(rng, 4), spd(rng, 2), spd(rng, 4), spd(rng, 2)
-    gain = synthesize(model, LINE, Given(P=P, R=R, coupling=7.0))
-    reaction = synthesize(model, LINE, Given(P=Pr, R=Rr, coupling=3.0)) if reacts else None
+    gain = synthesize(model, LINE, FixedGain(P=P, R=R, coupling=7.0))
+    reaction = synthesize(model, LINE, FixedGain(P=Pr, R=Rr, coupling=3.0)) if reacts else None
     path = Circle(center=(1.0, 0.0, 0.0), radius=2.0, rate=0.5)
     law = prepared(Tracking(path, gain, reaction), model)
 
@@ -196,7 +200,7 @@ def test_a_tracking_gain_is_the_model_s_riccati_gain_unless_given():
 
 def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():
     model = UnicyclePoint(ahead=0.4)
-    law = prepared(Tracking(Circle(), synthesize(model, LINE, Given())), model)
+    law = prepared(Tracking(Circle(), synthesize(model, LINE, FixedGain())), model)
     with numerics.precision("float64"):
         x = np.asarray(law.target(model, jnp.asarray(0.3))[0]) + [0.1, 0.2, 0.3]
     turned = x + [0.0, 0.0, 4.0 * np.pi]
@@ -206,7 +210,7 @@ def test_headings_of_a_tracking_leader_are_compared_by_the_shorter_way():
 
 def test_a_leader_starts_where_its_law_says():
     with numerics.precision("float64"):
-        assert np.asarray(Passive().start(QUAD)).tolist() == [0.0] * 12
+        assert np.asarray(TrimInput().start(QUAD)).tolist() == [0.0] * 12
         start = np.asarray(Tracking(Line((1, 2, 3), (0.5, 0, 0))).start(QUAD))
         rows = np.asarray(Tracking(Line()).reference_states(QUAD, jnp.array([0.0, 2.0])))
     assert start == pytest.approx([1, 2, 3, 0.5, *[0.0] * 8])
@@ -214,7 +218,7 @@ def test_a_leader_starts_where_its_law_says():
 
 
 def test_the_passive_law_is_the_trim():
-    assert input_of(Passive(), QUAD, x=np.ones(12)) == pytest.approx([0.028 * 9.81, 0, 0, 0])
+    assert input_of(TrimInput(), QUAD, x=np.ones(12)) == pytest.approx([0.028 * 9.81, 0, 0, 0])
 
 
 # ---- what an agent may know ----

@@ -10,15 +10,17 @@ DRAG = 0.7
 
 
 def double_integrators(leaders=(0,), **changes):
-    model, graph = ech.DoubleIntegrator(2, drag=DRAG), ech.Graph.ring(5, leaders=leaders)
+    model, graph = ech.models.DoubleIntegrator(2, drag=DRAG), ech.Graph.ring(5, leaders=leaders)
     formation = ech.Formation.circle(model, graph)
     settings = dict(initial={"position": 1.0, "velocity": 1.0}, horizon=4.0, dt=0.005, seed=3)
     return ech.simulate(
         model,
         graph,
         formation,
-        leader=ech.Passive(),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.Riccati()), feedforward="relay"),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.Riccati()), feedforward="relay"
+        ),
         **{**settings, **changes},
     )
 
@@ -58,15 +60,15 @@ def test_v_falls_wherever_theory_says_so_and_the_step_is_short():
 
 def monotone(**changes):
     """First-order agents with a stable drift: P = 1 is monotone, so V may never rise."""
-    model, graph = ech.Linear([[-1.0]], [[1.0]]), ech.Graph.path(4)
-    gain = ech.synthesize(model, graph, ech.Given("identity"))
+    model, graph = ech.models.Linear([[-1.0]], [[1.0]]), ech.Graph.path(4)
+    gain = ech.synthesize(model, graph, ech.gains.FixedGain("identity"))
     settings = dict(initial={"x1": 1.0}, horizon=10.0, dt=0.01)
     return ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {}),
-        leader=ech.Passive(),
-        follower=ech.Consensus(gain),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(gain),
         **{**settings, **changes},
     )
 
@@ -85,13 +87,13 @@ def test_the_printed_algorithm_is_caught_where_v_rises_against_theory():
 
 
 def test_laws_without_a_metric_have_no_v():
-    model, graph = ech.VanDerPol(), ech.Graph.path(3)
+    model, graph = ech.models.VanDerPol(), ech.Graph.path(3)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {}),
-        leader=ech.Passive(),
-        follower=ech.Passive(),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.TrimInput(),
         horizon=0.1,
         dt=0.01,
     )

@@ -7,7 +7,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from echelon.certificates.bounds import disturbance_ellipsoid, disturbance_l1, exponential
+from echelon.certificates.bounds import exponential, invariant_ellipsoid, peak_gain
 from echelon.certificates.margins import (
     ClosedLoop,
     decays_between,
@@ -276,7 +276,7 @@ def test_modes_that_do_not_turn_have_the_l1_norm_of_their_sum(seed, n):
     T, slow = rng.uniform(0.0, 1.0, (n, n)) + n * np.eye(n), -(10.0 ** rng.uniform(-3, 4, n))
     A, E = T @ np.diag(slow) @ np.linalg.inv(T), T @ rng.uniform(0.1, 1.0, (n, 1))
     loop = ClosedLoop(A, np.zeros((n, 1)), np.eye(n), ONE, 1.0, [1.0])
-    assert disturbance_l1(loop, E) == pytest.approx(np.linalg.solve(-A, E)[:, 0], rel=1e-6)
+    assert peak_gain(loop, E) == pytest.approx(np.linalg.solve(-A, E)[:, 0], rel=1e-6)
 
 
 def l1_by_trapezoids(A, E):
@@ -295,14 +295,14 @@ def l1_by_trapezoids(A, E):
 
 def test_a_scalar_disturbance_has_one_bound_by_both_arguments():
     loop = ClosedLoop(1.0 * ONE, ONE, ONE, ONE, 1.0, [3.0])
-    for bound in (disturbance_ellipsoid, disturbance_l1):
+    for bound in (invariant_ellipsoid, peak_gain):
         assert bound(loop, 0.5 * ONE, 4.0) == pytest.approx([1.0], rel=1e-6)
 
 
 @pytest.mark.parametrize("damping", [0.02, 0.3, 0.9])
 def test_an_oscillator_s_l1_norm_has_a_closed_form(damping):
     K = [1.0, 2.0 * damping]
-    found = disturbance_l1(ClosedLoop(CHAIN, PUSH, with_rows(K), ONE, 1.0, [1.0]), PUSH)
+    found = peak_gain(ClosedLoop(CHAIN, PUSH, with_rows(K), ONE, 1.0, [1.0]), PUSH)
     turn = np.pi * damping / np.sqrt(1.0 - damping**2)
     assert found[0] == pytest.approx(1.0 / np.tanh(0.5 * turn), rel=1e-6)
 
@@ -311,8 +311,8 @@ def test_stiff_and_slow_states_are_integrated_together():
     A = np.diag([-1e4, -1e-3])
     loop = ClosedLoop(A, np.zeros((2, 1)), np.eye(2), ONE, 1.0, [1.0])
     E = np.array([[1.0], [1.0]])
-    assert disturbance_l1(loop, E) == pytest.approx([1e-4, 1e3], rel=1e-6)
-    assert disturbance_ellipsoid(loop, E)[1] == pytest.approx(1e3, rel=1e-6)
+    assert peak_gain(loop, E) == pytest.approx([1e-4, 1e3], rel=1e-6)
+    assert invariant_ellipsoid(loop, E)[1] == pytest.approx(1e3, rel=1e-6)
 
 
 @given(st.integers(0, 10**6), st.integers(1, 2))
@@ -320,7 +320,7 @@ def test_stiff_and_slow_states_are_integrated_together():
 def test_the_ellipsoid_is_no_tighter_than_the_exact_norm(seed, q):
     loop, rng = random_loop(seed)
     E = rng.normal(size=(3, q))
-    outer, exact = disturbance_ellipsoid(loop, E), disturbance_l1(loop, E)
+    outer, exact = invariant_ellipsoid(loop, E), peak_gain(loop, E)
     assert (outer >= exact * (1.0 - 1e-6)).all()
     closed = modes(loop)
     assert exact == pytest.approx(np.max([l1_by_trapezoids(A, E) for A in closed], 0), rel=2e-4)
@@ -339,7 +339,7 @@ def test_the_ellipsoid_is_the_best_of_its_family(seed):
         solved = [scipy.linalg.solve_continuous_lyapunov(S, -E @ E.T / alpha) for S in shifted]
         return np.max([np.diag(X) for X in solved], 0)
 
-    found = disturbance_ellipsoid(loop, E) ** 2
+    found = invariant_ellipsoid(loop, E) ** 2
     tried = np.array([squares(alpha) for alpha in limit * np.linspace(0.002, 0.998, 400)])
     assert (found <= tried.min(0) * (1.0 + 1e-6)).all()
     assert found == pytest.approx(tried.min(0), rel=1e-2)
@@ -352,15 +352,15 @@ def test_the_ellipsoid_holds_for_every_follower_of_the_whole_network():
     E = rng.normal(size=(3, 1))
     whole = np.kron(np.eye(3), A) - c * np.kron(L, B @ np.linalg.solve(R, B.T @ P))
     exact = l1_by_trapezoids(whole, np.kron(np.eye(3), E)).reshape(3, 3)
-    assert (exact <= disturbance_ellipsoid(loop, E)).all()
+    assert (exact <= invariant_ellipsoid(loop, E)).all()
 
 
 def test_a_quadrotor_pushed_by_1_metre_per_second_squared():
     A, B, P, R = QUAD
     E = np.zeros((12, 3))
     E[3:6] = np.eye(3)
-    outer = disturbance_ellipsoid(QUAD_ON_LINE, E)
-    exact = disturbance_l1(QUAD_ON_LINE, E)
+    outer = invariant_ellipsoid(QUAD_ON_LINE, E)
+    exact = peak_gain(QUAD_ON_LINE, E)
     assert outer[:3].max() == pytest.approx(0.53, abs=5e-3)
     assert exact[:3].max() == pytest.approx(0.46, abs=5e-3)
     # Nothing turns the vehicle in yaw.

@@ -31,8 +31,8 @@ def made_up(
         model=model,
         graph=graph,
         formation=ech.Formation(np.zeros((agents, n)) if offsets is None else offsets),
-        leader=ech.Passive(),
-        follower=ech.Passive(),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.TrimInput(),
         settings=Settings(float(frames - 1), 1.0, "rk4", True, 1, "float64", 0),
         wall_time=0.0,
     )
@@ -41,7 +41,7 @@ def made_up(
 @pytest.fixture
 def exponential():
     """Two agents in space, the follower off by 2^-t (3, 0, 4) from its goal (1, 0, 0) ahead."""
-    model, graph = ech.SingleIntegrator(3), ech.Graph.path(2)
+    model, graph = ech.models.SingleIntegrator(3), ech.Graph.path(2)
     t = np.arange(21.0)
     leader = np.column_stack([np.sin(t), t, 0 * t])
     goal = leader + [1.0, 0.0, 0.0]
@@ -82,7 +82,7 @@ def test_edge_error_is_that_of_the_distance(exponential):
 
 
 def test_leader_error_by_output_with_the_heading_wound():
-    model, graph = ech.Unicycle(), ech.Graph.path(2)
+    model, graph = ech.models.Unicycle(), ech.Graph.path(2)
     reference = np.tile([1.0, 2.0, 3.1], (5, 1))
     states = np.stack([reference + [0.3, 0.4, 2 * np.pi + 0.1], reference], axis=1)
     result = made_up(states, model, graph, reference=reference)
@@ -95,7 +95,7 @@ def test_leader_error_by_output_with_the_heading_wound():
 
 
 def test_effort_is_of_the_normalized_input_about_the_trim():
-    model, graph = ech.Quadrotor.crazyflie(), ech.Graph.path(2)
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)
     inputs = np.tile(np.asarray(model.trim[1]), (4, 2, 1))
     inputs[:, 1] += np.asarray(model.input_scale) @ [3.0, 0.0, 4.0, 0.0]
     result = made_up(np.zeros((4, 2, 12)), model, graph, inputs=inputs)
@@ -103,7 +103,7 @@ def test_effort_is_of_the_normalized_input_about_the_trim():
 
 
 def test_what_does_not_exist_is_none():
-    model, graph = ech.VanDerPol(), ech.Graph.path(3)
+    model, graph = ech.models.VanDerPol(), ech.Graph.path(3)
     numbers = metrics(made_up(np.zeros((3, 3, 2)), model, graph))
     assert numbers.leader.rmse is None and numbers.minimum_distance is None
     diverged = made_up(np.zeros((3, 3, 2)), model, graph, outcome=Outcome.DIVERGED)
@@ -113,7 +113,7 @@ def test_what_does_not_exist_is_none():
 
 
 def test_a_run_without_a_frame_has_no_numbers():
-    model, graph = ech.SingleIntegrator(2), ech.Graph.path(2)
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(2)
     result = made_up(np.zeros((1, 2, 2)), model, graph, outcome=Outcome.INTERRUPTED)
     nothing = dataclasses.replace(
         result, times=result.times[:0], states=result.states[:0], inputs=result.inputs[:0]
@@ -125,14 +125,16 @@ def test_a_run_without_a_frame_has_no_numbers():
 
 def test_the_relay_is_a_fixed_point_of_the_formation():
     """Started on their goals, followers told the leader's input stay there to rounding."""
-    model, graph = ech.Quadrotor.crazyflie(), ech.Graph.path(3)
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
     formation = ech.Formation.from_offsets(model, graph, {1: (1, 0, 0), 2: (2, 0, 0)})
     result = ech.simulate(
         model,
         graph,
         formation,
-        leader=ech.Tracking(ech.Lemniscate()),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.Riccati()), feedforward="relay"),
+        leader=ech.laws.Tracking(ech.references.Lemniscate()),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.Riccati()), feedforward="relay"
+        ),
         start_error={"x": -6.0, "y": 3.0},
         horizon=2.0,
         dt=0.01,

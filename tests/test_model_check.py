@@ -8,9 +8,9 @@ from test_models import FAMILY
 from echelon.core import numerics
 from echelon.core.errors import EchelonError, ModelError
 from echelon.engine.simulate import simulate
-from echelon.gains import Given
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Passive
+from echelon.gains import FixedGain
+from echelon.gains.gain import synthesize
+from echelon.laws import TrimInput
 from echelon.models import ControlAffine, SingleIntegrator
 from echelon.models.check import check_model
 from echelon.network.formation import Formation
@@ -227,14 +227,14 @@ def test_both_verbs_check_the_agent_they_are_given():
     model = spoiled(trim=((0.5, 0.5), (0.25,)))
     graph = Graph.path(2)
     with pytest.raises(EchelonError, match="is no equilibrium"):
-        synthesize(model, graph, Given())
+        synthesize(model, graph, FixedGain())
     with pytest.raises(EchelonError, match="is no equilibrium"):
         simulate(
             model,
             graph,
             Formation(np.zeros((2, 2))),
-            leader=Passive(),
-            follower=Passive(),
+            leader=TrimInput(),
+            follower=TrimInput(),
             horizon=1.0,
             dt=0.1,
         )
@@ -257,8 +257,8 @@ def test_parameters_that_jax_has_rounded_are_warned_of_and_others_are_not():
         Tuned(outflow=jnp.asarray(0.1, jnp.float32)),
         Graph.path(2),
         Formation(np.zeros((2, 2))),
-        leader=Passive(),
-        follower=Passive(),
+        leader=TrimInput(),
+        follower=TrimInput(),
         horizon=0.1,
         dt=0.1,
     )

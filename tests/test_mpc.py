@@ -11,24 +11,24 @@ import echelon as ech
 from echelon.core.errors import MissingExtraError, PlanError
 from echelon.optimal.horizon import Answer, Horizon
 
-CART = ech.DoubleIntegrator(1)
+CART = ech.models.DoubleIntegrator(1)
 PAIR = ech.Graph.path(2)
 APART = ech.Formation([[0.0, 0.0], [-1.0, 0.0]])
-QUADROTOR = ech.Quadrotor.crazyflie()
+QUADROTOR = ech.models.Quadrotor.crazyflie()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])
 DRAWN = ech.Formation.from_offsets(QUADROTOR, TREE, {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)})
-LOOP = ech.Lemniscate()
+LOOP = ech.references.Lemniscate()
 BRIEF = {"horizon": 0.2, "dt": 0.01, "reference": LOOP, "initial": {"position": 0.2}, "seed": 1}
 
 
 def cart_run(mpc, states, horizon=2.0, **more):
-    return ech.simulate_mpc(
+    return ech.optimal.simulate_mpc(
         CART, PAIR, APART, mpc=mpc, initial=np.array(states), horizon=horizon, dt=0.05, **more
     )
 
 
 def swarm(**more):
-    return ech.simulate_mpc(QUADROTOR, TREE, DRAWN, **{**BRIEF, **more})
+    return ech.optimal.simulate_mpc(QUADROTOR, TREE, DRAWN, **{**BRIEF, **more})
 
 
 def regulator(Q, R, dt):
@@ -48,7 +48,7 @@ def regulator(Q, R, dt):
 def test_without_limits_every_horizon_is_the_linear_regulator(horizon):
     # The cost from the horizon's end on is the regulator's, so that a short one is no worse.
     Q, R = [3.0, 0.5], [0.2]
-    mpc = ech.MPC(period=0.1, horizon=horizon, state_weight=Q, input_weight=R)
+    mpc = ech.optimal.MPC(period=0.1, horizon=horizon, state_weight=Q, input_weight=R)
     result = cart_run(mpc, [[0.0, 0.0], [0.5, -0.3]], store_every=2)
     closed, K = regulator(Q, R, 0.1)
     x = np.array([1.5, -0.3])
@@ -62,7 +62,7 @@ def test_without_limits_every_horizon_is_the_linear_regulator(horizon):
 def test_a_follower_of_a_moving_leader_has_no_lag():
     # The leader is off its goal too; the difference between the two obeys the regulator alone.
     Q, R = [3.0, 0.5], [0.2]
-    mpc = ech.MPC(period=0.1, horizon=1.0, state_weight=Q, input_weight=R)
+    mpc = ech.optimal.MPC(period=0.1, horizon=1.0, state_weight=Q, input_weight=R)
     result = cart_run(mpc, [[2.0, 1.0], [0.5, -0.3]], store_every=2)
     closed, _ = regulator(Q, R, 0.1)
     gap = result.states[:, 1] - result.states[:, 0] - APART.offsets[1]
@@ -71,7 +71,7 @@ def test_a_follower_of_a_moving_leader_has_no_lag():
 
 
 def test_the_weights_left_out_are_the_model_s_on_what_it_shows():
-    Q, R = ech.MPC().weights(QUADROTOR)
+    Q, R = ech.optimal.MPC().weights(QUADROTOR)
     own = np.array(QUADROTOR.weights[0])
     shown = [0, 1, 2, 8]
     assert Q[shown] == pytest.approx(own[shown]) and R == pytest.approx(
@@ -92,7 +92,7 @@ def test_quadrotors_close_up_within_their_motors_limits():
     G, low, high = (np.array(part) for part in QUADROTOR.input_limits)
     thrusts = result.inputs @ G.T
     assert (thrusts >= low - 1e-7).all() and (thrusts <= high + 1e-7).all()
-    figures = ech.solver_figures(result)
+    figures = ech.optimal.solver_stats(result)
     assert figures.failures == 0 and figures.solves == 4 * 80
 
 
@@ -100,7 +100,7 @@ def test_wind_does_not_add_up_as_it_does_open_loop():
     wind = ech.Disturbance(constant={"vx": 1.0})
     given = {"horizon": 0.6, "initial": None, "disturbance": wind, "store_every": 10}
     closed = swarm(**given)
-    replayed = ech.simulate_plans(QUADROTOR, TREE, DRAWN, **{**BRIEF, **given})
+    replayed = ech.optimal.simulate_plans(QUADROTOR, TREE, DRAWN, **{**BRIEF, **given})
     off, lost = (np.abs(r.states[-1, 0, 0] - r.reference[-1, 0]) for r in (closed, replayed))
     # 1 m/s^2 over 0.6 s is 0.18 m.
     assert lost == pytest.approx(0.18, abs=0.01) and off < 0.1
@@ -116,7 +116,9 @@ def test_agents_renamed_fly_the_same():
     again = np.zeros_like(states)
     again[order] = states
     one = swarm(initial=states)
-    other = ech.simulate_mpc(QUADROTOR, renamed, ech.Formation(rows), **{**BRIEF, "initial": again})
+    other = ech.optimal.simulate_mpc(
+        QUADROTOR, renamed, ech.Formation(rows), **{**BRIEF, "initial": again}
+    )
     assert other.states[:, order] == pytest.approx(one.states, abs=1e-9)
 
 
@@ -167,9 +169,9 @@ def failing(monkeypatch, when):
 
 def test_after_a_failure_the_last_plan_goes_on_shifted(monkeypatch):
     calls = failing(monkeypatch, lambda number: number in (10, 12))
-    mpc = ech.MPC(period=0.1, horizon=1.0)
+    mpc = ech.optimal.MPC(period=0.1, horizon=1.0)
     result = cart_run(mpc, [[0.0, 0.0], [0.5, -0.3]], store_every=2)
-    figures = ech.solver_figures(result)
+    figures = ech.optimal.solver_stats(result)
     assert figures.failures == 2 and result.outcome is ech.Outcome.COMPLETED
     assert figures.solves == 2 * 20 and len(calls) == 2 * 20 + 1
     plan = calls[8].course.inputs
@@ -180,7 +182,7 @@ def test_after_a_failure_the_last_plan_goes_on_shifted(monkeypatch):
 
 def test_a_failure_can_end_the_run_and_keeps_what_was_flown(monkeypatch):
     failing(monkeypatch, lambda number: number == 10)
-    mpc = ech.MPC(period=0.1, horizon=1.0, on_failure="stop")
+    mpc = ech.optimal.MPC(period=0.1, horizon=1.0, on_failure="stop")
     result = cart_run(mpc, [[0.0, 0.0], [0.5, -0.3]])
     assert result.outcome is ech.Outcome.INTERRUPTED
     assert result.message == (
@@ -191,8 +193,8 @@ def test_a_failure_can_end_the_run_and_keeps_what_was_flown(monkeypatch):
 
 
 def test_a_real_failure_is_counted_and_survived():
-    result = swarm(mpc=ech.MPC(options={"piqp": {"max_iter": 1}}), horizon=0.1)
-    figures = ech.solver_figures(result)
+    result = swarm(mpc=ech.optimal.MPC(options={"piqp": {"max_iter": 1}}), horizon=0.1)
+    figures = ech.optimal.solver_stats(result)
     assert figures.failures == figures.solves == 20
     assert result.outcome is ech.Outcome.COMPLETED
 
@@ -209,19 +211,25 @@ def test_a_run_that_diverges_says_so():
 
 def test_the_figures_are_kept_with_the_result():
     result = swarm(horizon=0.1)
-    figures = ech.solver_figures(result)
+    figures = ech.optimal.solver_stats(result)
     assert json.loads(result.provenance["solver"]) == figures._asdict()
     assert figures.method == "mpc" and figures.solver == "piqp" and figures.solves == 4 * 5
     assert 0.0 < figures.median_ms <= figures.p99_ms <= figures.worst_ms
     law = ech.simulate(
-        CART, PAIR, APART, leader=ech.Passive(), follower=ech.Passive(), horizon=0.1, dt=0.05
+        CART,
+        PAIR,
+        APART,
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.TrimInput(),
+        horizon=0.1,
+        dt=0.05,
     )
-    assert ech.solver_figures(law) is None
+    assert ech.optimal.solver_stats(law) is None
 
 
 def test_a_result_s_law_cannot_be_run_by_itself():
     result = swarm(horizon=0.1)
-    assert result.leader.needs == ("the reference",)
+    assert result.leader.information == ("the reference",)
     with pytest.raises(ech.EchelonError, match="use `simulate_plans` or `simulate_mpc`"):
         ech.simulate(
             QUADROTOR, TREE, DRAWN, leader=result.leader, follower=result.follower,
@@ -248,7 +256,7 @@ def test_a_result_s_law_cannot_be_run_by_itself():
 )
 def test_a_horizon_out_of_range_is_refused(how, sentence):
     with pytest.raises(PlanError) as caught:
-        ech.MPC(**how)
+        ech.optimal.MPC(**how)
     assert str(caught.value) == sentence
 
 
@@ -263,14 +271,14 @@ def test_a_horizon_out_of_range_is_refused(how, sentence):
 )  # fmt: skip
 def test_what_does_not_fit_the_model_is_refused(how, sentence):
     with pytest.raises(PlanError) as caught:
-        cart_run(ech.MPC(period=0.1, **how), [[0, 0], [0, 0]])
+        cart_run(ech.optimal.MPC(period=0.1, **how), [[0, 0], [0, 0]])
     assert str(caught.value).startswith(sentence)
 
 
 def test_a_state_that_nothing_brings_back_is_told():
-    still = ech.Linear([[0.0]], [[0.0]])
+    still = ech.models.Linear([[0.0]], [[0.0]])
     with pytest.raises(PlanError, match="the cost from the horizon's end on does not exist"):
-        ech.simulate_mpc(
+        ech.optimal.simulate_mpc(
             still, PAIR, ech.Formation([[0.0], [1.0]]), horizon=1.0, dt=0.1,
         )  # fmt: skip
 
@@ -283,7 +291,7 @@ def test_a_missing_extra_is_told(monkeypatch):
 
 def test_the_terminal_cost_is_that_of_the_discrete_riccati_equation():
     # Another solver of the same equation, on the quadrotor at hover.
-    horizon = Horizon(QUADROTOR, ech.MPC(), 3, 0.02, limits=True)
+    horizon = Horizon(QUADROTOR, ech.optimal.MPC(), 3, 0.02, limits=True)
     last = horizon._weight.toarray()[-12:, -12:]
     A, B = np.zeros((12, 12)), np.zeros((12, 4))
     A[:3, 3:6] = A[6:9, 9:] = np.eye(3)
@@ -291,7 +299,7 @@ def test_the_terminal_cost_is_that_of_the_discrete_riccati_equation():
     B[5, 0] = 1.0
     B[9:, 1:] = np.eye(3)
     flow = scipy.linalg.expm(0.02 * np.block([[A, B], [np.zeros((4, 16))]]))
-    Q, R = (0.02 * np.diag(w) for w in ech.MPC().weights(QUADROTOR))
+    Q, R = (0.02 * np.diag(w) for w in ech.optimal.MPC().weights(QUADROTOR))
     F, G = flow[:12, :12], flow[:12, 12:]
     P = np.zeros((12, 12))
     for _ in range(4000):

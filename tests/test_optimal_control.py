@@ -13,12 +13,13 @@ from scipy.integrate import solve_bvp
 import echelon as ech
 from echelon.core.errors import MissingExtraError, ModelError, PlanError
 from echelon.core.numerics import precision
+from echelon.models import Limits
 from echelon.references.flatness import demand, flat_inputs, reference_warnings
 
-CART = ech.DoubleIntegrator(1)
-PUSH = ech.Limits(((1.0,),), (-1.0,), (1.0,))
-REST = ech.Constraint("rest", lambda x, p: x[1], 0.0, 0.0, end=True)
-ARRIVAL = ech.Constraint("arrival", lambda x, p: x - p, 0.0, 0.0, end=True)
+CART = ech.models.DoubleIntegrator(1)
+PUSH = Limits(((1.0,),), (-1.0,), (1.0,))
+REST = ech.optimal.Constraint("rest", lambda x, p: x[1], 0.0, 0.0, end=True)
+ARRIVAL = ech.optimal.Constraint("arrival", lambda x, p: x - p, 0.0, 0.0, end=True)
 both_transcriptions = pytest.mark.parametrize("transcription", ["shooting", "collocation"])
 
 
@@ -29,7 +30,9 @@ def effort(x, u, p):
 def transfer(steps, **changes):
     """A cart from rest to rest with the least effort; p is where it shall arrive."""
     parts = {"model": CART, "stage": effort, "constraints": (ARRIVAL,), "limits": False}
-    return ech.OptimalControl(horizon=1.0, steps=steps, parameters=2, **{**parts, **changes})
+    return ech.optimal.OptimalControl(
+        horizon=1.0, steps=steps, parameters=2, **{**parts, **changes}
+    )
 
 
 # ---- closed forms ----
@@ -40,7 +43,7 @@ def test_least_effort_moves_a_cart_as_the_calculus_of_variations_says(transcript
     # u = 6 - 12 t and the effort 12, which the grid approaches in proportion to dt^2.
     costs, slopes = [], []
     for steps in (10, 20, 40):
-        found = ech.plan(transfer(steps, transcription=transcription), [0, 0], [1, 0])
+        found = ech.optimal.solve(transfer(steps, transcription=transcription), [0, 0], [1, 0])
         t = found.times if transcription == "collocation" else found.times[:-1] + 0.5 / steps
         costs.append(found.cost - 12.0)
         # The trapezoidal rule's first and last input stand for half a step, and lag by as much.
@@ -56,7 +59,7 @@ def test_least_effort_moves_a_cart_as_the_calculus_of_variations_says(transcript
 @pytest.mark.parametrize("transcription", ["shooting", "collocation"])
 @pytest.mark.parametrize("top", [1.0, 0.25])
 def test_a_cart_with_limits_gets_as_far_as_full_push_and_full_brake_take_it(transcription, top):
-    limits = ech.Limits(((2.0,),), (-2.0 * top,), (2.0 * top,))
+    limits = Limits(((2.0,),), (-2.0 * top,), (2.0 * top,))
     problem = transfer(
         20,
         stage=lambda x, u, p: 0.0 * u[0],
@@ -65,7 +68,7 @@ def test_a_cart_with_limits_gets_as_far_as_full_push_and_full_brake_take_it(tran
         limits=limits,
         transcription=transcription,
     )
-    found = ech.plan(problem, [0, 0], [0, 0])
+    found = ech.optimal.solve(problem, [0, 0], [0, 0])
     assert found.solved
     assert np.abs(found.inputs).max() <= top * (1 + 1e-7)
     # By collocation the input cannot jump, so the switch takes a step.
@@ -74,7 +77,7 @@ def test_a_cart_with_limits_gets_as_far_as_full_push_and_full_brake_take_it(tran
 
 
 def test_a_plan_meets_pontryagin_s_conditions_to_the_order_of_the_grid():
-    model, T, x0 = ech.VanDerPol(1.0), 2.0, np.array([1.5, -0.5])
+    model, T, x0 = ech.models.VanDerPol(1.0), 2.0, np.array([1.5, -0.5])
 
     def conditions(t, y):
         x, v, a, b = y
@@ -91,10 +94,10 @@ def test_a_plan_meets_pontryagin_s_conditions_to_the_order_of_the_grid():
     assert exact.success
     misses = []
     for steps in (20, 40, 80):
-        problem = ech.OptimalControl(
+        problem = ech.optimal.OptimalControl(
             model, T, steps, lambda x, u, p: x @ x + u @ u, transcription="collocation"
         )
-        found = ech.plan(problem, x0)
+        found = ech.optimal.solve(problem, x0)
         misses.append(np.abs(found.states - exact.sol(found.times)[:2].T).max())
     orders = np.log2(np.array(misses[:-1]) / misses[1:])
     assert orders == pytest.approx(2.0, abs=0.3)
@@ -115,23 +118,23 @@ class Played(ech.Law):
 
 
 def test_a_plan_is_flown_by_the_simulation_as_planned():
-    model, start = ech.Quadrotor.crazyflie(), np.array([0.5, -0.2, 0.3] + [0.0] * 9)
+    model, start = ech.models.Quadrotor.crazyflie(), np.array([0.5, -0.2, 0.3] + [0.0] * 9)
     size = jnp.array([0.3, 1e-4, 1e-4, 1e-4])
-    problem = ech.OptimalControl(
+    problem = ech.optimal.OptimalControl(
         model,
         1.0,
         20,
         lambda x, u, p: x[:3] @ x[:3] + 0.01 * (x[3:] @ x[3:] + jnp.sum((u / size) ** 2)),
         substeps=5,
     )
-    found = ech.plan(problem, start)
+    found = ech.optimal.solve(problem, start)
     assert found.solved
     flown = ech.simulate(
         model,
         ech.Graph.path(2),
         ech.Formation(np.zeros((2, 12))),
         leader=Played(found.inputs, problem.dt),
-        follower=ech.Passive(),
+        follower=ech.laws.TrimInput(),
         initial=np.stack([start, start]),
         horizon=1.0,
         dt=0.01,
@@ -144,9 +147,9 @@ def test_a_plan_is_flown_by_the_simulation_as_planned():
 @pytest.mark.parametrize("solver", ["fatrop", "sqpmethod"])
 def test_solvers_agree(solver):
     problem = transfer(15, stage=lambda x, u, p: u @ u + x @ x + x[0] ** 4, limits=PUSH)
-    first = ech.plan(problem, [0.1, 0.0], [0.2, 0.1])
+    first = ech.optimal.solve(problem, [0.1, 0.0], [0.2, 0.1])
     quiet = {"fatrop": {}, "sqpmethod": QUIET}[solver]
-    second = ech.plan(problem, [0.1, 0.0], [0.2, 0.1], solver=solver, options=quiet)
+    second = ech.optimal.solve(problem, [0.1, 0.0], [0.2, 0.1], solver=solver, options=quiet)
     assert first.solved and second.solved
     assert second.message == f"{solver} solved the problem: it reached its tolerance."
     assert second.states == pytest.approx(first.states, abs=1e-5)
@@ -163,26 +166,26 @@ QUIET = {
 
 
 def test_a_planner_solves_other_data_as_a_fresh_one_would():
-    planner = ech.Planner(transfer(20))
+    planner = ech.optimal.Solver(transfer(20))
     first = planner.solve([0, 0], [1, 0])
     for guess in (None, first, (first.states, first.inputs)):
         again = planner.solve([0.3, -0.1], [2, 0], guess)
-        fresh = ech.plan(transfer(20), [0.3, -0.1], [2, 0])
+        fresh = ech.optimal.solve(transfer(20), [0.3, -0.1], [2, 0])
         assert again.states == pytest.approx(fresh.states, abs=1e-7)
         assert again.cost == pytest.approx(fresh.cost)
 
 
 def test_parameters_belong_to_their_times():
     path = np.cumsum(np.random.default_rng(0).normal(0.0, 0.1, (21, 1)), axis=0)
-    problem = ech.OptimalControl(
-        ech.SingleIntegrator(1),
+    problem = ech.optimal.OptimalControl(
+        ech.models.SingleIntegrator(1),
         1.0,
         20,
         lambda x, u, p: 0.0 * u[0],
-        constraints=(ech.Constraint("path", lambda x, p: x - p, 0.0, 0.0),),
+        constraints=(ech.optimal.Constraint("path", lambda x, p: x - p, 0.0, 0.0),),
         parameters=1,
     )
-    found = ech.plan(problem, path[0], path)
+    found = ech.optimal.solve(problem, path[0], path)
     assert found.states == pytest.approx(path, abs=1e-7)
     # The cost too: with the cost |x - p|^2 alone the plan follows the same path at no cost.
     follow = dataclasses.replace(
@@ -191,7 +194,7 @@ def test_parameters_belong_to_their_times():
         stage=lambda x, u, p: jnp.sum((x - p) ** 2),
         terminal=lambda x, p: jnp.sum((x - p) ** 2),
     )
-    found = ech.plan(follow, path[0], path)
+    found = ech.optimal.solve(follow, path[0], path)
     assert found.states == pytest.approx(path, abs=1e-5)
     assert found.cost == pytest.approx(0.0, abs=1e-9)
 
@@ -210,9 +213,9 @@ def test_scaled_units_give_the_same_plan():
             return jnp.array([[0.0], [1e-6]], x.dtype)
 
     def solved(model, unit):
-        limits = ech.Limits(((1.0,),), (-4.0 * unit,), (4.0 * unit,))
+        limits = Limits(((1.0,),), (-4.0 * unit,), (4.0 * unit,))
         cost = {"stage": lambda x, u, p: u @ u / unit**2}
-        return ech.plan(transfer(20, model=model, limits=limits, **cost), [0, 0], [0.9, 0])
+        return ech.optimal.solve(transfer(20, model=model, limits=limits, **cost), [0, 0], [0.9, 0])
 
     plain, micro = solved(CART, 1.0), solved(Micro(), 1e6)
     assert micro.states == pytest.approx(plain.states, abs=1e-8)
@@ -225,7 +228,7 @@ def test_scaled_units_give_the_same_plan():
 
 def test_an_infeasible_problem_names_what_must_be_missed_and_by_how_much():
     # In one second full push and full brake carry the cart 1/4 m, and it has 5 m to go.
-    found = ech.plan(transfer(20, limits=PUSH), [5.0, 0.0], [0.0, 0.0])
+    found = ech.optimal.solve(transfer(20, limits=PUSH), [5.0, 0.0], [0.0, 0.0])
     assert not found.solved
     [missed] = found.violations
     assert (missed.name, missed.time) == ("arrival", 1.0)
@@ -237,8 +240,8 @@ def test_an_infeasible_problem_names_what_must_be_missed_and_by_how_much():
 
 
 def test_a_contradiction_of_the_limits_themselves_is_told_too():
-    both = ech.Limits(((1.0,), (1.0,)), (-1.0, 2.0), (1.0, 3.0))
-    found = ech.plan(transfer(5, limits=both, constraints=()), [0.0, 0.0], [0.0, 0.0])
+    both = Limits(((1.0,), (1.0,)), (-1.0, 2.0), (1.0, 3.0))
+    found = ech.optimal.solve(transfer(5, limits=both, constraints=()), [0.0, 0.0], [0.0, 0.0])
     assert not found.solved
     assert {v.name for v in found.violations} <= {"actuator limit 1", "actuator limit 2"}
     assert sum(v.amount for v in found.violations) >= 1.0 - 1e-6
@@ -248,10 +251,12 @@ def test_a_solver_that_stops_early_says_so_and_what_its_plan_misses():
     # With no iteration the plan is the guess, whose misses are worked out by hand.
     rng = np.random.default_rng(5)
     steps, states, inputs = 4, rng.normal(size=(5, 2)), 3.0 * rng.normal(size=(4, 1))
-    wall = ech.Constraint("wall", lambda x, p: x[0], high=-3.0)
+    wall = ech.optimal.Constraint("wall", lambda x, p: x[0], high=-3.0)
     problem = transfer(steps, limits=PUSH, constraints=(wall, ARRIVAL))
     options = {"ipopt.max_iter": 0}
-    found = ech.plan(problem, [7.0, 0.0], [9.0, 0.0], guess=(states, inputs), options=options)
+    found = ech.optimal.solve(
+        problem, [7.0, 0.0], [9.0, 0.0], guess=(states, inputs), options=options
+    )
     dt = 0.25
     moved = np.stack(
         [
@@ -286,7 +291,7 @@ def test_a_solver_that_stops_early_says_so_and_what_its_plan_misses():
 
 def test_a_cost_without_a_minimum_is_told():
     problem = transfer(5, constraints=(), stage=lambda x, u, p: u[0])
-    found = ech.plan(problem, [0.0, 0.0], [0.0, 0.0], options={"ipopt.max_iter": 500})
+    found = ech.optimal.solve(problem, [0.0, 0.0], [0.0, 0.0], options={"ipopt.max_iter": 500})
     assert not found.solved
     assert found.message.startswith(
         "ipopt failed to solve the problem: its variables grew without bound, as where the cost "
@@ -296,7 +301,7 @@ def test_a_cost_without_a_minimum_is_told():
 
 def test_a_number_that_is_not_finite_is_told():
     problem = transfer(5, constraints=(), stage=lambda x, u, p: jnp.log(x[0]) + u @ u)
-    found = ech.plan(problem, [-1.0, 0.0], [0.0, 0.0])
+    found = ech.optimal.solve(problem, [-1.0, 0.0], [0.0, 0.0])
     assert not found.solved
     assert "not a finite number" in found.message
 
@@ -318,9 +323,9 @@ def test_a_number_that_is_not_finite_is_told():
         ({"transcription": "euler"}, "`transcription` is `euler`, allowed are `shooting`, "
          "`collocation`."),
         ({"model": 3}, "the model is 3, and must be an instance of a `ControlAffine` class."),
-        ({"limits": ech.Limits(((1.0, 0.0),), (-1.0,), (1.0,))}, "the input limits have shapes "
+        ({"limits": Limits(((1.0, 0.0),), (-1.0,), (1.0,))}, "the input limits have shapes "
          "(1, 2), (1,) and (1,), and must have (k, 1), (k,) and (k,)."),
-        ({"limits": ech.Limits(((1.0,),), (2.0,), (1.0,))}, "the input limits [2.0] to [1.0] hold "
+        ({"limits": Limits(((1.0,),), (2.0,), (1.0,))}, "the input limits [2.0] to [1.0] hold "
          "no number."),
     ],
 )  # fmt: skip
@@ -348,10 +353,10 @@ def test_a_model_whose_limits_no_solver_can_read_is_told():
         "or give `limits`."
     )
     with pytest.raises(PlanError, match=f"^{re.escape(said)}$"):
-        ech.OptimalControl(Clipped(), 1.0, 5, effort)
-    assert ech.OptimalControl(Clipped(), 1.0, 5, effort, limits=False).bounds is None
-    assert ech.OptimalControl(Clipped(), 1.0, 5, effort, limits=PUSH).bounds == PUSH
-    assert ech.OptimalControl(CART, 1.0, 5, effort).bounds is None
+        ech.optimal.OptimalControl(Clipped(), 1.0, 5, effort)
+    assert ech.optimal.OptimalControl(Clipped(), 1.0, 5, effort, limits=False).bounds is None
+    assert ech.optimal.OptimalControl(Clipped(), 1.0, 5, effort, limits=PUSH).bounds == PUSH
+    assert ech.optimal.OptimalControl(CART, 1.0, 5, effort).bounds is None
 
 
 @pytest.mark.parametrize(
@@ -369,7 +374,7 @@ def test_a_model_whose_limits_no_solver_can_read_is_told():
 )  # fmt: skip
 def test_a_cost_or_constraint_of_a_wrong_shape_is_told(changes, said):
     with pytest.raises(PlanError, match=f"^{re.escape(said)}$"):
-        ech.Planner(transfer(5, **changes))
+        ech.optimal.Solver(transfer(5, **changes))
 
 
 @pytest.mark.parametrize(
@@ -386,18 +391,18 @@ def test_a_cost_or_constraint_of_a_wrong_shape_is_told(changes, said):
     ],
 )  # fmt: skip
 def test_data_that_does_not_fit_is_told(arguments, said):
-    planner = ech.Planner(transfer(5))
+    planner = ech.optimal.Solver(transfer(5))
     with pytest.raises(PlanError, match=f"^{re.escape(said)}$"):
         planner.solve(*arguments)
 
 
 def test_a_solver_that_does_not_exist_or_refuses_is_told():
     with pytest.raises(PlanError, match="`solver` is `newton`, which CasADi lacks; try `ipopt`"):
-        ech.Planner(transfer(5), "newton")
+        ech.optimal.Solver(transfer(5), "newton")
     with pytest.raises(
         PlanError, match=r"^`ipopt` refuses the problem or its options: Unknown option: coffee.$"
     ):
-        ech.Planner(transfer(5), options={"coffee": 1})
+        ech.optimal.Solver(transfer(5), options={"coffee": 1})
 
 
 def test_a_cost_that_no_expression_holds_is_named():
@@ -405,21 +410,21 @@ def test_a_cost_that_no_expression_holds_is_named():
         return jax.lax.while_loop(lambda y: y > 1.0, lambda y: 0.5 * y, u[0])
 
     with pytest.raises(ModelError, match="^`stage` uses `while`, which has no expression"):
-        ech.Planner(transfer(5, stage=search))
+        ech.optimal.Solver(transfer(5, stage=search))
 
 
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'echelon\[optimal\]'"):
-        ech.plan(transfer(5), [0, 0], [1, 0])
+        ech.optimal.solve(transfer(5), [0, 0], [1, 0])
 
 
 # ---- what a reference asks ----
 
-FIGURE = ech.FigureEight(rate=6.0)
+FIGURE = ech.references.FigureEight(rate=6.0)
 
 
-@pytest.mark.parametrize("model", [ech.Quadrotor.crazyflie(), ech.PlanarQuadrotor()])
+@pytest.mark.parametrize("model", [ech.models.Quadrotor.crazyflie(), ech.models.PlanarQuadrotor()])
 def test_the_demand_is_how_far_the_input_goes_towards_the_limit(model):
     inputs = flat_inputs(model, FIGURE, np.linspace(0.1, 0.9, 50))
     hover = np.array(model.trim[1])
@@ -432,7 +437,7 @@ def test_the_demand_is_how_far_the_input_goes_towards_the_limit(model):
 
 
 def test_a_reference_beyond_the_limits_is_warned_of_with_the_ratio():
-    model = ech.Quadrotor.crazyflie()
+    model = ech.models.Quadrotor.crazyflie()
     [told] = reference_warnings(model, FIGURE, 4.0)
     times = np.linspace(0.0, 4.0, 1000)
     worst = demand(model, flat_inputs(model, FIGURE, times)).max()
@@ -443,5 +448,5 @@ def test_a_reference_beyond_the_limits_is_warned_of_with_the_ratio():
         "it slower or smaller.",
         told,
     )
-    assert reference_warnings(model, ech.FigureEight(rate=0.3), 10.0) == ()
-    assert reference_warnings(ech.DoubleIntegrator(3), FIGURE, 10.0) == ()
+    assert reference_warnings(model, ech.references.FigureEight(rate=0.3), 10.0) == ()
+    assert reference_warnings(ech.models.DoubleIntegrator(3), FIGURE, 10.0) == ()

@@ -8,24 +8,24 @@ import echelon as ech
 from echelon.core.errors import LawError, PlanError
 from echelon.core.numerics import precision
 
-QUADROTOR = ech.Quadrotor.crazyflie()
+QUADROTOR = ech.models.Quadrotor.crazyflie()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2)], leaders=[0])
 DRAWN = ech.Formation.from_offsets(QUADROTOR, TREE, {1: (1, 0, 0), 2: (2, 0, 0)})
-LOOP = ech.Lemniscate()
+LOOP = ech.references.Lemniscate()
 ERROR = {"x": -0.3, "y": 0.2}
-GAIN = ech.synthesize(QUADROTOR, TREE, ech.Riccati())
+GAIN = ech.synthesize(QUADROTOR, TREE, ech.gains.Riccati())
 
 
 def led(leader, **more):
     # The same frames in every run, so that JAX compiles but what differs.
     given = {"horizon": 1.0, "dt": 0.005, "start_error": ERROR, "store_every": 10, **more}
     formation = given.pop("formation", DRAWN)
-    follower = ech.Consensus(GAIN, feedforward="relay")
+    follower = ech.laws.Consensus(GAIN, feedforward="relay")
     return ech.simulate(QUADROTOR, TREE, formation, leader=leader, follower=follower, **given)
 
 
 def prepared(**how):
-    law = ech.OptimalTracking(LOOP, horizon=1.0, start_error=ERROR, **how)
+    law = ech.optimal.OptimalTracking(LOOP, horizon=1.0, start_error=ERROR, **how)
     return law.prepared(QUADROTOR, TREE)
 
 
@@ -37,7 +37,7 @@ def rmse(result):
 
 
 def test_it_errs_less_than_tracking_and_still_less_without_limits():
-    usual, best = led(ech.Tracking(LOOP)), led(LAW)
+    usual, best = led(ech.laws.Tracking(LOOP)), led(LAW)
     free = led(prepared(limits=False), limits=False)
     assert rmse(free) < rmse(best) < 0.9 * rmse(usual)
 
@@ -66,7 +66,9 @@ def test_between_its_times_the_plan_is_the_motion_from_the_last_one():
 def test_after_the_plan_it_follows_the_reference():
     with precision("float64"):
         found = LAW.target(QUADROTOR, jnp.asarray(1.5))
-        usual = ech.Tracking(LOOP).prepared(QUADROTOR, TREE).target(QUADROTOR, jnp.asarray(1.5))
+        usual = (
+            ech.laws.Tracking(LOOP).prepared(QUADROTOR, TREE).target(QUADROTOR, jnp.asarray(1.5))
+        )
     for one, other in zip(found, usual, strict=True):
         assert np.asarray(one) == pytest.approx(np.asarray(other), abs=1e-12)
 
@@ -107,7 +109,7 @@ simulation: {horizon: 1.0, dt: 0.005, store_every: 10}
     file.write_text(text)
     scenario = ech.load_scenario(file)
     parts = ech.build(scenario)
-    assert isinstance(parts.leader, ech.OptimalTracking)
+    assert isinstance(parts.leader, ech.optimal.OptimalTracking)
     assert parts.leader.states == pytest.approx(LAW.states, abs=1e-5)
     result = ech.run(scenario)
     assert rmse(result) == pytest.approx(rmse(led(LAW)), abs=1e-6)
@@ -131,28 +133,30 @@ def test_the_scenario_s_limits_are_those_of_the_plan(limits):
 
 
 def test_without_a_plan_it_leads_nobody():
-    law = ech.OptimalTracking(LOOP)
+    law = ech.optimal.OptimalTracking(LOOP)
     with pytest.raises(LawError, match="no plan yet"):
         law.target(QUADROTOR, jnp.asarray(0.0))
 
 
 def test_a_model_without_a_flatness_map_is_refused():
-    model = ech.VanDerPol()
+    model = ech.models.VanDerPol()
     with pytest.raises(PlanError, match="`VanDerPol` cannot be led along a reference"):
-        ech.OptimalTracking(LOOP).prepared(model, TREE)
+        ech.optimal.OptimalTracking(LOOP).prepared(model, TREE)
 
 
 def test_a_gain_of_another_model_is_refused():
-    small = ech.synthesize(ech.DoubleIntegrator(1), TREE, ech.Riccati())
+    small = ech.synthesize(ech.models.DoubleIntegrator(1), TREE, ech.gains.Riccati())
     with pytest.raises(LawError, match="`OptimalTracking` has P"):
-        ech.OptimalTracking(LOOP, gain=small).prepared(QUADROTOR, TREE)
+        ech.optimal.OptimalTracking(LOOP, gain=small).prepared(QUADROTOR, TREE)
 
 
 def test_a_reference_that_is_too_fast_is_warned_of_with_the_ratio():
     # At rate w the lemniscate's acceleration grows as w^2, past the thrust to weight of 2.3.
-    fast = ech.OptimalTracking(ech.Lemniscate(rate=3.0), horizon=2.0)
+    fast = ech.optimal.OptimalTracking(ech.references.Lemniscate(rate=3.0), horizon=2.0)
     (told,) = fast.warnings(QUADROTOR, TREE)
     assert "is too fast for `Quadrotor`" in told and "times what the actuators leave" in told
     assert LAW.warnings(QUADROTOR, TREE) == ()
-    free = ech.OptimalTracking(ech.Lemniscate(rate=3.0), horizon=2.0, limits=False)
+    free = ech.optimal.OptimalTracking(
+        ech.references.Lemniscate(rate=3.0), horizon=2.0, limits=False
+    )
     assert free.warnings(QUADROTOR, TREE) == ()

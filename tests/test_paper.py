@@ -10,9 +10,9 @@ from oracles import laplacian, skew
 from echelon.core import numerics
 from echelon.core.errors import ModelError, Outcome
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Agreement, Consensus, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.models import (
     DoubleIntegrator,
     Linear,
@@ -316,8 +316,8 @@ def test_theorem_2_fails_a_follower_settles_at_half_its_offset():
         model,
         graph,
         formation,
-        leader=Passive(),
-        follower=Consensus(synthesize(model, graph, Given())),
+        leader=TrimInput(),
+        follower=Consensus(synthesize(model, graph, FixedGain())),
         horizon=20.0,
         dt=0.01,
         store_every=100,
@@ -332,13 +332,13 @@ def test_theorem_2_fails_a_follower_settles_at_half_its_offset():
 def test_v_that_never_rises_is_no_convergence_without_detectability():
     # Two integrators of which the input moves one: V' = -z1^2 <= 0, and z2 stays for good.
     model = Linear(np.zeros((2, 2)), [[1.0], [0.0]])
-    gain = synthesize(model, TREE, Given())
+    gain = synthesize(model, TREE, FixedGain())
     assert gain.certificate.observable == 1 and not gain.certificate.stable
     run = simulate(
         model,
         TREE,
         Formation.from_offsets(model, TREE, {}),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(gain),
         initial={"x1": 1.0, "x2": 1.0},
         horizon=60.0,
@@ -357,7 +357,7 @@ def test_the_leader_s_motion_is_missing_from_the_proof_and_makes_a_lag():
         LINE,
         Formation.from_offsets(model, LINE, {}),
         leader=Tracking(Line((0, 0, 0), (1, 0, 0))),
-        follower=Consensus(synthesize(model, LINE, Given())),
+        follower=Consensus(synthesize(model, LINE, FixedGain())),
         horizon=150.0,
         dt=0.02,
         store_every=1000,
@@ -413,7 +413,7 @@ def test_the_printed_law_sees_four_of_the_twelve_states():
     A, B = at_trim(QUAD)
     seen = np.vstack([B.T @ np.linalg.matrix_power(A, k) for k in range(12)])
     assert np.linalg.matrix_rank(seen) == 4
-    assert synthesize(QUAD, TREE, Given()).certificate.observable == 4
+    assert synthesize(QUAD, TREE, FixedGain()).certificate.observable == 4
 
 
 def test_the_printed_law_in_physical_inputs_is_stiffer_than_any_step_can_follow():
@@ -429,7 +429,7 @@ def test_the_printed_law_on_the_printed_example_diverges():
         TREE,
         Formation.from_offsets(QUAD, TREE, OFFSETS),
         leader=Tracking(Lemniscate()),
-        follower=Consensus(synthesize(QUAD, TREE, Given()), trim=False),
+        follower=Consensus(synthesize(QUAD, TREE, FixedGain()), trim=False),
         initial={"position": 1.0, "attitude": 0.3},
         start_error={"x": -1.344, "y": 0.530},
         horizon=20.0,
@@ -448,8 +448,8 @@ def test_algorithm_1_without_a_step_has_a_spectral_radius_above_three():
         model,
         LINE,
         Formation.from_offsets(model, LINE, {}),
-        leader=Passive(),
-        follower=Consensus(synthesize(model, LINE, Given())),
+        leader=TrimInput(),
+        follower=Consensus(synthesize(model, LINE, FixedGain())),
         initial={"x": 1.0},
         horizon=60.0,
         dt=1.0,

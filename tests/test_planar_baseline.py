@@ -10,7 +10,8 @@ from scipy.optimize import lsq_linear
 import echelon as ech
 from echelon.core.errors import ModelError, PlanError
 from echelon.core.numerics import precision
-from echelon.optimal.planar_baseline import LinearPlanarQuadrotor, PlanarBaseline
+from echelon.models.planar_quadrotor_linear import LinearPlanarQuadrotor
+from echelon.optimal.planar_baseline import PlanarBaseline
 
 MASS, INERTIA, GRAVITY = 0.028, 16.571710e-6, 9.81
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
@@ -71,7 +72,7 @@ def deviation(states):
 
 def leader(**changes):
     baseline = PlanarBaseline.literal(**changes)
-    found = ech.plan(baseline.leader(), [-np.pi, 0, 0, 0, 0, 0], baseline.reference)
+    found = ech.optimal.solve(baseline.leader(), [-np.pi, 0, 0, 0, 0, 0], baseline.reference)
     assert found.solved
     return baseline, found
 
@@ -215,7 +216,7 @@ def test_an_open_loop_adds_up_the_noise():
 
 
 def test_the_agent_is_the_linearization_of_the_planar_quadrotor_at_hover():
-    linear, full = LinearPlanarQuadrotor(), ech.PlanarQuadrotor()
+    linear, full = LinearPlanarQuadrotor(), ech.models.PlanarQuadrotor()
     places = [full.state_names.index(name) for name in linear.state_names]
     rng = np.random.default_rng(0)
     with precision("float64"):

@@ -15,8 +15,8 @@ from echelon.core.numerics import precision
 from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.objectives import Grid, grid
 
-QUADROTOR = ech.Quadrotor.crazyflie()
-LOOP = ech.Lemniscate()
+QUADROTOR = ech.models.Quadrotor.crazyflie()
+LOOP = ech.references.Lemniscate()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])
 OFFSETS = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
 DRAWN = ech.Formation.from_offsets(QUADROTOR, TREE, OFFSETS)
@@ -25,7 +25,7 @@ SHORT = {"horizon": 1.0, "dt": 0.01}
 
 def starts(**moved):
     """States (4, 12) on the goals, but for the leader and agents moved by a vector in space."""
-    x = np.asarray(ech.Tracking(LOOP).prepared(QUADROTOR, TREE).start(QUADROTOR), float)
+    x = np.asarray(ech.laws.Tracking(LOOP).prepared(QUADROTOR, TREE).start(QUADROTOR), float)
     states = x + DRAWN.offsets
     states[0, :2] += -0.3, 0.2
     for name, by in moved.items():
@@ -34,7 +34,7 @@ def starts(**moved):
 
 
 def planned(states, *, limits=True, horizon=1.0, dt=0.01, formation=DRAWN, graph=TREE, **how):
-    planning = ech.Planning(**how)
+    planning = ech.optimal.TrackingOptions(**how)
     times = grid(horizon, dt, planning.interval)
     return plan_formation(
         QUADROTOR,
@@ -123,7 +123,7 @@ def test_the_leader_s_plan_is_that_of_a_problem_written_by_hand(limited):
     states = starts()
     made = planned(states, limits=limited, dt=0.01, input_weight=1e-3)
     times = made.grid.times
-    law = ech.Tracking(LOOP).prepared(QUADROTOR, TREE)
+    law = ech.laws.Tracking(LOOP).prepared(QUADROTOR, TREE)
     with precision("float64"):
         both = [law.target(QUADROTOR, jnp.asarray(t)) for t in times]
     x, u = (np.stack([np.asarray(pair[k]) for pair in both]) for k in (0, 1))
@@ -138,7 +138,7 @@ def test_the_leader_s_plan_is_that_of_a_problem_written_by_hand(limited):
 
 def test_on_linear_agents_the_plans_are_least_squares():
     # Double integrators, no limits: the gap, the trapezoidal cost and the order of the graph.
-    cart, steps, dt = ech.DoubleIntegrator(1), 20, 0.1
+    cart, steps, dt = ech.models.DoubleIntegrator(1), 20, 0.1
     graph = ech.Graph.from_edges([(0, 1), (1, 2), (0, 2, 3.0)], leaders=[0])
     formation = ech.Formation([[0, 0], [-1, 0], [-2, 0]])
     states = np.array([[0.5, 0.0], [0.0, 1.0], [-1.0, 0.3]])
@@ -149,7 +149,7 @@ def test_on_linear_agents_the_plans_are_least_squares():
         states,
         Grid(steps, 1, dt),
         reference=None,
-        planning=ech.Planning(interval=dt, input_weight=0.1),
+        planning=ech.optimal.TrackingOptions(interval=dt, input_weight=0.1),
         limits=True,
     )
     A, B = np.array([[1, dt], [0, 1]]), np.array([dt**2 / 2, dt])
@@ -230,7 +230,7 @@ def test_followers_arrive_at_their_offsets_or_at_their_distances():
 def test_the_replay_of_plans_is_the_plans():
     states = starts(a1=(-0.193, 0, 0))
     made = planned(states, limits=False)
-    result = ech.simulate_plans(
+    result = ech.optimal.simulate_plans(
         QUADROTOR,
         TREE,
         DRAWN,
@@ -249,18 +249,18 @@ def test_the_replay_of_plans_is_the_plans():
 
 def test_a_replay_is_a_result_like_any_other(tmp_path):
     states = starts(a1=(-0.193, 0, 0))
-    fast = ech.FigureEight(amplitude=(1.0, 0.5), rate=6.0)
-    result = ech.simulate_plans(
+    fast = ech.references.FigureEight(amplitude=(1.0, 0.5), rate=6.0)
+    result = ech.optimal.simulate_plans(
         QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, store_every=10, **SHORT
     )
     assert result.outcome is ech.Outcome.COMPLETED and len(result.times) == 11
     assert ech.metrics(result).leader.rmse < 0.36
     assert "Each follower is told" in ech.report(result)
     ech.save_dataset(result, tmp_path / "run.nc")
-    figures = ech.solver_figures(result)
+    figures = ech.optimal.solver_stats(result)
     assert figures.method == "optimization" and figures.solves == 4 and figures.failures == 0
     assert figures.seconds > 0.0 and figures.worst_ms >= figures.median_ms > 0.0
-    warned = ech.simulate_plans(
+    warned = ech.optimal.simulate_plans(
         QUADROTOR, TREE, DRAWN, reference=fast, horizon=0.2, dt=0.01, start_error={}
     )
     assert [w for w in warned.warnings if "times what the actuators leave" in w]
@@ -269,7 +269,9 @@ def test_a_replay_is_a_result_like_any_other(tmp_path):
 def test_open_loop_a_wrong_mass_and_wind_add_up():
     states = starts()
     still, heavy, windy = (
-        ech.simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, **SHORT, **more)
+        ech.optimal.simulate_plans(
+            QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, **SHORT, **more
+        )
         for more in (
             {},
             {"plant": dataclasses.replace(QUADROTOR, mass=0.0294)},
@@ -298,7 +300,7 @@ def test_open_loop_a_wrong_mass_and_wind_add_up():
 )
 def test_a_planning_out_of_range_is_refused(how, sentence):
     with pytest.raises(PlanError) as caught:
-        ech.Planning(**how)
+        ech.optimal.TrackingOptions(**how)
     assert str(caught.value) == sentence
 
 
@@ -318,7 +320,7 @@ class Corridor(ech.ControlAffine):
     state_names = ("x", "v")
     input_names = ("force",)
     chart = {"x": (-1.0, 1.0)}
-    input_limits = ech.Limits(((1.0,),), (-1.0,), (1.0,))
+    input_limits = ech.models.Limits(((1.0,),), (-1.0,), (1.0,))
 
     def drift(self, x):
         return jnp.stack([x[1], jnp.zeros((), x.dtype)])
@@ -333,7 +335,7 @@ class Corridor(ech.ControlAffine):
 def test_a_problem_without_a_solution_says_which_constraint_and_by_how_much():
     # From 0.5 at a speed of 2 the brakes stop it at 2.5, and the plan's corridor ends at 0.9.
     with pytest.raises(PlanError, match=r"^there is no plan for agent 1: .*`[\w ]+` by [\d.]+ at"):
-        ech.simulate_plans(
+        ech.optimal.simulate_plans(
             Corridor(),
             ech.Graph.path(2),
             ech.Formation(np.zeros((2, 2))),
@@ -344,26 +346,26 @@ def test_a_problem_without_a_solution_says_which_constraint_and_by_how_much():
 
 
 def test_a_model_without_a_flatness_map_is_led_along_no_reference():
-    graph, model = ech.Graph.path(2), ech.VanDerPol()
+    graph, model = ech.Graph.path(2), ech.models.VanDerPol()
     with pytest.raises(PlanError, match="`VanDerPol` cannot be led along a reference"):
-        ech.simulate_plans(
+        ech.optimal.simulate_plans(
             model, graph, ech.Formation(np.zeros((2, 2))), reference=LOOP, horizon=1.0, dt=0.1
         )
 
 
 def test_what_is_no_reference_is_refused():
     with pytest.raises(ech.EchelonError, match="`reference` is a `float`, and must be"):
-        ech.simulate_plans(QUADROTOR, TREE, DRAWN, reference=1.0, **SHORT)
+        ech.optimal.simulate_plans(QUADROTOR, TREE, DRAWN, reference=1.0, **SHORT)
 
 
 def test_a_distance_needs_a_position():
-    graph, model = ech.Graph.path(2), ech.VanDerPol()
+    graph, model = ech.Graph.path(2), ech.models.VanDerPol()
     with pytest.raises(PlanError, match="`VanDerPol` has no position"):
-        ech.simulate_plans(
+        ech.optimal.simulate_plans(
             model,
             graph,
             ech.Formation(np.zeros((2, 2))),
-            planning=ech.Planning(specification="distance"),
+            planning=ech.optimal.TrackingOptions(specification="distance"),
             horizon=1.0,
             dt=0.1,
         )
@@ -372,4 +374,4 @@ def test_a_distance_needs_a_position():
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'echelon\[optimal\]'"):
-        ech.simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, **SHORT)
+        ech.optimal.simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, **SHORT)

@@ -12,9 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from echelon.core.errors import Outcome
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Consensus, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Consensus, Tracking, TrimInput
 from echelon.models import (
     PlanarQuadrotor,
     Quadrotor,
@@ -30,8 +30,8 @@ from echelon.references import Circle, Lemniscate
 from echelon.results.lyapunov import lyapunov
 
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
-POINT = Given([1.0, 1.0, 0.1], coupling=2.0)
-PLAIN = Given("identity", coupling=2.0)
+POINT = FixedGain([1.0, 1.0, 0.1], coupling=2.0)
+PLAIN = FixedGain("identity", coupling=2.0)
 
 # Model, graph, method (of leader and followers alike), reference and spread.
 RUNS = {
@@ -52,7 +52,7 @@ def close(model, graph, method, reference, spread):
         model,
         graph,
         Formation.from_offsets(model, graph, offsets),
-        leader=Passive() if reference is None else Tracking(reference, gain),
+        leader=TrimInput() if reference is None else Tracking(reference, gain),
         follower=Consensus(gain, "relay"),
         initial=spread,
         start_error={model.state_names[0]: 0.2},
@@ -389,10 +389,10 @@ import sys
 from pathlib import Path
 import echelon as ech
 assert "matplotlib" not in sys.modules
-model, graph = ech.SingleIntegrator(dimension=3), ech.Graph.path(3)
+model, graph = ech.models.SingleIntegrator(dimension=3), ech.Graph.path(3)
 parts = model, graph, ech.Formation.line(model, graph)
-law = ech.Consensus(ech.synthesize(model, graph, ech.Riccati()))
-result = ech.simulate(*parts, leader=ech.Passive(), follower=law, horizon=0.1, dt=0.05)
+law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
+result = ech.simulate(*parts, leader=ech.laws.TrimInput(), follower=law, horizon=0.1, dt=0.05)
 assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 6
 assert "matplotlib.pyplot" not in sys.modules
 """

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.network.topology import _Large, shorter, time_constant
+from echelon.network.topology import _Large
+from echelon.studies.speedup import speedup, time_constant
 
 
 def slowest(edges, leaders, agents):
@@ -39,13 +40,13 @@ def graphs(draw):
 def test_one_more_leader_or_edge_is_the_best_of_all(drawn):
     graph, edges = drawn
     agents = graph.agents
-    (leader,) = ech.recommend_leaders(graph, 1)
+    (leader,) = ech.network.recommend_leaders(graph, 1)
     best = max(slowest(edges, {0, k}, agents) for k in range(1, agents))
     assert slowest(edges, {0, leader}, agents) == pytest.approx(best, rel=1e-9)
     linked = {(i, j) for i, j, _ in edges}
     free = [pair for pair in itertools.combinations(range(agents), 2) if pair not in linked]
     if free:
-        (pair,) = ech.recommend_edges(graph, 1)
+        (pair,) = ech.network.recommend_edges(graph, 1)
         best = max(slowest([*edges, (*each, 1.0)], {0}, agents) for each in free)
         assert pair in free
         assert slowest([*edges, (*pair, 1.0)], {0}, agents) == pytest.approx(best, rel=1e-9)
@@ -56,28 +57,28 @@ def test_one_more_leader_or_edge_is_the_best_of_all(drawn):
 def test_each_further_leader_raises_lambda_min_and_keeps_the_earlier_ones(drawn, count):
     graph, edges = drawn
     count = min(count, graph.agents - 2)
-    chosen = ech.recommend_leaders(graph, count)
+    chosen = ech.network.recommend_leaders(graph, count)
     assert len(set(chosen)) == count and 0 not in chosen
     values = [slowest(edges, {0, *chosen[:k]}, graph.agents) for k in range(count + 1)]
     assert (np.diff(values) >= -1e-12).all()
     if count:
-        assert chosen[:-1] == ech.recommend_leaders(graph, count - 1)
+        assert chosen[:-1] == ech.network.recommend_leaders(graph, count - 1)
 
 
 def test_on_a_line_the_second_leader_stands_at_two_thirds():
     # Between two leaders a chain of k is as slow as an open one of k / 2: k = 2 (N - k).
-    assert ech.recommend_leaders(ech.Graph.path(31))[0] in (20, 21)
-    (pair,) = ech.recommend_edges(ech.Graph.path(31))
+    assert ech.network.recommend_leaders(ech.Graph.path(31))[0] in (20, 21)
+    (pair,) = ech.network.recommend_edges(ech.Graph.path(31))
     assert pair[0] == 0 and 15 <= pair[1] <= 30
 
 
 def test_large_graphs_are_thinned_and_still_gain():
     graph = ech.Graph.path(700)
     before = float(graph.grounded_spectrum()[0])
-    (leader,) = ech.recommend_leaders(graph)
+    (leader,) = ech.network.recommend_leaders(graph)
     after = ech.Graph.path(700, leaders=(0, leader)).grounded_spectrum()[0]
     assert abs(leader / 699 - 2 / 3) < 0.01 and after / before == pytest.approx(9.0, rel=0.05)
-    (pair,) = ech.recommend_edges(graph)
+    (pair,) = ech.network.recommend_edges(graph)
     linked = ech.Graph.from_edges([*graph.edges.tolist(), pair])
     assert pair[0] == 0 and linked.grounded_spectrum()[0] > 3.0 * before
 
@@ -99,9 +100,9 @@ def test_what_a_large_graph_is_told_by_iteration_is_its_eigenvalue(seed):
 
 
 def test_the_time_constant_of_an_inner_loop_grows_as_the_square_of_a_line():
-    model = ech.DoubleIntegrator(2)
+    model = ech.models.DoubleIntegrator(2)
     graphs = [ech.Graph.path(size + 1) for size in (10, 30, 90)]
-    gain = ech.synthesize(model, graphs[0], ech.InnerLoop())
+    gain = ech.synthesize(model, graphs[0], ech.gains.InnerLoop())
     times = [time_constant(model, graph, gain) for graph in graphs]
     assert times[0] == pytest.approx(-1.0 / gain.certificate.abscissa, rel=1e-12)
     lows = np.array([graph.grounded_spectrum()[0] for graph in graphs])
@@ -111,13 +112,13 @@ def test_the_time_constant_of_an_inner_loop_grows_as_the_square_of_a_line():
 
 
 def test_what_is_told_is_what_the_changed_graph_has():
-    model, graph = ech.Quadrotor.crazyflie(), ech.Graph.path(11)
-    gain = ech.synthesize(model, graph, ech.InnerLoop())
-    found = shorter(model, graph, gain, leaders=1, edges=2)
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(11)
+    gain = ech.synthesize(model, graph, ech.gains.InnerLoop())
+    found = speedup(model, graph, gain, leaders=1, edges=2)
     led = ech.Graph.path(11, leaders=(0, *found.leaders))
     linked = ech.Graph.from_edges([*graph.edges.tolist(), *found.edges])
     for told, changed in ((found.with_leaders, led), (found.with_edges, linked)):
-        again = ech.synthesize(model, changed, ech.InnerLoop()).certificate.abscissa
+        again = ech.synthesize(model, changed, ech.gains.InnerLoop()).certificate.abscissa
         assert told == pytest.approx(-1.0 / again, rel=1e-9) and told < 0.5 * found.now
     (i, j), (k, m) = found.edges
     assert found.sentence() == (
@@ -128,8 +129,8 @@ def test_what_is_told_is_what_the_changed_graph_has():
 
 
 def test_what_does_not_shorten_is_not_recommended():
-    model, graph = ech.Quadrotor.crazyflie(), ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
-    found = shorter(model, graph, ech.synthesize(model, graph, ech.Riccati()))
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
+    found = speedup(model, graph, ech.synthesize(model, graph, ech.gains.Riccati()))
     assert not found.edges and found.with_edges == found.now
     assert found.leaders == () or found.with_leaders < found.now
     assert "edge" not in found.sentence()
@@ -138,7 +139,7 @@ def test_what_does_not_shorten_is_not_recommended():
 def test_more_than_there_is_cannot_be_had():
     graph = ech.Graph.complete(4)
     with pytest.raises(ech.EchelonError, match="from 0 to 2 of the 3 followers"):
-        ech.recommend_leaders(graph, 3)
+        ech.network.recommend_leaders(graph, 3)
     with pytest.raises(ech.EchelonError, match="from 0 to 0 pairs are not linked yet"):
-        ech.recommend_edges(graph)
-    assert ech.recommend_leaders(graph, 0) == () == ech.recommend_edges(graph, 0)
+        ech.network.recommend_edges(graph)
+    assert ech.network.recommend_leaders(graph, 0) == () == ech.network.recommend_edges(graph, 0)

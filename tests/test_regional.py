@@ -29,7 +29,7 @@ def sentence(act):
 
 def rate_seen(model, gain, domain, low, count=500):
     """The slowest contraction at random states of a domain, by eigenvalues of the inequality."""
-    from echelon.enclosure.hull import model_jacobian
+    from echelon.certificates.jacobians import model_jacobian
     from echelon.models.linearization import linearize
 
     states, inputs = domain.sample(count, seed=7)
@@ -48,11 +48,11 @@ def rate_seen(model, gain, domain, low, count=500):
 
 @pytest.fixture(scope="module")
 def robust():
-    return ech.synthesize(ech.QuadrotorThrust(), LINE, ech.RobustLQR(TILT, exact=True))
+    return ech.synthesize(ech.models.QuadrotorThrust(), LINE, ech.gains.RobustLQR(TILT, exact=True))
 
 
 def test_a_robust_gain_is_proved_and_no_sample_contradicts_it(robust):
-    region, model = robust.certificate.region, ech.QuadrotorThrust()
+    region, model = robust.certificate.region, ech.models.QuadrotorThrust()
     assert (region.kind, region.theorem) == ("proof", "T1")
     assert region.rate >= 0.2 and np.linalg.cond(robust.P) <= 500
     low = float(LINE.grounded_spectrum()[0])
@@ -60,7 +60,7 @@ def test_a_robust_gain_is_proved_and_no_sample_contradicts_it(robust):
 
 
 def test_the_certified_set_fits_into_the_domain(robust):
-    domain = ech.Domain.about(ech.QuadrotorThrust(), TILT)
+    domain = ech.Domain.about(ech.models.QuadrotorThrust(), TILT)
     r = robust.certificate.region.radius
     assert r == radius(domain, robust.P)
     W = np.linalg.inv(robust.P)
@@ -71,7 +71,7 @@ def test_the_certified_set_fits_into_the_domain(robust):
 
 
 def test_only_a_constant_input_map_gives_the_nonlocal_theorem():
-    euler, thrust = ech.QuadrotorEuler(), ech.QuadrotorThrust()
+    euler, thrust = ech.models.QuadrotorEuler(), ech.models.QuadrotorThrust()
     with precision("float64"):
         assert has_constant_input_map(thrust, ech.Domain.about(thrust, TILT))
         assert not has_constant_input_map(euler, ech.Domain.about(euler, TILT))
@@ -79,7 +79,7 @@ def test_only_a_constant_input_map_gives_the_nonlocal_theorem():
 
 def with_its_own_map(model, gain, domain, low):
     """The slowest contraction at states and corners of a domain, each with the g that it has."""
-    from echelon.enclosure.hull import model_jacobian
+    from echelon.certificates.jacobians import model_jacobian
 
     random = np.random.default_rng(8)
     points = [np.concatenate(both) for both in zip(*map(domain.sample, (300, 300)), strict=True)]
@@ -100,8 +100,8 @@ def with_its_own_map(model, gain, domain, low):
 
 @pytest.mark.parametrize("tilt", [0.2, 0.35])
 def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
-    model, bounds = ech.PlanarQuadrotor(), {"roll": tilt, "thrust": 1.0}
-    region = (gain := ech.synthesize(model, LINE, ech.RobustLQR(bounds))).certificate.region
+    model, bounds = ech.models.PlanarQuadrotor(), {"roll": tilt, "thrust": 1.0}
+    region = (gain := ech.synthesize(model, LINE, ech.gains.RobustLQR(bounds))).certificate.region
     seen = with_its_own_map(
         model, gain, ech.Domain.about(model, bounds), float(LINE.grounded_spectrum()[0])
     )
@@ -110,9 +110,9 @@ def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
 
 
 def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
-    model, low = ech.QuadrotorEuler(), float(LINE.grounded_spectrum()[0])
+    model, low = ech.models.QuadrotorEuler(), float(LINE.grounded_spectrum()[0])
     domain = ech.Domain.about(model, TILT)
-    gain = ech.synthesize(model, LINE, ech.RobustLQR(TILT))
+    gain = ech.synthesize(model, LINE, ech.gains.RobustLQR(TILT))
     region = gain.certificate.region
     assert (region.theorem, region.kind, region.radius) == ("T2", "vertices", None)
     assert 0.2 <= region.rate <= with_its_own_map(model, gain, domain, low) + 1e-12
@@ -126,9 +126,9 @@ def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
 
 
 def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():
-    model, bounds = ech.Pendulum(damping=0.1), {"angle": 0.5}
-    full = ech.synthesize(model, LINE, ech.Contraction(bounds, rate=0.5, exact=False))
-    half = ech.Contraction(bounds, rate=0.5, exact=False, coupling=0.5 * full.coupling)
+    model, bounds = ech.models.Pendulum(damping=0.1), {"angle": 0.5}
+    full = ech.synthesize(model, LINE, ech.gains.Contraction(bounds, rate=0.5, exact=False))
+    half = ech.gains.Contraction(bounds, rate=0.5, exact=False, coupling=0.5 * full.coupling)
     gain = ech.synthesize(model, LINE, half)
     seen = with_its_own_map(
         model, gain, ech.Domain.about(model, bounds), float(LINE.grounded_spectrum()[0])
@@ -141,15 +141,17 @@ def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():
 
 def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():
     # sqrt(g)(1 - sqrt(cos th)) > damping: infeasible beyond 0.787 rad for 9.81 and 0.5.
-    pendulum = ech.Pendulum(damping=0.5)
+    pendulum = ech.models.Pendulum(damping=0.5)
     edge = np.arccos((1.0 - 0.5 / np.sqrt(9.81)) ** 2)
-    gain = ech.synthesize(pendulum, LINE, ech.Monotone({"angle": 0.99 * edge}))
+    gain = ech.synthesize(pendulum, LINE, ech.gains.Monotone({"angle": 0.99 * edge}))
     assert gain.certificate.region.theorem == "A5" and gain.certificate.region.kind == "vertices"
     with precision("float64"):
         found = jacobians(pendulum, ech.Domain.about(pendulum, {"angle": 0.99 * edge}))
     for A in found.matrices:
         assert np.linalg.eigvalsh(gain.P @ A + A.T @ gain.P).max() <= 1e-7 * np.abs(gain.P).max()
-    told = sentence(lambda: ech.synthesize(pendulum, LINE, ech.Monotone({"angle": 1.01 * edge})))
+    told = sentence(
+        lambda: ech.synthesize(pendulum, LINE, ech.gains.Monotone({"angle": 1.01 * edge}))
+    )
     assert "no constant metric" in told
 
 
@@ -167,7 +169,7 @@ class Turned(ech.ControlAffine):
 
 
 def test_where_g_varies_a_monotone_drift_is_certified_a_smaller_set(tmp_path):
-    gain = ech.synthesize(Turned(), LINE, ech.Monotone({"east": 1.0, "north": 2.0}))
+    gain = ech.synthesize(Turned(), LINE, ech.gains.Monotone({"east": 1.0, "north": 2.0}))
     region, ends = gain.certificate.region, LINE.grounded_spectrum()[[0, -1]]
     assert region.theorem == "A5"
     assert region.radius == pytest.approx(
@@ -186,21 +188,21 @@ def test_where_g_varies_a_monotone_drift_is_certified_a_smaller_set(tmp_path):
     assert found.sentence == "Refused: g is constant (A5) does not hold as stored."
 
 
-@pytest.mark.parametrize("model", [ech.DoubleIntegrator(3), ech.PrintedQuadrotor()])
+@pytest.mark.parametrize("model", [ech.models.DoubleIntegrator(3), ech.models.PrintedQuadrotor()])
 def test_nilpotent_drifts_have_no_monotone_metric_and_the_block_is_named(model):
     told = sentence(
         lambda: (
-            ech.synthesize(model, LINE, ech.Monotone({"attitude": 0.2, "rate": 0.5}))
+            ech.synthesize(model, LINE, ech.gains.Monotone({"attitude": 0.2, "rate": 0.5}))
             if model.state_groups.get("attitude")
-            else ech.synthesize(model, LINE, ech.Monotone({}))
+            else ech.synthesize(model, LINE, ech.gains.Monotone({}))
         )
     )
     assert "has a Jordan block on the imaginary axis, at 0" in told and "`vx`" in told
 
 
 def test_a_contraction_gain_is_the_weakest_and_keeps_its_rate():
-    model = ech.Pendulum()
-    gain = ech.synthesize(model, LINE, ech.Contraction({"angle": 1.0}, rate=0.5))
+    model = ech.models.Pendulum()
+    gain = ech.synthesize(model, LINE, ech.gains.Contraction({"angle": 1.0}, rate=0.5))
     region = gain.certificate.region
     assert region.kind == "proof" and region.rate >= 0.5 * (1 - 1e-5)
     low = float(LINE.grounded_spectrum()[0])
@@ -228,16 +230,16 @@ DOMAINS = {
 @pytest.mark.parametrize("name", DOMAINS)
 def test_a_bad_domain_has_its_sentence(name):
     bounds, told = DOMAINS[name]
-    assert sentence(lambda: ech.Domain.about(ech.Quadrotor(), bounds)) == told
+    assert sentence(lambda: ech.Domain.about(ech.models.Quadrotor(), bounds)) == told
 
 
 def test_a_domain_needs_known_names_and_all_bounds_that_matter():
-    euler = ech.QuadrotorEuler()
+    euler = ech.models.QuadrotorEuler()
     told = sentence(lambda: ech.Domain.about(euler, {"rol": 0.1}))
     assert "did you mean `roll`?" in told
-    told = sentence(lambda: ech.synthesize(euler, LINE, ech.RobustLQR({"roll": 0.1})))
+    told = sentence(lambda: ech.synthesize(euler, LINE, ech.gains.RobustLQR({"roll": 0.1})))
     assert told.startswith("the domain leaves `pitch` unbounded")
-    told = sentence(lambda: ech.synthesize(euler, LINE, ech.RobustLQR()))
+    told = sentence(lambda: ech.synthesize(euler, LINE, ech.gains.RobustLQR()))
     assert told.startswith("this method needs a `domain`")
 
 
@@ -246,8 +248,8 @@ def test_a_domain_needs_known_names_and_all_bounds_that_matter():
 
 @pytest.fixture
 def saved(tmp_path):
-    model = ech.Quadrotor.crazyflie()
-    gain = ech.synthesize(model, LINE, ech.InnerLoop())
+    model = ech.models.Quadrotor.crazyflie()
+    gain = ech.synthesize(model, LINE, ech.gains.InnerLoop())
     ech.save_gain(gain, model, LINE, tmp_path / "gain.json")
     return model, gain, tmp_path / "gain.json"
 
@@ -263,8 +265,8 @@ def test_a_gain_comes_back_to_the_bit(saved):
 
 def test_a_promise_on_a_domain_comes_back_whole(tmp_path):
     # A domain with two sides, one unbounded state, and a hull of many corners.
-    model, bounds = ech.PlanarQuadrotor(), {"roll": (-0.1, 0.2), "thrust": 1.0}
-    gain = ech.synthesize(model, LINE, ech.RobustLQR(bounds))
+    model, bounds = ech.models.PlanarQuadrotor(), {"roll": (-0.1, 0.2), "thrust": 1.0}
+    gain = ech.synthesize(model, LINE, ech.gains.RobustLQR(bounds))
     ech.save_gain(gain, model, LINE, tmp_path / "gain.json")
     saved, again = gain.certificate, ech.load_gain(tmp_path / "gain.json", model, LINE).certificate
     for name in ("kind", "lambda_min", "lambda_max", "abscissa", "modes", "edge", "observable"):
@@ -313,15 +315,15 @@ def test_samples_stand_at_all_corners_and_need_the_bounds_that_matter():
     for slope in slopes:
         assert np.abs(found.matrices[:, 1, 0] + slope).min() < 1e-14
     assert found.matrices[:, 1, 0].max() <= -slopes.min() + 1e-14
-    told = sentence(lambda: ech.synthesize(Yielding(), LINE, ech.RobustLQR({"speed": 1.0})))
+    told = sentence(lambda: ech.synthesize(Yielding(), LINE, ech.gains.RobustLQR({"speed": 1.0})))
     assert told.startswith("the domain leaves `place` unbounded")
 
 
 def test_a_gain_for_another_model_or_graph_is_refused_with_the_reason(saved, tmp_path):
     model, gain, file = saved
-    told = sentence(lambda: ech.load_gain(file, ech.Quadrotor(mass=0.03), LINE))
+    told = sentence(lambda: ech.load_gain(file, ech.models.Quadrotor(mass=0.03), LINE))
     assert "made for another `Quadrotor`: input_scale differs by 0.002" in told
-    told = sentence(lambda: ech.load_gain(file, ech.PlanarQuadrotor(), LINE))
+    told = sentence(lambda: ech.load_gain(file, ech.models.PlanarQuadrotor(), LINE))
     assert "made for `Quadrotor` with state_names" in told
     told = sentence(lambda: ech.load_gain(file, model, ech.Graph.path(5)))
     assert "made for a graph of 4 agents with lambda_min = 0.198062" in told

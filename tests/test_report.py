@@ -42,13 +42,13 @@ def test_the_lag_without_feed_forward_is_told():
 
 
 def test_a_broken_symmetry_warns_and_names_the_agent():
-    model, graph = ech.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
+    model, graph = ech.models.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
-        leader=ech.Passive(),
-        follower=ech.Consensus(ech.synthesize(model, graph, ech.Given("identity"))),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.FixedGain("identity"))),
         horizon=20.0,
         dt=0.01,
     )
@@ -60,13 +60,13 @@ def test_a_broken_symmetry_warns_and_names_the_agent():
 
 
 def test_coincident_goals_warn():
-    model, graph = ech.SingleIntegrator(2), ech.Graph.path(3)
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {1: (1.0, 0.0), 2: (1.0, 0.0)}),
-        leader=ech.Agreement(),
-        follower=ech.Agreement(),
+        leader=ech.laws.Agreement(),
+        follower=ech.laws.Agreement(),
         horizon=1.0,
         dt=0.1,
     )
@@ -83,13 +83,13 @@ def test_a_weak_coupling_is_named_as_the_cause_of_growth():
 
 
 def test_a_swarm_shows_best_median_and_worst():
-    model, graph = ech.SingleIntegrator(2), ech.Graph.star(30)
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.star(30)
     result = ech.simulate(
         model,
         graph,
         ech.Formation.grid(model, graph),
-        leader=ech.Passive(),
-        follower=ech.Agreement(),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Agreement(),
         initial={"position": 1.0},
         horizon=2.0,
         dt=0.1,

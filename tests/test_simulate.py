@@ -22,9 +22,9 @@ from scipy.integrate import solve_ivp
 from echelon.core.errors import EchelonError, Outcome
 from echelon.engine import simulate as _simulate
 from echelon.engine.simulate import simulate
-from echelon.gains import Given, Riccati
-from echelon.gains.synthesize import synthesize
-from echelon.laws import Agreement, Consensus, Passive, Tracking
+from echelon.gains import FixedGain, Riccati
+from echelon.gains.gain import synthesize
+from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
@@ -51,7 +51,7 @@ def alone(model, x0, **options):
     start = np.tile(x0, (2, 1))
     nothing = Formation.from_offsets(model, graph, {})
     return simulate(
-        model, graph, nothing, leader=Passive(), follower=Passive(), initial=start, **options
+        model, graph, nothing, leader=TrimInput(), follower=TrimInput(), initial=start, **options
     )
 
 
@@ -135,7 +135,7 @@ def test_linear_agents_with_held_inputs_follow_the_matrix_exponential():
         model,
         TREE,
         Formation.from_offsets(model, TREE, {}),
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(gain),
         initial=start,
         horizon=3.0,
@@ -220,7 +220,7 @@ def test_moving_all_quadrotors_moves_the_run():
             QUAD,
             TREE,
             DRAWN,
-            leader=Passive(),
+            leader=TrimInput(),
             follower=Consensus(gain),
             initial=start + s,
             horizon=2.0,
@@ -265,7 +265,7 @@ def test_each_follower_hears_its_own_leader():
         graph,
         Formation(np.array([[0.0], [1.0], [2.0], [3.0], [4.0]])),
         leader=Tracking(Line((0, 0, 0), (1, 0, 0))),
-        follower=Consensus(synthesize(model, graph, Given()), feedforward="relay"),
+        follower=Consensus(synthesize(model, graph, FixedGain()), feedforward="relay"),
         initial={"x": 0.5},
         horizon=40.0,
         dt=0.02,
@@ -284,7 +284,7 @@ def chain(**options):
         model,
         CHAIN,
         Formation.from_offsets(model, CHAIN, {}),
-        follower=Consensus(synthesize(model, CHAIN, Given())),
+        follower=Consensus(synthesize(model, CHAIN, FixedGain())),
         initial={"x": 1.0},
         **options,
     )
@@ -299,7 +299,7 @@ def test_integrators_behind_a_moving_leader_lag_three_five_and_six_metres():
 
 
 def test_algorithm_1_as_printed_grows_by_its_spectral_radius():
-    run = chain(leader=Passive(), horizon=40.0, dt=1.0, integrator="printed")
+    run = chain(leader=TrimInput(), horizon=40.0, dt=1.0, integrator="printed")
     states, L = run.states[:, 1:, 0], CHAIN.grounded_laplacian().toarray()
     # x <- f + g u = -L x: the state itself is lost, only the input remains.
     assert states[1:] == pytest.approx(-states[:-1] @ L, rel=1e-12)
@@ -350,8 +350,8 @@ def test_v_never_rises_where_the_drift_is_monotone_for_p(name, seed):
         model,
         graph,
         Formation.from_offsets(model, graph, {}),
-        leader=Passive(),
-        follower=Consensus(synthesize(model, graph, Given(P=P))),
+        leader=TrimInput(),
+        follower=Consensus(synthesize(model, graph, FixedGain(P=P))),
         initial=dict.fromkeys(model.state_names, 1.0),
         horizon=60.0,
         dt=0.01,
@@ -425,7 +425,7 @@ def test_starts_are_goals_plus_a_spread_that_the_seed_draws():
             graph,
             formation,
             leader=Tracking(Line((1, 2, 0), (0.5, 0, 0))),
-            follower=Passive(),
+            follower=TrimInput(),
             initial=initial,
             seed=seed,
             horizon=0.1,
@@ -478,7 +478,7 @@ def test_limits_act_and_are_counted_agent_by_agent():
             model,
             graph,
             Formation.from_offsets(model, graph, {}),
-            leader=Passive(),
+            leader=TrimInput(),
             follower=Consensus(synthesize(model, graph, Riccati())),
             initial=start,
             horizon=0.5,
@@ -531,7 +531,7 @@ def test_float32_flies_a_quadrotor():
         QUAD,
         TREE,
         DRAWN,
-        leader=Passive(),
+        leader=TrimInput(),
         follower=Consensus(gain),
         initial={"position": 0.1},
         horizon=0.2,
@@ -652,8 +652,8 @@ def diverging(**options):
         model,
         graph,
         Formation.from_offsets(model, graph, {}),
-        leader=Passive(),
-        follower=Consensus(synthesize(model, graph, Given(P=[1e3, 1e3], coupling=50.0))),
+        leader=TrimInput(),
+        follower=Consensus(synthesize(model, graph, FixedGain(P=[1e3, 1e3], coupling=50.0))),
         initial={"x1": 1.0, "x2": 1.0},
         **settings,
     )

@@ -90,7 +90,9 @@ def test_no_perturbation_of_the_metric_passes(files, seed, size, tmp_path_factor
 def test_every_bundled_model_is_made_again_from_its_file(name, tmp_path):
     kind = resolve(registry.MODELS[name])
     model = kind([[0.0, 1.0], [-2.0, 0.1]], [[0.0], [3.0]]) if name == "linear" else kind()
-    ech.save_gain(ech.synthesize(model, LINE, ech.Given()), model, LINE, tmp_path / "gain.json")
+    ech.save_gain(
+        ech.synthesize(model, LINE, ech.gains.FixedGain()), model, LINE, tmp_path / "gain.json"
+    )
     found = ech.verify(tmp_path / "gain.json")
     assert found.holds, found.sentence
     assert {each.verdict for each in found.findings} == {"holds"}
@@ -100,8 +102,10 @@ def test_every_bundled_model_is_made_again_from_its_file(name, tmp_path):
     ("graph", "open_"), [(ech.Graph.path(501), 0), (ech.Graph.complete(80), 1)]
 )
 def test_large_graphs_are_checked_as_far_as_their_edges_are_there(graph, open_, tmp_path):
-    model = ech.DoubleIntegrator(1)
-    ech.save_gain(ech.synthesize(model, graph, ech.Riccati()), model, graph, tmp_path / "gain.json")
+    model = ech.models.DoubleIntegrator(1)
+    ech.save_gain(
+        ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, tmp_path / "gain.json"
+    )
     found = ech.verify(tmp_path / "gain.json")
     assert found.holds
     assert sum(each.verdict == "not checked" for each in found.findings) == open_
@@ -109,13 +113,13 @@ def test_large_graphs_are_checked_as_far_as_their_edges_are_there(graph, open_, 
 
 def test_a_model_of_ones_own_must_be_given_and_is_never_imported(tmp_path):
     model, file = STUDY.Soft(), tmp_path / "gain.json"
-    ech.save_gain(ech.synthesize(model, LINE, ech.Riccati()), model, LINE, file)
+    ech.save_gain(ech.synthesize(model, LINE, ech.gains.Riccati()), model, LINE, file)
     found = ech.verify(file)
     verdicts = {each.claim: each.verdict for each in found.findings}
     assert found.holds and verdicts["equations of the model"] == "not checked"
     assert found.sentence.endswith("1 could not be checked.")
     assert ech.verify(file, model).sentence.startswith("Verified:")
-    assert not ech.verify(file, ech.Pendulum()).holds
+    assert not ech.verify(file, ech.models.Pendulum()).holds
     told = json.loads(file.read_text())
     told["model"]["class"] = "antigravity:Thing"
     file.write_text(json.dumps(told))

@@ -8,12 +8,12 @@ import numpy as np
 import scipy.linalg
 
 from echelon.certificates.margins import ClosedLoop, lowest, modes
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 
 _DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
 
 
-def disturbance_ellipsoid(loop: ClosedLoop, E: Matrix, bound: float = 1.0) -> Matrix:
+def invariant_ellipsoid(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:
     """Return for each state (n,) a bound that no disturbance of norm up to `bound` makes it leave.
 
     From rest, delta obeys a mode plus E w, E (n, q). For each alpha the ellipsoid X with
@@ -29,7 +29,7 @@ def disturbance_ellipsoid(loop: ClosedLoop, E: Matrix, bound: float = 1.0) -> Ma
     (solve,) = scipy.linalg.get_lapack_funcs(("trsyl",), (loop.A,))
     limit = -2.0 * float(np.linalg.eigvals(closed).real.max())
 
-    def squares(alpha: float) -> Matrix:
+    def squares(alpha: float) -> Array:
         found = np.zeros(n)
         for T, Q in forms:
             S, F = T + 0.5 * alpha * np.eye(n), Q.T @ E
@@ -41,7 +41,7 @@ def disturbance_ellipsoid(loop: ClosedLoop, E: Matrix, bound: float = 1.0) -> Ma
     return bound * np.sqrt([lowest(lambda a, j=j: squares(a)[j], *ends).fun for j in range(n)])
 
 
-def disturbance_l1(loop: ClosedLoop, E: Matrix, bound: float = 1.0) -> Matrix:
+def peak_gain(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:
     """Return for each state (n,) the largest value that a disturbance of norm `bound` gives it.
 
     In one mode, from rest, this is exactly bound times the integral of |e_j' exp(A t) E|, to a
@@ -54,7 +54,7 @@ def disturbance_l1(loop: ClosedLoop, E: Matrix, bound: float = 1.0) -> Matrix:
     return bound * np.max([_impulse_norms(mode, E) for mode in modes(loop)], axis=0)
 
 
-def _impulse_norms(A: Matrix, E: Matrix) -> Matrix:
+def _impulse_norms(A: Array, E: Array) -> Array:
     """Return the integrals over t >= 0 of the norms of the rows of exp(A t) E, (n,).
 
     Gauss's rule of 8 nodes on panels that are halved until the halves agree with the whole, all
@@ -89,7 +89,7 @@ def _impulse_norms(A: Matrix, E: Matrix) -> Matrix:
     return d * (closed + wholes.sum(0))
 
 
-def exponential(X: Matrix) -> Matrix:
+def exponential(X: Array) -> Array:
     """Return exp(X) of matrices (..., n, n), all scaled and squared alike.
 
     SciPy's waits on other threads for each of a stack of small matrices; products of a stack do

@@ -6,15 +6,15 @@ import equinox as eqx
 import numpy as np
 
 from echelon.certificates.domain import Domain
-from echelon.core.numerics import observability_rank
-from echelon.core.types import Matrix
+from echelon.core.linear import observability_rank
+from echelon.core.types import Array
 from echelon.models.linearization import Linearization
 from echelon.network.graph import Graph
 
 Kind: TypeAlias = Literal["proof", "vertices", "samples", "linearization"]
 
 
-class Region(eqx.Module):
+class RegionCertificate(eqx.Module):
     """What is promised on a domain, not only at a point.
 
     Attributes:
@@ -40,8 +40,8 @@ class Region(eqx.Module):
     domain: Domain = eqx.field(static=True)
     radius: float | None
     strength: float
-    hull: Matrix
-    error: Matrix
+    hull: Array
+    error: Array
 
 
 class Certificate(eqx.Module):
@@ -67,7 +67,7 @@ class Certificate(eqx.Module):
     modes: int = eqx.field(static=True)
     edge: float | None
     observable: int = eqx.field(static=True)
-    region: Region | None = None
+    region: RegionCertificate | None = None
 
     @property
     def stable(self) -> bool:
@@ -78,12 +78,12 @@ class Certificate(eqx.Module):
 def certify(
     linear: Linearization,
     graph: Graph,
-    P: Matrix,
-    R: Matrix,
+    P: Array,
+    R: Array,
     coupling: float,
     edge: float | None,
-    region: Region | None = None,
-    modes: Matrix | None = None,
+    region: RegionCertificate | None = None,
+    modes: Array | None = None,
 ) -> Certificate:
     """Return what linearization at the trim says of the law with gain P, R and coupling c.
 
@@ -106,12 +106,12 @@ def certify(
     )
 
 
-def parent_modes(graph: Graph) -> Matrix:
+def parent_modes(graph: Graph) -> Array:
     """Return the eigenvalues where parents' inputs are fed forward: the weights (theory, T4)."""
     led = np.isin(graph.edges, graph.leaders).all(axis=1)
     return np.unique(graph.weights[~led])
 
 
-def _abscissa(matrices: Matrix) -> float:
+def _abscissa(matrices: Array) -> float:
     """Return the largest real part of an eigenvalue of any of the matrices."""
     return float(np.linalg.eigvals(matrices).real.max())

@@ -6,7 +6,7 @@ from typing import TypeAlias, final
 import numpy as np
 
 from echelon.core.errors import GainError, did_you_mean, listing
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 
 Bound: TypeAlias = float | tuple[float, float]
@@ -23,9 +23,7 @@ class Domain:
     A certificate on a domain holds while every agent's state, and the leader's input, stay inside.
     """
 
-    def __init__(
-        self, lower: Matrix, upper: Matrix, input_lower: Matrix, input_upper: Matrix
-    ) -> None:
+    def __init__(self, lower: Array, upper: Array, input_lower: Array, input_upper: Array) -> None:
         """Keep the bounds, read-only."""
         self.lower, self.upper = np.array(lower, float), np.array(upper, float)
         self.input_lower, self.input_upper = (
@@ -60,7 +58,7 @@ class Domain:
         _check_chart(model, state)
         return cls(*state, *given)
 
-    def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Matrix, Matrix]:
+    def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Array, Array]:
         """Return random deviations (count, n) and inputs (count, m); unbounded states in +-free."""
         random = np.random.default_rng(seed)
         low = np.where(np.isfinite(self.lower), self.lower, -free)
@@ -82,7 +80,7 @@ class Domain:
         ]
         return ", ".join(told) or "all states"
 
-    def margins(self) -> Matrix:
+    def margins(self) -> Array:
         """Return (n,) how far each state may deviate from the trim to both sides."""
         return np.minimum(self.upper, -self.lower)
 
@@ -111,7 +109,7 @@ def _places(model: ControlAffine, name: str) -> list[int]:
     return list(model.states_called(name))
 
 
-def _check_chart(model: ControlAffine, state: Matrix) -> None:
+def _check_chart(model: ControlAffine, state: Array) -> None:
     """Check that a bounded state stays where the model's equations hold."""
     trim = np.asarray(model.trim[0], float)
     for name, (low, high) in model.chart.items():

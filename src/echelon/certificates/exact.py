@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from echelon.core.errors import GainError
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 
 Number: TypeAlias = float | Fraction
 
@@ -150,7 +150,7 @@ def _real(x: Fraction, bits: int) -> float:
     return float(x / (1 << bits))
 
 
-def rationalize(P: Matrix, bits: int = 24) -> Matrix:
+def rationalize(P: Array, bits: int = 24) -> Array:
     """Return a symmetric matrix near P with short entries, for use in place of P ever after.
 
     Entry (i, j) is rounded to a multiple of 2^-bits times a power of two close to
@@ -182,7 +182,7 @@ def rationalize(P: Matrix, bits: int = 24) -> Matrix:
 
 
 def prove_contraction(
-    vertices: Matrix, error: Matrix, B: Matrix, P: Matrix, rho: Number, rate: Number
+    vertices: Array, error: Array, B: Array, P: Array, rho: Number, rate: Number
 ) -> ContractionProof:
     """Prove P A + A'P - rho P B B'P + 2 rate P < 0 and P > 0 for every A of a polytope.
 
@@ -237,7 +237,7 @@ def _constant_part(
     return feedback.minus(wanted.plus(wanted)).minus(lost)
 
 
-def _check_shapes(vertices: Matrix, error: Matrix, B: Matrix, P: Matrix) -> None:
+def _check_shapes(vertices: Array, error: Array, B: Array, P: Array) -> None:
     """Raise unless all matrices belong to n states and there is a vertex."""
     n = len(P)
     shapes = {

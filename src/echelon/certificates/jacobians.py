@@ -10,8 +10,8 @@ import numpy as np
 from echelon.certificates.certificate import Kind
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError
-from echelon.core.types import Matrix
-from echelon.enclosure.hull import Box, Hull, jacobian_hull, model_jacobian
+from echelon.core.types import Array
+from echelon.enclosure.hull import Box, Hull, jacobian_hull
 from echelon.models.model import ControlAffine
 
 _SAMPLES = 400
@@ -27,8 +27,8 @@ class Jacobians(NamedTuple):
     `error` (n, n) entry by entry, or `samples` taken at random in the domain and at its corners.
     """
 
-    matrices: Matrix
-    error: Matrix
+    matrices: Array
+    error: Array
     kind: Kind
 
 
@@ -44,7 +44,7 @@ def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     return _over(model_jacobian(model), model, domain)
 
 
-def weighted_jacobians(model: ControlAffine, domain: Domain, R: Matrix) -> Jacobians:
+def weighted_jacobians(model: ControlAffine, domain: Domain, R: Array) -> Jacobians:
     """Return the same with g S R^-1 (g S)' to the right of each Jacobian: (K, n, 2n).
 
     They are enclosed together, as the two turn with the same angles.
@@ -110,7 +110,7 @@ def _unbounded(model: ControlAffine, name: str) -> GainError:
     )
 
 
-def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Matrix:
+def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
     """Return the matrices inside the domain and at its corners, all of them where they are few.
 
     Raises:
@@ -128,7 +128,7 @@ def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Matrix
     base = np.append(np.asarray(model.trim[0], float), np.zeros(len(model.input_names)))
     n, at = len(model.state_names), jax.jit(jax.vmap(function))
 
-    def matrices(points: Matrix) -> Matrix:
+    def matrices(points: Array) -> Array:
         return np.asarray(at(jnp.asarray((base + points)[:, :n]), jnp.asarray(points[:, n:])))
 
     found = matrices(both)
@@ -137,3 +137,15 @@ def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Matrix
         if np.abs(matrices(far) - found).max() > 1e-12 * np.abs(found).max():
             raise _unbounded(model, model.state_names[k])
     return found
+
+
+def model_jacobian(model: ControlAffine) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """Return (x, v) -> d/dx [f(x) + g(x) (u* + S v)], v the normalized input."""
+
+    def jacobian(x: jax.Array, v: jax.Array) -> jax.Array:
+        def velocity(x: jax.Array) -> jax.Array:
+            return model.normalized_drift(x) + model.normalized_input_map(x) @ v
+
+        return jax.jacfwd(velocity)(x)
+
+    return jacobian

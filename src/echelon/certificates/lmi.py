@@ -21,8 +21,8 @@ import scipy.linalg
 
 from echelon.certificates.modes import AXIS, axis_modes, obstacle, vertices_of
 from echelon.core.errors import GainError, MissingExtraError, listing
-from echelon.core.numerics import in_words, riccati, symmetric_part
-from echelon.core.types import Matrix
+from echelon.core.linear import in_words, riccati, symmetric_part
+from echelon.core.types import Array
 
 _STRICT = 1e-6  # asked of the solver, in scaled states, so that its own error does not reach zero
 _FIRST, _BATCH = 16, 12  # vertices that the solver sees at first; violated ones added at a time
@@ -39,7 +39,7 @@ class Metric(NamedTuple):
         margin: largest eigenvalue, over k, of P A_k + A_k'P - rho P B R^-1 B'P.
     """
 
-    P: Matrix
+    P: Array
     rho: float
     rate: float
     condition: float
@@ -47,7 +47,11 @@ class Metric(NamedTuple):
 
 
 def rate_of(
-    P: Matrix, As: Matrix, B: Matrix | None = None, R: Matrix | None = None, strength: float = 0.0
+    P: Array,
+    As: Array,
+    B: Array | None = None,
+    R: Array | None = None,
+    strength: float = 0.0,
 ) -> float:
     """Return the largest alpha with P A_k + A_k'P - strength P B R^-1 B'P <= -2 alpha P for all k.
 
@@ -66,7 +70,7 @@ def rate_of(
     return _rate(P, vertices_of(As), None if B is None else _weighted(B, R), strength)
 
 
-def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None = None) -> Metric:
+def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None = None) -> Metric:
     """Return the best conditioned P with P A_k + A_k'P <= 0 for all k (the paper's Assumption 5).
 
     One that the smallest change of the vertices would spoil may be missed.
@@ -109,7 +113,7 @@ def monotone(As: Matrix, condition_max: float = 1e4, names: Sequence[str] | None
     return found._replace(rate=max(0.0, found.rate))
 
 
-def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix, W: Matrix | None = None) -> Metric:
+def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) -> Metric:
     """Return the P of least trace with A_k'P + P A_k + Q - P B R^-1 B'P <= 0 for all k.
 
     The rate is measured at rho = 1, the edge c = 1/(2 lambda_min); the inequality makes it half the
@@ -149,7 +153,11 @@ def robust_lqr(As: Matrix, B: Matrix, Q: Matrix, R: Matrix, W: Matrix | None = N
 
 
 def contraction(
-    As: Matrix, B: Matrix, rate: float, condition_max: float = 1e4, W: Matrix | None = None
+    As: Array,
+    B: Array,
+    rate: float,
+    condition_max: float = 1e4,
+    W: Array | None = None,
 ) -> Metric:
     """Return the metric of least strength rho that contracts every vertex at `rate`, with R = I.
 
@@ -192,12 +200,12 @@ def contraction(
     return _measured(P, As, S, enough[0])
 
 
-def _weighted(B: Matrix, R: Matrix | None) -> Matrix:
+def _weighted(B: Array, R: Array | None) -> Array:
     """Return B R^-1 B', (n, n) or (K, n, n)."""
     return B @ (B.swapaxes(-1, -2) if R is None else np.linalg.solve(R, B.swapaxes(-1, -2)))
 
 
-def _drift(P: Matrix, As: Matrix, S: Matrix | None, strength: float) -> Matrix:
+def _drift(P: Array, As: Array, S: Array | None, strength: float) -> Array:
     """Return P A_k + A_k'P - strength P S P, (K, n, n), symmetric."""
     pull = P @ As
     if S is not None and strength:
@@ -205,26 +213,26 @@ def _drift(P: Matrix, As: Matrix, S: Matrix | None, strength: float) -> Matrix:
     return pull + pull.swapaxes(-1, -2)
 
 
-def _rate(P: Matrix, As: Matrix, S: Matrix | None, strength: float) -> float:
+def _rate(P: Array, As: Array, S: Array | None, strength: float) -> float:
     inverse = np.linalg.inv(np.linalg.cholesky(P))
     X = inverse @ _drift(P, As, S, strength) @ inverse.T
     return -0.5 * float(np.linalg.eigvalsh(0.5 * (X + X.swapaxes(-1, -2))).max())
 
 
-def _condition(P: Matrix) -> float:
+def _condition(P: Array) -> float:
     """Return the condition number of P, infinite where it is not positive definite."""
     low, high = np.linalg.eigvalsh(P)[[0, -1]]
     return float(high / low) if low > 0.0 else np.inf
 
 
-def _falls(P: Matrix, As: Matrix) -> bool:
+def _falls(P: Array, As: Array) -> bool:
     """Return whether no P^-1 (P A_k + A_k'P) has an eigenvalue above what rounding makes."""
     inverse = np.abs(np.linalg.inv(np.linalg.cholesky(P)))
     size = inverse @ _drift(np.abs(P), np.abs(As), None, 0.0) @ inverse.T
     return -2.0 * rate_of(P, As) <= 4.0 * len(P) * np.finfo(float).eps * size.sum(-1).max()
 
 
-def _measured(P: Matrix, As: Matrix, S: Matrix | None, rho: float) -> Metric:
+def _measured(P: Array, As: Array, S: Array | None, rho: float) -> Metric:
     margin = float(np.linalg.eigvalsh(_drift(P, As, S, rho)).max())
     return Metric(P, rho, _rate(P, As, S, rho), _condition(P), margin)
 
@@ -266,12 +274,12 @@ def _least(cp: Any, goal: Any, cones: list[Any], gaps: list[Any]) -> bool:
             return True
 
 
-def _matrix(cp: Any, basis: Matrix, x: Any) -> Any:
+def _matrix(cp: Any, basis: Array, x: Any) -> Any:
     """Return sum_i x_i basis_i."""
     return cp.reshape(basis.reshape(len(basis), -1).T @ x, basis.shape[1:], order="C")
 
 
-def _basis(n: int) -> Matrix:
+def _basis(n: int) -> Array:
     """Return a basis of the symmetric matrices, (n (n + 1) / 2, n, n)."""
     i, j = np.triu_indices(n)
     basis = np.zeros((len(i), n, n))
@@ -279,12 +287,12 @@ def _basis(n: int) -> Matrix:
     return basis
 
 
-def _pull(As: Matrix, basis: Matrix) -> Matrix:
+def _pull(As: Array, basis: Array) -> Array:
     """Return A_k E_i + E_i A_k', (K, d, n, n)."""
     return (product := As[:, None] @ basis) + product.swapaxes(-1, -2)
 
 
-def _gaps(cp: Any, slopes: list[Matrix], x: Any) -> list[Any]:
+def _gaps(cp: Any, slopes: list[Array], x: Any) -> list[Any]:
     """Return sum_i x_i slopes_k[i] for each k, turned by a dense orthogonal matrix.
 
     An unknown that enters few rows of many cones is eliminated first by the solver, which fills its
@@ -294,14 +302,14 @@ def _gaps(cp: Any, slopes: list[Matrix], x: Any) -> list[Any]:
     return [_matrix(cp, U @ X @ U.T, x) for U, X in zip(turns, slopes, strict=True)]
 
 
-def _stack(As: Matrix, S: Matrix, M: Matrix, more: Matrix) -> list[Matrix]:
+def _stack(As: Array, S: Array, M: Array, more: Array) -> list[Array]:
     """Return A_k E_i + E_i A_k', then `more`, then S_k, in the states M x, for each k."""
     S = np.broadcast_to(M @ S @ M.T, As.shape)
     pulls = _pull(M @ As @ np.linalg.inv(M), _basis(len(M)))
     return [np.concatenate([X, more, s[None]]) for X, s in zip(pulls, S, strict=True)]
 
 
-def _scale(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+def _scale(As: Array, B: Array, Q: Array, R: Array) -> Array:
     """Return M with M'M the Riccati P of the mean, so that metrics are near I in the states M x."""
     try:
         return np.linalg.cholesky(riccati(As.mean(0), B if B.ndim == 2 else B.mean(0), Q, R)).T
@@ -309,12 +317,12 @@ def _scale(As: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
         return np.eye(As.shape[-1])
 
 
-def _unscaled(W: Matrix, M: Matrix) -> Matrix | None:
+def _unscaled(W: Array, M: Array) -> Array | None:
     """Return P in the caller's states from W = P^-1 in the states M x."""
     return None if _condition(W) == np.inf else symmetric_part(M.T @ np.linalg.inv(W) @ M)
 
 
-def _face(A: Matrix) -> tuple[Matrix, list[Matrix]]:
+def _face(A: Array) -> tuple[Array, list[Array]]:
     """Return a basis E of the P that modes on the axis allow, and X_k(E) where it may be negative.
 
     Along a mode v on the imaginary axis v*(P A + A'P) v = 0, so that a semidefinite X = P A + A'P

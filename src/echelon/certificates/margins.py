@@ -14,7 +14,7 @@ import scipy.linalg
 import scipy.optimize
 
 from echelon.core.errors import GainError
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 
 _FAR = 1e6  # factors on the coupling beyond this count as infinite
 _HIDDEN = 1e-9  # relative size below which a singular value or a damping counts as zero
@@ -23,20 +23,20 @@ _HIDDEN = 1e-9  # relative size below which a singular value or a damping counts
 class ClosedLoop(NamedTuple):
     """What every margin is of: the modes A - c lambda B R^-1 B'P for lambda in `eigenvalues`."""
 
-    A: Matrix
-    B: Matrix
-    P: Matrix
-    R: Matrix
+    A: Array
+    B: Array
+    P: Array
+    R: Array
     coupling: float
-    eigenvalues: Matrix
+    eigenvalues: Array
 
     @property
-    def K(self) -> Matrix:
+    def K(self) -> Array:
         """R^-1 B'P, (m, n)."""
         return np.linalg.solve(self.R, self.B.T @ self.P)
 
     @property
-    def strengths(self) -> Matrix:
+    def strengths(self) -> Array:
         """The distinct c lambda, ascending."""
         return self.coupling * np.unique(np.asarray(self.eigenvalues, dtype=np.float64))
 
@@ -75,10 +75,10 @@ class HiddenMode(NamedTuple):
     """A mode that does not decay and never shows: its eigenvalue, 1/s, and its direction (n,)."""
 
     eigenvalue: complex
-    direction: Matrix
+    direction: Array
 
 
-def modes(loop: ClosedLoop) -> Matrix:
+def modes(loop: ClosedLoop) -> Array:
     """Return the matrices A - c lambda B R^-1 B'P, (K, n, n), for the distinct eigenvalues.
 
     Raises:
@@ -145,7 +145,7 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     """
     closed, K, strengths = modes(loop), loop.K, loop.strengths
 
-    def loci(w: Matrix) -> Matrix:
+    def loci(w: Array) -> Array:
         mu = np.linalg.eigvals(K @ _resolvent(loop.A, w, loop.B))
         return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
 
@@ -170,7 +170,7 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
 
 
 def input_scaling(
-    loop: ClosedLoop, spread: float = 0.3, slopes: Matrix | None = None
+    loop: ClosedLoop, spread: float = 0.3, slopes: Array | None = None
 ) -> InputScaling:
     """Return the worst mode when every input acts 1 +- spread as strongly as the law believes.
 
@@ -209,7 +209,7 @@ def string_gain(loop: ClosedLoop) -> StringGain:
     closed = modes(loop._replace(eigenvalues=np.ones(1)))[0]
     K = loop.coupling * loop.K
 
-    def sizes(w: Matrix) -> Matrix:
+    def sizes(w: Array) -> Array:
         return np.linalg.norm(K @ _resolvent(closed, w, loop.B), ord=2, axis=(-2, -1))
 
     grid = np.append(0.0, _frequencies([loop.A, closed]))
@@ -218,7 +218,7 @@ def string_gain(loop: ClosedLoop) -> StringGain:
     return StringGain(float(sizes(grid)[at]), float(grid[at]))
 
 
-def detectability(A: Matrix, C: Matrix) -> list[HiddenMode]:
+def detectability(A: Array, C: Array) -> list[HiddenMode]:
     """Return the modes with Re s >= 0 and a right eigenvector v with C v = 0 (the PBH test).
 
     The largest invariant subspace where C vanishes is found first, by singular values; then the
@@ -237,7 +237,7 @@ def detectability(A: Matrix, C: Matrix) -> list[HiddenMode]:
     return found
 
 
-def _edge(decays: Callable[[float], bool], k: float, edges: Matrix, end: float) -> float:
+def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -> float:
     """Return where stability ends on the way from k over the candidates `edges` to `end`."""
     inside = k
     for here, beyond in itertools.pairwise([*edges, end]):
@@ -252,7 +252,7 @@ def _edge(decays: Callable[[float], bool], k: float, edges: Matrix, end: float) 
     return end
 
 
-def _crossings(A: Matrix, G: Matrix, top: float) -> Matrix:
+def _crossings(A: Array, G: Array, top: float) -> Array:
     """Return the k in (0, top) at which two eigenvalues of A - k G may add to zero, ascending."""
     i, j = np.triu_indices(len(A))
     basis = np.zeros((len(i), *A.shape))
@@ -265,12 +265,12 @@ def _crossings(A: Matrix, G: Matrix, top: float) -> Matrix:
     return np.unique(k.real[real & (k.real < top)])
 
 
-def _resolvent(A: Matrix, w: Matrix, B: Matrix) -> Matrix:
+def _resolvent(A: Array, w: Array, B: Array) -> Array:
     """Return (i w I - A)^-1 B for each frequency, (N, n, m)."""
     return np.linalg.solve(1j * w[:, None, None] * np.eye(len(A)) - A, B[None].astype(complex))
 
 
-def _frequencies(matrices: list[Matrix]) -> Matrix:
+def _frequencies(matrices: list[Array]) -> Array:
     """Return frequencies up to the largest norm of the matrices, denser about their resonances."""
     # |w| <= |A - k B K z| for |z| = 1, which is at most twice the norm of A and that of A - k B K.
     top = 3.0 * max(float(np.linalg.norm(M, 2)) for M in matrices) or 1.0
@@ -282,7 +282,7 @@ def _frequencies(matrices: list[Matrix]) -> Matrix:
     return np.union1d(sweep, near[near > sweep[0]])
 
 
-def _peaks(f: Callable[[float], float], grid: Matrix, values: Matrix) -> Matrix:
+def _peaks(f: Callable[[float], float], grid: Array, values: Array) -> Array:
     """Return the local maxima of f between the points of a grid where it has these values."""
     middle, left, right = values[1:-1], values[:-2], values[2:]
     # A flat stretch has maxima by rounding, which are no peaks.
@@ -297,7 +297,7 @@ def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
     return scipy.optimize.minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
 
 
-def _unobservable(A: Matrix, C: Matrix) -> Matrix:
+def _unobservable(A: Array, C: Array) -> Array:
     """Return an orthonormal basis, (n, r), of the largest invariant subspace where C vanishes."""
     rows = np.linalg.norm(C, axis=1, keepdims=True)
     basis = _null_space(C / np.where(rows > 0.0, rows, 1.0), _HIDDEN)
@@ -310,13 +310,13 @@ def _unobservable(A: Matrix, C: Matrix) -> Matrix:
     return basis
 
 
-def _null_space(M: Matrix, tolerance: float) -> Matrix:
+def _null_space(M: Array, tolerance: float) -> Array:
     """Return an orthonormal basis of the vectors that M sends to less than the tolerance."""
     _, singular, right = np.linalg.svd(M)
     return right[int((singular > tolerance).sum()) :].conj().T
 
 
-def _sparse(vectors: Matrix) -> Matrix:
+def _sparse(vectors: Array) -> Array:
     """Return unit vectors of the same span, (n, r), each alone at one state where it is large."""
     pivots = np.asarray(scipy.linalg.qr(vectors.conj().T, pivoting=True)[-1])[: vectors.shape[1]]
     sparse = vectors @ np.linalg.inv(vectors[pivots])

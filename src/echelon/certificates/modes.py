@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from echelon.core.errors import GainError
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 
 AXIS = 1e-9
 """Eigenvalues closer to the imaginary axis, in units of the norm, count as on it."""
@@ -29,7 +29,7 @@ class Obstacle(NamedTuple):
     states: tuple[int, ...]
 
 
-def obstacle(As: Matrix) -> Obstacle | None:
+def obstacle(As: Array) -> Obstacle | None:
     """Return the first mode that forbids every P > 0 with P A_k + A_k'P <= 0, or None.
 
     It is an eigenvalue in the open right half plane, or one on the imaginary axis with a Jordan
@@ -51,7 +51,7 @@ def obstacle(As: Matrix) -> Obstacle | None:
     return None
 
 
-def vertices_of(As: Matrix) -> Matrix:
+def vertices_of(As: Array) -> Array:
     """Return As as a float64 array (K, n, n), K >= 1, of finite numbers."""
     As = np.asarray(As, dtype=np.float64)
     if As.ndim != 3 or As.shape[1] != As.shape[2] or not As.size or not np.isfinite(As).all():
@@ -59,7 +59,7 @@ def vertices_of(As: Matrix) -> Matrix:
     return As
 
 
-def axis_modes(A: Matrix) -> list[tuple[complex, Matrix, Matrix]]:
+def axis_modes(A: Array) -> list[tuple[complex, Array, Array]]:
     """Return each s = i w, w >= 0, on the imaginary axis with right and left null space of A - s I.
 
     Rounding scatters the eigenvalues of a Jordan block and leaves their mean in place, so means of
@@ -77,7 +77,7 @@ def axis_modes(A: Matrix) -> list[tuple[complex, Matrix, Matrix]]:
     return [mode for mode in modes if mode[1].size]
 
 
-def _support(vectors: Matrix) -> tuple[int, ...]:
+def _support(vectors: Array) -> tuple[int, ...]:
     """Return the rows that hold a tenth or more of a column's largest entry."""
     sizes = np.abs(vectors)
     return tuple(np.flatnonzero((sizes >= 0.1 * sizes.max(0)).any(1)).tolist())

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from echelon.certificates.certificate import Region
+from echelon.certificates.certificate import RegionCertificate
 from echelon.certificates.domain import Bound, Domain
 from echelon.certificates.exact import prove_contraction
 from echelon.certificates.jacobians import (
@@ -16,7 +16,7 @@ from echelon.certificates.jacobians import (
 )
 from echelon.certificates.lmi import rate_of
 from echelon.core.errors import GainError
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 
 # The exact proof is of a rate a little below the one that eigenvalues show, for their rounding.
@@ -38,8 +38,8 @@ def the_domain(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None
 
 
 def pairs_on(
-    model: ControlAffine, domain: Domain, R: Matrix
-) -> tuple[Jacobians, Matrix, Matrix | None]:
+    model: ControlAffine, domain: Domain, R: Array
+) -> tuple[Jacobians, Array, Array | None]:
     """Return what a gain must contract: the Jacobians on a domain, and (A_k, W_k).
 
     W_k = g S R^-1 (g S)' is enclosed with A_k where g varies, and None where it is constant.
@@ -58,12 +58,12 @@ def pairs_on(
 def contracting_region(
     domain: Domain,
     found: Jacobians,
-    P: Matrix,
-    B: Matrix,
-    R: Matrix,
+    P: Array,
+    B: Array,
+    R: Array,
     strength: float,
     exact: bool,
-) -> Region | None:
+) -> RegionCertificate | None:
     """Return what a metric promises on a domain; None where it contracts at no rate there.
 
     Args:
@@ -90,7 +90,7 @@ def contracting_region(
         weighted = B @ np.linalg.cholesky(np.linalg.inv(R))
         proof = prove_contraction(found.matrices, found.error, weighted, P, strength, shown)
         kind, rate = ("proof", shown) if proof.holds else (kind, rate)
-    return Region(
+    return RegionCertificate(
         kind=kind,
         rate=rate,
         theorem="T1" if constant else "T2",
@@ -103,7 +103,7 @@ def contracting_region(
     )
 
 
-def _rate_where_g_varies(P: Matrix, pairs: Matrix, strength: float) -> float:
+def _rate_where_g_varies(P: Array, pairs: Array, strength: float) -> float:
     """Return the rate over pairs [A, W] with W = g S R^-1 (g S)', (K, n, 2n).
 
     P A + A'P - strength P W P is affine in the pair, so the corners of its hull suffice.
@@ -112,7 +112,7 @@ def _rate_where_g_varies(P: Matrix, pairs: Matrix, strength: float) -> float:
     return rate_of(P, A - 0.5 * strength * W @ P)
 
 
-def radius(domain: Domain, P: Matrix) -> float | None:
+def radius(domain: Domain, P: Array) -> float | None:
     """Return r with {delta'P delta <= r^2} inside the domain: r^2 = min_j margin_j^2 / W_jj."""
     margins, W = domain.margins(), np.linalg.inv(P)
     bounded = np.isfinite(margins)

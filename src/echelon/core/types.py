@@ -6,18 +6,19 @@ T frames, N agents (leaders included), n states, m inputs, q outputs, E edges.
 import os
 from typing import TypeAlias
 
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-State: TypeAlias = Float[Array, " n"]
-Input: TypeAlias = Float[Array, " m"]
-Output: TypeAlias = Float[Array, " q"]
-InputMap: TypeAlias = Float[Array, "n m"]
-States: TypeAlias = Float[Array, "N n"]
-Inputs: TypeAlias = Float[Array, "N m"]
-Scalar: TypeAlias = Float[Array, ""]
+State: TypeAlias = Float[jax.Array, " n"]
+Input: TypeAlias = Float[jax.Array, " m"]
+Output: TypeAlias = Float[jax.Array, " q"]
+InputMap: TypeAlias = Float[jax.Array, "n m"]
+States: TypeAlias = Float[jax.Array, "N n"]
+Inputs: TypeAlias = Float[jax.Array, "N m"]
+Scalar: TypeAlias = Float[jax.Array, ""]
 
-Matrix: TypeAlias = np.ndarray
+Array: TypeAlias = np.ndarray
 """A float64 NumPy array; gains, results and files never hold JAX arrays."""
 
 PathLike: TypeAlias = str | os.PathLike[str]

@@ -17,7 +17,7 @@ import numpy as np
 
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.enclosure.interval import Interval
 from echelon.enclosure.polynomial import (
     Atoms,
@@ -28,14 +28,13 @@ from echelon.enclosure.polynomial import (
     corner_values,
 )
 from echelon.enclosure.trace import evaluate
-from echelon.models.model import ControlAffine
 
 
 class Box(NamedTuple):
     """Bounds (k,) of k entries, each taken as the exact number that its float is."""
 
-    lower: Matrix
-    upper: Matrix
+    lower: Array
+    upper: Array
 
 
 class HullAtom(NamedTuple):
@@ -60,21 +59,9 @@ class Hull(NamedTuple):
     entry by entry; it is 0 where floats are exact.
     """
 
-    vertices: Matrix
-    error: Matrix
+    vertices: Array
+    error: Array
     atoms: tuple[HullAtom, ...]
-
-
-def model_jacobian(model: ControlAffine) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return (x, v) -> d/dx [f(x) + g(x) (u* + S v)], v the normalized input."""
-
-    def jacobian(x: jax.Array, v: jax.Array) -> jax.Array:
-        def velocity(x: jax.Array) -> jax.Array:
-            return model.normalized_drift(x) + model.normalized_input_map(x) @ v
-
-        return jax.jacfwd(velocity)(x)
-
-    return jacobian
 
 
 def jacobian_hull(

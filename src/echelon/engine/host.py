@@ -11,12 +11,12 @@ import numpy as np
 
 from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import Precision, precision
-from echelon.core.types import Inputs, Matrix, States
+from echelon.core.types import Array, Inputs, States
 from echelon.engine.initial import Initial, initial_states
 from echelon.engine.loop import Loop, advance_plant, assemble, delivered
 from echelon.engine.prepare import check_parts, check_settings, formation_warnings
 from echelon.engine.result import Result, Settings
-from echelon.laws.passive import Passive
+from echelon.laws.trim_input import TrimInput
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
@@ -45,7 +45,7 @@ class Flight(NamedTuple):
     disturbance: Disturbance | None
     settings: Settings
     loop: Loop
-    states: Matrix
+    states: Array
     warnings: tuple[str, ...]
     began: float
 
@@ -55,7 +55,7 @@ class Flight(NamedTuple):
         return max(1, round(self.settings.horizon / self.settings.dt))
 
 
-Pilot: TypeAlias = Callable[[int, Matrix], Matrix]
+Pilot: TypeAlias = Callable[[int, Array], Array]
 """(step, states (N, n)) -> wanted physical inputs (N, m) from that step on."""
 
 
@@ -89,7 +89,7 @@ def take_off(
         if plant is not None:
             warnings = tuple(dict.fromkeys((*warnings, *check_model(plant))))
             check_plant(model, plant)
-        idle = Passive()
+        idle = TrimInput()
         loop = assemble(model, graph, formation, idle, idle, settings, plant, disturbance)
         states = initial_states(
             model, graph, formation, marker, initial, start_error or {}, settings.seed
@@ -104,9 +104,9 @@ def take_off(
 class _Track(NamedTuple):
     """States (T + 1, N, n), delivered inputs (T, N, m), saturated steps (N,), and why it ended."""
 
-    states: Matrix
-    inputs: Matrix
-    saturated: Matrix
+    states: Array
+    inputs: Array
+    saturated: Array
     stopped: str | None
 
 
@@ -207,7 +207,7 @@ def _result(flight: Flight, track: _Track, told: tuple[str, ...]) -> Result:
     )
 
 
-def _verdict(flight: Flight, track: _Track, cut: int, lost: Matrix) -> tuple[Outcome, str]:
+def _verdict(flight: Flight, track: _Track, cut: int, lost: Array) -> tuple[Outcome, str]:
     dt = flight.settings.dt
     if lost.any():
         agent = int(np.argwhere(lost)[0, 1])

@@ -13,13 +13,13 @@ import numpy as np
 
 from echelon.core import numerics
 from echelon.core.errors import SimulationError
-from echelon.core.types import Input, Inputs, Matrix, State, States
+from echelon.core.types import Array, Input, Inputs, State, States
 from echelon.engine.result import Settings
-from echelon.gains.gain import Gain
-from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.law import Law, LocalView, Memory, without_certificates
 from echelon.models.model import ControlAffine
+from echelon.network.exchange import Exchange
 from echelon.network.formation import Formation
-from echelon.network.graph import Exchange, Graph
+from echelon.network.graph import Graph
 from echelon.world.disturbance import Disturbance, Wind, disturbed
 
 
@@ -36,14 +36,14 @@ class Loop(eqx.Module):
     leader: Law
     follower: Law
     exchange: Exchange
-    offsets: Matrix
-    leaders: Matrix
-    followers: Matrix
-    sender: Matrix
-    parents: Matrix | None
-    levels: Matrix | None
-    order: Matrix
-    normalizer: Matrix
+    offsets: Array
+    leaders: Array
+    followers: Array
+    sender: Array
+    parents: Array | None
+    levels: Array | None
+    order: Array
+    normalizer: Array
     dt: float = eqx.field(static=True)
     integrator: str = eqx.field(static=True)
     limits: bool = eqx.field(static=True)
@@ -90,14 +90,14 @@ def assemble(
             f"with {shape[1]} states need {shape}."
         )
     leaders, followers = np.array(graph.leaders), np.array(graph.followers)
-    by_depth = follower.asks() == "parent"
+    by_depth = follower.feedforward == "parent"
     nearest = np.array(graph.nearest_leader())
     return Loop(
         model=model,
         plant=plant,
         wind=disturbance and disturbance.prepared(plant, settings.dt, settings.seed),
-        leader=_lean(leader),
-        follower=_lean(follower),
+        leader=without_certificates(leader),
+        follower=without_certificates(follower),
         exchange=graph.exchange(),
         offsets=np.asarray(formation.offsets),
         leaders=leaders,
@@ -113,7 +113,7 @@ def assemble(
     )
 
 
-def _levels(graph: Graph) -> Matrix:
+def _levels(graph: Graph) -> Array:
     """Return the places of followers among the followers, (D, W), a row for each depth.
 
     A row that is too short repeats its first.
@@ -122,21 +122,6 @@ def _levels(graph: Graph) -> Matrix:
     rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
     width = max(map(len, rows))
     return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
-
-
-def _lean(law: Law) -> Law:
-    """Return a law whose gains carry no certificate and a traced coupling.
-
-    So another coupling or another graph of the same size compiles nothing again.
-    """
-
-    def lean(node: Any) -> Any:
-        if not isinstance(node, Gain):
-            return node
-        parts = (np.asarray(node.coupling), None)
-        return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
-
-    return jax.tree.map(lean, law, is_leaf=lambda node: isinstance(node, Gain))
 
 
 # ---- one step ------------------------------------------------------------------------------------
@@ -194,11 +179,11 @@ def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) 
 
 def _told(loop: Loop, x: States, u: Inputs) -> jax.Array:
     """Return what is told of agents at x (K, n) with delivered inputs u (K, m)."""
-    if loop.follower.asks() == "none":
+    if loop.follower.feedforward == "none":
         return jnp.zeros_like(u)
     trim = jnp.asarray(loop.model.trim[1], u.dtype)
     v = (u - trim[None]) @ jnp.asarray(loop.normalizer, u.dtype).T
-    return jax.vmap(loop.follower.message, in_axes=(None, 0, 0))(loop.model, x, v)
+    return jax.vmap(loop.follower.broadcast, in_axes=(None, 0, 0))(loop.model, x, v)
 
 
 def delivered(loop: Loop, inputs: Inputs) -> Inputs:

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.core.errors import Outcome
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.world.disturbance import Disturbance
+from echelon.world.plant import differences
 
 
 class Settings(NamedTuple):
@@ -46,11 +47,11 @@ class Result:
         provenance: scenario text, versions and the like, as text.
     """
 
-    times: Matrix
-    states: Matrix
-    inputs: Matrix
-    reference: Matrix | None
-    saturated: Matrix
+    times: Array
+    states: Array
+    inputs: Array
+    reference: Array | None
+    saturated: Array
     outcome: Outcome
     message: str
     warnings: tuple[str, ...]
@@ -66,7 +67,7 @@ class Result:
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
-    def errors(self) -> Matrix:
+    def errors(self) -> Array:
         """Deviation of each agent from its goal relative to its leader, (T, N, n).
 
         The leaders' rows are zero.
@@ -97,3 +98,12 @@ class Result:
 def finite_or_none(value: Any) -> float | None:
     """Return a number as a float, or None where it does not exist or is not finite."""
     return float(value) if value is not None and np.isfinite(value) else None
+
+
+def imperfections(result: Result) -> dict[str, str | None]:
+    """Return in words how the plant differs from the model, and what disturbed it; else None."""
+    plant, disturbance = result.plant, result.disturbance
+    return {
+        "plant": None if plant is None else differences(result.model, plant),
+        "disturbance": None if disturbance is None else str(disturbance),
+    }

@@ -15,7 +15,7 @@ import numpy as np
 
 from echelon.core import numerics
 from echelon.core.errors import ModelError, Outcome
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.engine.initial import Initial, initial_states
 from echelon.engine.loop import Loop, Moment, assemble, control, step
 from echelon.engine.prepare import check_parts, check_settings, formation_warnings
@@ -166,7 +166,7 @@ def _frame_counts(settings: Settings) -> np.ndarray:
 
 
 def _start(loop: Loop, states: np.ndarray) -> Moment:
-    def remember(law: Law, who: Matrix) -> Memory:
+    def remember(law: Law, who: Array) -> Memory:
         return jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (len(who), *jnp.shape(leaf))), law.init()
         )

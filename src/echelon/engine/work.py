@@ -11,7 +11,7 @@ from echelon.engine.result import Result
 _KEY = "solver"
 
 
-class SolverFigures(NamedTuple):
+class SolverStats(NamedTuple):
     """The work of the solvers of all agents together.
 
     Attributes:
@@ -40,18 +40,18 @@ class SolverFigures(NamedTuple):
     setup_seconds: float
 
 
-def figures_of(
+def stats_of(
     method: Literal["optimization", "mpc"],
     solver: str,
     seconds: Sequence[float],
     iterations: Sequence[int],
     failures: int,
     setup_seconds: float,
-) -> SolverFigures:
+) -> SolverStats:
     """Return the figures of plans that took these seconds and iterations."""
     ms = 1e3 * np.array(seconds) if len(seconds) else np.zeros(1)
     counts = np.array(iterations) if len(iterations) else np.zeros(1)
-    return SolverFigures(
+    return SolverStats(
         method,
         solver,
         len(seconds),
@@ -66,12 +66,12 @@ def figures_of(
     )
 
 
-def with_figures(result: Result, figures: SolverFigures) -> Result:
+def with_stats(result: Result, figures: SolverStats) -> Result:
     """Return the result with the figures in its provenance, which files keep."""
     return result.with_provenance(**{_KEY: json.dumps(figures._asdict())})
 
 
-def solver_figures(result: Result) -> SolverFigures | None:
+def solver_stats(result: Result) -> SolverStats | None:
     """Return what solving took, or None where the inputs came from laws."""
     text = result.provenance.get(_KEY)
-    return None if text is None else SolverFigures(**json.loads(text))
+    return None if text is None else SolverStats(**json.loads(text))

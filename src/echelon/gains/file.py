@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from echelon.certificates.certificate import Certificate, Region
+from echelon.certificates.certificate import Certificate, RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError, OutputError
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix, PathLike
+from echelon.core.types import Array, PathLike
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
@@ -99,7 +99,7 @@ def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _region_as_mapping(region: Region) -> dict[str, Any]:
+def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
     domain = region.domain
     return {
         "kind": region.kind,
@@ -113,18 +113,18 @@ def _region_as_mapping(region: Region) -> dict[str, Any]:
     }
 
 
-def _finite(bounds: Matrix) -> list[float | None]:
+def _finite(bounds: Array) -> list[float | None]:
     return [x if np.isfinite(x) else None for x in bounds.tolist()]
 
 
-def _packed(matrices: Matrix) -> dict[str, Any]:
+def _packed(matrices: Array) -> dict[str, Any]:
     """Return many matrices as one, and what of it changes: most entries are the same in all."""
     places = np.argwhere((matrices != matrices[0]).any(axis=0))
     values = matrices[:, places[:, 0], places[:, 1]]
     return {"base": matrices[0].tolist(), "places": places.tolist(), "values": values.tolist()}
 
 
-def _unpacked(told: Mapping[str, Any]) -> Matrix:
+def _unpacked(told: Mapping[str, Any]) -> Array:
     values, places = np.array(told["values"], float), np.array(told["places"], int).reshape(-1, 2)
     matrices = np.repeat(np.array(told["base"], float)[None], len(values), axis=0)
     matrices[:, places[:, 0], places[:, 1]] = values
@@ -192,11 +192,11 @@ def _gain(told: Mapping[str, Any]) -> Gain:
     )
 
 
-def _region(told: Mapping[str, Any]) -> Region:
+def _region(told: Mapping[str, Any]) -> RegionCertificate:
     bounds = [
         [end if x is None else x for x in told["domain"][name]] for name, end in _ENDS.items()
     ]
-    return Region(
+    return RegionCertificate(
         kind=told["kind"],
         rate=told["rate"],
         theorem=told["theorem"],

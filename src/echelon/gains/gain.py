@@ -4,8 +4,6 @@ It carries the certificate that says what it promises.
 """
 
 import abc
-from collections.abc import Sequence
-from typing import TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,11 +11,12 @@ import numpy as np
 
 from echelon.certificates.certificate import Certificate
 from echelon.core.errors import GainError
-from echelon.core.types import Input, Matrix, State
+from echelon.core.linear import check_definite
+from echelon.core.numerics import precision
+from echelon.core.types import Array, Input, State
+from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-
-Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Matrix
 
 
 class Gain(eqx.Module):
@@ -35,22 +34,22 @@ class Gain(eqx.Module):
         GainError: P or R is not symmetric positive definite, or c is not positive.
     """
 
-    P: Matrix
-    R: Matrix
+    P: Array
+    R: Array
     coupling: float
     method: str = eqx.field(static=True)
     certificate: Certificate
-    R_inverse: Matrix
-    inner: Matrix | None
+    R_inverse: Array
+    inner: Array | None
 
     def __init__(
         self,
-        P: Matrix,
-        R: Matrix,
+        P: Array,
+        R: Array,
         coupling: float,
         method: str,
         certificate: Certificate,
-        inner: Matrix | None = None,
+        inner: Array | None = None,
     ) -> None:
         """Refuse P or R not symmetric positive definite, and a coupling that is not positive."""
         check_definite("P", P)
@@ -89,46 +88,18 @@ def check_coupling(coupling: float) -> None:
         raise GainError(f"`coupling` is {coupling}, and must be positive and finite.")
 
 
-def check_definite(name: str, matrix: np.ndarray) -> None:
-    """Check that a matrix is finite, symmetric (to 1e-9 of its size) and positive definite.
+def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
+    """Return the gain of the consensus law for agents `model` on `graph`, with its certificate.
+
+    The computation is in float64.
 
     Raises:
-        GainError: it is not.
+        ModelError: the model is malformed.
+        GainError: the method does not apply, with the reason.
     """
-    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise GainError(f"`{name}` has shape {matrix.shape}, and must be square.")
-    if not np.isfinite(matrix).all():
-        raise GainError(f"`{name}` holds a number that is not finite.")
-    gap = np.abs(matrix - matrix.T)
-    if gap.max() > 1e-9 * np.abs(matrix).max():
-        i, j = np.unravel_index(np.argmax(gap), gap.shape)
-        raise GainError(
-            f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} "
-            f"and entry [{j}, {i}] is {matrix[j, i]:.6g}."
-        )
-    least = float(np.linalg.eigvalsh(matrix)[0])
-    if least <= 0.0:
-        raise GainError(
-            f"`{name}` is not positive definite: its smallest eigenvalue is {least:.6g}."
-        )
-
-
-def as_matrix(name: str, value: Weight, size: int) -> Matrix:
-    """Return a weight as a square matrix; a plain list of numbers is a diagonal.
-
-    Raises:
-        GainError: it is neither `size` numbers nor a `size` x `size` matrix.
-    """
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise GainError(
-            f"`{name}` is {value}, and must be {size} numbers or {size} x {size}."
-        ) from None
-    if array.shape == (size,):
-        array = np.diag(array)
-    if array.shape != (size, size):
-        raise GainError(
-            f"`{name}` has shape {array.shape}, and must be {size} numbers or {size} x {size}."
-        )
-    return array
+    if not isinstance(method, Method):
+        got = f"the class `{method.__name__}`" if isinstance(method, type) else f"{method!r}"
+        raise GainError(f"`method` is {got}, and must be a gain method such as `Riccati()`.")
+    with precision("float64"):
+        check_model(model)
+        return method.solve(model, graph)

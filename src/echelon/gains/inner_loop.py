@@ -8,9 +8,9 @@ import scipy.linalg
 
 from echelon.certificates.certificate import certify
 from echelon.core.errors import GainError, listing
-from echelon.core.numerics import riccati
-from echelon.core.types import Matrix
-from echelon.gains.gain import Gain, Method, as_matrix, check_coupling
+from echelon.core.linear import as_matrix, riccati
+from echelon.core.types import Array
+from echelon.gains.gain import Gain, Method, check_coupling
 from echelon.gains.riccati import Riccati
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
@@ -61,7 +61,7 @@ class InnerLoop(Method):
         certificate = certify(closed, graph, P, R, self.coupling, edge=0.0)
         return Gain(P, R, self.coupling, "inner-loop", certificate, inner=K)
 
-    def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Matrix:
+    def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
         """Return K (m, n), zero in the columns of the symmetric states."""
         if self.base is None and model.damping is not None:
             return np.asarray(model.damping, float)
@@ -72,7 +72,7 @@ class InnerLoop(Method):
         K[:, free] = np.linalg.solve(R, B.T @ riccati(A, B, Q[np.ix_(free, free)], R))
         return K
 
-    def _base_weights(self, model: ControlAffine) -> tuple[Matrix, Matrix]:
+    def _base_weights(self, model: ControlAffine) -> tuple[Array, Array]:
         base = Riccati() if self.base is None else self.base
         Q = model.weights[0] if base.Q is None else base.Q
         R = model.weights[1] if base.R is None else base.R
@@ -81,7 +81,7 @@ class InnerLoop(Method):
             as_matrix("R", R, len(model.input_names)),
         )
 
-    def _weights(self, model: ControlAffine, count: int) -> Matrix:
+    def _weights(self, model: ControlAffine, count: int) -> Array:
         """Return the weights of the symmetric states, (count,)."""
         given = model.symmetry_weights if self.symmetry_weight is None else self.symmetry_weight
         weights = np.broadcast_to(np.asarray(1.0 if given is None else given, float), (count,))
@@ -113,7 +113,7 @@ def _others(model: ControlAffine, fixed: list[int]) -> list[int]:
     return [k for k in range(len(model.state_names)) if k not in fixed]
 
 
-def _monotone(model: ControlAffine, A: Matrix, fixed: list[int], weights: Matrix) -> Matrix:
+def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) -> Array:
     """Return P = T^-T diag(weights, P_s) T^-1, with P_s from a Lyapunov equation.
 
     T^-1 takes the symmetric states to coordinates that stand still when the rest decays.

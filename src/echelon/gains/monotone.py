@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from echelon.certificates.certificate import Region, certify
+from echelon.certificates.certificate import RegionCertificate, certify
 from echelon.certificates.domain import Bound, Domain
 from echelon.certificates.jacobians import has_constant_input_map, jacobians
 from echelon.certificates.lmi import monotone
@@ -45,7 +45,7 @@ class Monotone(Method):
         if reach is not None and not has_constant_input_map(model, domain):
             # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
             reach *= float(np.sqrt(np.divide(*graph.grounded_spectrum()[[0, -1]])))
-        region = Region(
+        region = RegionCertificate(
             kind=found.kind,
             rate=0.0,
             theorem="A5",

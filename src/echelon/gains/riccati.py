@@ -4,8 +4,15 @@ import numpy as np
 
 from echelon.certificates.certificate import certify
 from echelon.core.errors import GainError
-from echelon.core.numerics import in_words, riccati, uncontrollable_modes
-from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
+from echelon.core.linear import (
+    Weight,
+    as_matrix,
+    check_definite,
+    in_words,
+    riccati,
+    uncontrollable_modes,
+)
+from echelon.gains.gain import Gain, Method, check_coupling
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph

@@ -6,7 +6,8 @@ from echelon.certificates.certificate import certify
 from echelon.certificates.domain import Bound, Domain
 from echelon.certificates.lmi import robust_lqr
 from echelon.certificates.region import contracting_region, pairs_on, the_domain
-from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
+from echelon.core.linear import Weight, as_matrix, check_definite
+from echelon.gains.gain import Gain, Method, check_coupling
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph

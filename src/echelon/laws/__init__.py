@@ -3,8 +3,7 @@
 from echelon.laws.agreement import Agreement
 from echelon.laws.consensus import Consensus
 from echelon.laws.law import Law, LocalView
-from echelon.laws.passive import Passive
 from echelon.laws.tracking import Tracking
-from echelon.optimal.leader import OptimalTracking
+from echelon.laws.trim_input import TrimInput
 
-__all__ = ["Agreement", "Consensus", "Law", "LocalView", "OptimalTracking", "Passive", "Tracking"]
+__all__ = ["Agreement", "Consensus", "Law", "LocalView", "TrimInput", "Tracking"]

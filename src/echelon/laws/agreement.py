@@ -3,7 +3,7 @@
 import numpy as np
 
 from echelon.core.errors import LawError
-from echelon.core.types import Input, Matrix
+from echelon.core.types import Array, Input
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.integrator import SingleIntegrator
 from echelon.models.model import ControlAffine
@@ -18,11 +18,11 @@ class Agreement(Law):
     """
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def information(self) -> tuple[str, ...]:
         """Neighbours' states."""
         return ("neighbours' states",)
 
-    def metric(self, model: ControlAffine) -> Matrix:
+    def metric(self, model: ControlAffine) -> Array:
         """Return the identity."""
         return np.eye(len(model.state_names))
 

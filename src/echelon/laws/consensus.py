@@ -1,16 +1,15 @@
 """The paper's follower law, with the coupling, input weight and feed-forward that make it work."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from echelon.certificates.margins import ClosedLoop, string_gain
-from echelon.core.errors import GainError, LawError, did_you_mean, listing
-from echelon.core.types import Input, Matrix, State
+from echelon.core.errors import LawError, did_you_mean, listing
+from echelon.core.types import Array, Input, State
 from echelon.gains.gain import Gain
+from echelon.gains.strings import string_growth
 from echelon.laws.law import Feedforward, Law, LocalView, Memory, check_gain_fits
-from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
@@ -56,15 +55,11 @@ class Consensus(Law):
             )
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def information(self) -> tuple[str, ...]:
         """Neighbours' states, and what is fed forward."""
         return ("neighbours' states", *_TOLD[self.feedforward])
 
-    def asks(self) -> Feedforward:
-        """Return the chosen feed-forward."""
-        return self.feedforward
-
-    def metric(self, model: ControlAffine) -> Matrix:
+    def metric(self, model: ControlAffine) -> Array:
         """Return the gain's P."""
         return self.gain.P
 
@@ -77,7 +72,7 @@ class Consensus(Law):
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Tell by how much a branch amplifies, where the parent's input is fed forward."""
-        return _string_growth(self.gain, model, graph) if self.feedforward == "parent" else ()
+        return string_growth(self.gain, model, graph) if self.feedforward == "parent" else ()
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
@@ -87,7 +82,7 @@ class Consensus(Law):
         v = told - feedback(self.gain, model, view.x, view.disagreement)
         return model.physical(v + self.gain.inner_loop(model, view.x), trim=self.trim), memory
 
-    def message(self, model: ControlAffine, x: State, v: Input) -> Float[Array, " k"]:
+    def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return the input beyond the inner loop, v - kappa(x), or the velocity that it makes."""
         beyond = v - self.gain.inner_loop(model, x)
         if self.feedforward == "relay-velocity":
@@ -104,37 +99,6 @@ def _matching(gain: Gain, model: ControlAffine, x: State, velocity: State) -> In
     G = model.normalized_input_map(x)
     weighted = G.T @ jnp.asarray(gain.P, x.dtype)
     return jnp.linalg.solve(weighted @ G, weighted @ velocity)
-
-
-def _string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
-    """Return a sentence on ||T||_inf along the branch that amplifies most (theory page, T4)."""
-    linear = linearize(model)
-    A = linear.A if gain.inner is None else linear.A - linear.B @ gain.inner
-    depth, parents = graph.depths(), graph.parents()
-    i, j = graph.edges.T
-    weight = np.ones(graph.agents)
-    weight[np.where(depth[i] > depth[j], i, j)] = graph.weights
-    used = np.unique(weight[list(graph.followers)])
-    try:
-        gains = [
-            string_gain(ClosedLoop(A, linear.B, gain.P, gain.R, gain.coupling * w, used)).gain
-            for w in used
-        ]
-    except GainError:
-        return (
-            f"with the parent's input fed forward, coupling {gain.coupling:.4g} times an edge's "
-            f"weight, {used[0]:.4g}, is too weak: a mode of the formation does not decay.",
-        )
-    growth = np.ones(graph.agents)
-    for agent in np.argsort(depth, kind="stable"):
-        if depth[agent]:
-            growth[agent] = growth[parents[agent]] * gains[np.searchsorted(used, weight[agent])]
-    worst = int(growth.argmax())
-    return (
-        "with the parent's input fed forward, each agent of a branch amplifies a push by up to "
-        f"||T|| = {max(gains):.3g}, and the {depth[worst]} agents up from agent {worst} by up to "
-        f"{growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
-    )
 
 
 def feedback(gain: Gain, model: ControlAffine, x: State, error: State) -> Input:

@@ -1,16 +1,17 @@
 """The interface of a control law, and all that one agent may know when it runs one."""
 
 import abc
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from echelon.core.errors import LawError
-from echelon.core.types import Input, Matrix, Scalar, State
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.gains.gain import Gain
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
@@ -27,34 +28,33 @@ class LocalView(NamedTuple):
         offset: own goal offset xi (n,).
         disagreement: z = e + d (n,), from what the neighbours said.
         feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
-            unless the law's `message` says otherwise.
+            unless the law's `broadcast` says otherwise.
     """
 
     t: Scalar
     x: State
     offset: State
     disagreement: State
-    feedforward: Float[Array, " k"]
+    feedforward: Float[jax.Array, " k"]
 
 
 class Law(eqx.Module):
     """A control law: a pure function of what one agent knows.
 
     It is the same for one agent in its own process and for a million in a batch.
+
+    Attributes:
+        feedforward: which feed-forward the law asks for. `none`; `relay` or `relay-velocity`: its
+            leader's broadcast of the same step; `parent`: that of its parent, the one neighbour
+            nearer to a leader.
     """
 
+    feedforward: ClassVar[Feedforward] = "none"
+
     @property
-    def needs(self) -> tuple[str, ...]:
+    def information(self) -> tuple[str, ...]:
         """What the law must be told by others, in words."""
         return ()
-
-    def asks(self) -> Feedforward:
-        """Return which feed-forward the law asks for.
-
-        `none`; `relay` or `relay-velocity`: its leader's message of the same step; `parent`: that
-        of its parent, the one neighbour nearer to a leader.
-        """
-        return "none"
 
     def start(self, model: ControlAffine) -> State:
         """Return the state (n,) in which a leader under this law begins, the trim by default."""
@@ -64,7 +64,7 @@ class Law(eqx.Module):
         """Return the states (T, n) that the law follows, or None where it follows nothing."""
         return None
 
-    def metric(self, model: ControlAffine) -> Matrix | None:
+    def metric(self, model: ControlAffine) -> Array | None:
         """Return P (n, n) of the paper's Lyapunov function for this law; None if it has none."""
         return None
 
@@ -82,7 +82,7 @@ class Law(eqx.Module):
         """Return one agent's memory before the first step; none unless replaced."""
         return None
 
-    def message(self, model: ControlAffine, x: State, v: Input) -> Float[Array, " k"]:
+    def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return what followers under this law are told of an agent at x with normalized input v.
 
         The input itself unless replaced: a law with an inner loop of its own asks for what is
@@ -117,3 +117,24 @@ def check_gain_fits(
             f"the gain of `{type(law).__name__}` has P {P_shape} and R {R_shape}, "
             f"and `{type(model).__name__}` needs P {(n, n)} and R {(m, m)}."
         )
+
+
+def gain_of(law: Law) -> Gain | None:
+    """Return the gain that a law runs with, where it has one."""
+    gain = getattr(law, "gain", None)
+    return gain if isinstance(gain, Gain) else None
+
+
+def without_certificates(law: Law) -> Law:
+    """Return a law whose gains carry no certificate and a traced coupling.
+
+    So another coupling or another graph of the same size compiles nothing again.
+    """
+
+    def lean(node: Any) -> Any:
+        if not isinstance(node, Gain):
+            return node
+        parts = (np.asarray(node.coupling), None)
+        return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
+
+    return jax.tree.map(lean, law, is_leaf=lambda node: isinstance(node, Gain))

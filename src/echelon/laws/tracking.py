@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import LawError, ReferenceError, listing
+from echelon.core.errors import LawError, ReferenceError
 from echelon.core.types import Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
@@ -16,7 +16,8 @@ from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-from echelon.references.reference import COORDINATES, Reference
+from echelon.references.flatness import check_flat
+from echelon.references.reference import Reference
 
 
 class Tracking(Law):
@@ -36,13 +37,13 @@ class Tracking(Law):
     reaction: Gain | None = None
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def information(self) -> tuple[str, ...]:
         """The reference; neighbours' states when the leader reacts."""
         return ("the reference", *(("neighbours' states",) if self.reaction is not None else ()))
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
         """Complete the gain, and check that the model can follow a reference."""
-        _check_flat(model)
+        check_flat(model)
         gain = Riccati(coupling=1.0).solve(model, graph) if self.gain is None else self.gain
         for each in (gain, self.reaction):
             if each is not None:
@@ -78,21 +79,6 @@ class Tracking(Law):
         if self.reaction is not None:
             v = v + feedback(self.reaction, model, view.x, view.disagreement)
         return u - model.physical(v, trim=False), memory
-
-
-def _check_flat(model: ControlAffine) -> None:
-    if not model.flat_outputs:
-        raise LawError(
-            f"the law `tracking` cannot lead `{type(model).__name__}`, "
-            "which defines no `flat` map; "
-            "use `passive`, or add `flat_outputs`, `flat_order` and `flat` to the model."
-        )
-    unknown = [name for name in model.flat_outputs if name not in COORDINATES]
-    if unknown:
-        raise LawError(
-            f"`flat_outputs` of `{type(model).__name__}` names {listing(unknown)}, "
-            f"and a reference gives {listing(COORDINATES)}."
-        )
 
 
 @eqx.filter_jit

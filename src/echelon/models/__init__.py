@@ -2,7 +2,7 @@
 
 from echelon.models.integrator import DoubleIntegrator, SingleIntegrator
 from echelon.models.linear import Linear
-from echelon.models.model import ControlAffine
+from echelon.models.model import ControlAffine, Limits
 from echelon.models.pendulum import Pendulum
 from echelon.models.planar_quadrotor import PlanarQuadrotor
 from echelon.models.quadrotor import Quadrotor
@@ -14,6 +14,7 @@ from echelon.models.van_der_pol import VanDerPol
 __all__ = [
     "ControlAffine",
     "DoubleIntegrator",
+    "Limits",
     "Linear",
     "Pendulum",
     "PlanarQuadrotor",

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import ModelError
-from echelon.core.types import InputMap, Matrix, Output, State
+from echelon.core.types import Array, InputMap, Output, State
 from echelon.models.model import ControlAffine
 
 
@@ -24,16 +24,16 @@ class Linear(ControlAffine):
         ModelError: the matrices do not fit together or hold a non-finite number.
     """
 
-    A: Matrix
-    B: Matrix
-    C: Matrix
+    A: Array
+    B: Array
+    C: Array
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
-        A: Sequence[Sequence[float]] | Matrix,
-        B: Sequence[Sequence[float]] | Matrix,
-        C: Sequence[Sequence[float]] | Matrix | None = None,
+        A: Sequence[Sequence[float]] | Array,
+        B: Sequence[Sequence[float]] | Array,
+        C: Sequence[Sequence[float]] | Array | None = None,
         names: Sequence[str] = (),
     ) -> None:
         """Check and keep the matrices as float64."""
@@ -81,7 +81,7 @@ class Linear(ControlAffine):
         return jnp.asarray(self.C, x.dtype) @ x
 
 
-def _matrix(name: str, value: Sequence[Sequence[float]] | Matrix) -> Matrix:
+def _matrix(name: str, value: Sequence[Sequence[float]] | Array) -> Array:
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

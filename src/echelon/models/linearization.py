@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.types import Matrix, State
+from echelon.core.types import Array, State
 from echelon.models.model import ControlAffine
 
 
 class Linearization(NamedTuple):
     """A (n, n) and B (n, m) of the deviation from the trim, float64."""
 
-    A: Matrix
-    B: Matrix
+    A: Array
+    B: Array
 
 
 def linearize(model: ControlAffine) -> Linearization:
@@ -30,7 +30,7 @@ def _slopes(model: ControlAffine, x: State) -> tuple[jax.Array, jax.Array]:
     return jax.jacfwd(model.normalized_drift)(x), model.normalized_input_map(x)
 
 
-def trim_slopes(model: ControlAffine) -> Matrix:
+def trim_slopes(model: ControlAffine) -> Array:
     """Return u*_k dg_k/dx at the trim, (m, n, n): what each trim input puts into A."""
     x = jnp.asarray(np.asarray(model.trim[0], float))
     u = np.asarray(model.trim[1], np.float64)

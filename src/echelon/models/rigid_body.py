@@ -3,11 +3,17 @@
 Body to world is Rz(yaw) Ry(pitch) Rx(roll).
 """
 
+from typing import TypeAlias
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from echelon.core.errors import ModelError
+from echelon.core.types import Scalar
 from echelon.models.model import positive
+
+Vector: TypeAlias = Float[jax.Array, " 3"]
 
 
 def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
@@ -41,19 +47,19 @@ def check_inertia(inertia: tuple[float, float, float]) -> None:
             )
 
 
-def free_spin(inertia: tuple[float, float, float], omega: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def free_spin(inertia: tuple[float, float, float], omega: Vector) -> Vector:
     """Return -J^-1 (omega x J omega), the angular acceleration without torque."""
     J = jnp.asarray(inertia, omega.dtype)
     return -jnp.cross(omega, J * omega) / J
 
 
-def thrust_axis(zeta: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def thrust_axis(zeta: Vector) -> Vector:
     """Return the body z axis in the world frame, R e3."""
     (sr, sp, sy), (cr, cp, cy) = jnp.sin(zeta), jnp.cos(zeta)
     return jnp.stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
 
 
-def euler_rates(zeta: Float[Array, " 3"], omega: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def euler_rates(zeta: Vector, omega: Vector) -> Vector:
     """Return zetadot = W(zeta) omega (rad/s) from the body rate; singular at pitch +-90 deg."""
     sr, cr = jnp.sin(zeta[0]), jnp.cos(zeta[0])
     p, q, r = omega
@@ -61,14 +67,14 @@ def euler_rates(zeta: Float[Array, " 3"], omega: Float[Array, " 3"]) -> Float[Ar
     return jnp.stack([p + jnp.sin(zeta[1]) * turn, cr * q - sr * r, turn])
 
 
-def body_rates(zeta: Float[Array, " 3"], zeta_dot: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def body_rates(zeta: Vector, zeta_dot: Vector) -> Vector:
     """Return the body rate omega = W(zeta)^-1 zetadot, rad/s."""
     (sr, sp), (cr, cp) = jnp.sin(zeta[:2]), jnp.cos(zeta[:2])
     roll, pitch, yaw = zeta_dot
     return jnp.stack([roll - sp * yaw, cr * pitch + sr * cp * yaw, cr * cp * yaw - sr * pitch])
 
 
-def tilt_towards(direction: Float[Array, " 3"], yaw: Float[Array, ""]) -> Float[Array, " 3"]:
+def tilt_towards(direction: Vector, yaw: Scalar) -> Vector:
     """Return the angles zeta with the given yaw whose thrust axis points along `direction`.
 
     The length of `direction` does not matter.

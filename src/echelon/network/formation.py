@@ -14,7 +14,7 @@ import numpy as np
 
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix, State, States
+from echelon.core.types import Array, State, States
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
@@ -34,7 +34,7 @@ class Formation:
         FormationError: the offsets are no finite matrix.
     """
 
-    def __init__(self, offsets: Sequence[Sequence[float]] | Matrix) -> None:
+    def __init__(self, offsets: Sequence[Sequence[float]] | Array) -> None:
         """Keep the offsets, read-only."""
         self.offsets = np.array(offsets, dtype=np.float64)
         if self.offsets.ndim != 2 or not np.isfinite(self.offsets).all():
@@ -140,20 +140,20 @@ class Formation:
         full[:, axes[:used]] = spacing * plan[:, :used]
         return cls(full)
 
-    def displacement(self, i: int, j: int) -> Matrix:
+    def displacement(self, i: int, j: int) -> Array:
         """Return d_ij = xi_j - xi_i (paper, Definition 3)."""
         return self.offsets[j] - self.offsets[i]
 
-    def distances(self, graph: Graph) -> Matrix:
+    def distances(self, graph: Graph) -> Array:
         """Return delta_ij = |d_ij| for each edge, (E,)."""
         i, j = graph.edges.T
         return np.linalg.norm(self.offsets[j] - self.offsets[i], axis=1)
 
-    def local_displacements(self, graph: Graph) -> Matrix:
+    def local_displacements(self, graph: Graph) -> Array:
         """Return d_i = sum_j A_ij d_ij for each agent, (N, n), so that z = e + d."""
         return -(graph.laplacian() @ self.offsets)
 
-    def rigidity_matrix(self, model: ControlAffine, graph: Graph) -> Matrix:
+    def rigidity_matrix(self, model: ControlAffine, graph: Graph) -> Array:
         """Return the rigidity matrix (E, N dim).
 
         The row of edge (i, j) has (p_i - p_j)^T in block i and its negative in block j.

@@ -6,16 +6,22 @@ It is undirected, weighted or not, with one or more leaders.
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
 
 from echelon.core.errors import GraphError
-from echelon.core.types import Matrix, States
+from echelon.core.types import Array, States
+from echelon.network.edges import (
+    _some,
+    check_at_least,
+    check_edges,
+    check_leaders,
+    count_agents,
+    split_weights,
+)
+from echelon.network.exchange import Exchange
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -47,15 +53,15 @@ class Graph:
         agents: int | None = None,
     ) -> None:
         """Check and keep the graph; an edge is (i, j) or (i, j, weight)."""
-        pairs, weights = _split(edges)
-        self.agents = _count_agents(pairs, agents)
-        self.edges, self.weights = _checked_edges(pairs, weights, self.agents)
-        self.leaders = _checked_leaders(leaders, self.agents)
+        pairs, weights = split_weights(edges)
+        self.agents = count_agents(pairs, agents)
+        self.edges, self.weights = check_edges(pairs, weights, self.agents)
+        self.leaders = check_leaders(leaders, self.agents)
         self.followers = tuple(np.setdiff1d(np.arange(self.agents), self.leaders).tolist())
         if not self.followers:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         self._check_connected()
-        self._spectrum: Matrix | None = None
+        self._spectrum: Array | None = None
         for array in (self.edges, self.weights):
             array.setflags(write=False)
 
@@ -91,34 +97,45 @@ class Graph:
         edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
         return cls(edges, leaders, len(graph))
 
+    def with_leaders(self, more: Iterable[int]) -> "Graph":
+        """Return the same graph with more leaders."""
+        return Graph(self._triples(), [*self.leaders, *more], self.agents)
+
+    def with_edges(self, more: Iterable[Sequence[float]]) -> "Graph":
+        """Return the same graph with more edges."""
+        return Graph([*self._triples(), *more], self.leaders, self.agents)
+
+    def _triples(self) -> list[list[float]]:
+        return np.column_stack([self.edges, self.weights]).tolist()
+
     @classmethod
     def path(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the line 0 - 1 - ... - (agents - 1)."""
-        _at_least(agents, 2, "path")
+        check_at_least(agents, 2, "path")
         return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents)
 
     @classmethod
     def ring(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the closed line."""
-        _at_least(agents, 3, "ring")
+        check_at_least(agents, 3, "ring")
         return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents)
 
     @classmethod
     def star(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the star with agent 0 in the middle."""
-        _at_least(agents, 2, "star")
+        check_at_least(agents, 2, "star")
         return cls([(0, i) for i in range(1, agents)], leaders, agents)
 
     @classmethod
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the graph with every edge."""
-        _at_least(agents, 2, "complete")
+        check_at_least(agents, 2, "complete")
         return cls(np.stack(np.triu_indices(agents, 1), axis=1), leaders, agents)
 
     @classmethod
     def grid(cls, rows: int, columns: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return rows x columns agents, numbered row by row, linked to the nearest four."""
-        _at_least(rows * columns, 2, "grid")
+        check_at_least(rows * columns, 2, "grid")
         number = np.arange(rows * columns).reshape(rows, columns)
         across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
         down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
@@ -135,7 +152,7 @@ class Graph:
         """
         from scipy.spatial import KDTree
 
-        _at_least(agents, 2, "geometric")
+        check_at_least(agents, 2, "geometric")
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
         pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
         return cls(pairs[np.lexsort(pairs.T[::-1])], leaders, agents)
@@ -159,11 +176,11 @@ class Graph:
         rows = np.asarray(self.followers)
         return sp.csr_array(self.laplacian()[rows][:, rows])
 
-    def inverse_grounded(self) -> Matrix:
+    def inverse_grounded(self) -> Array:
         """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
         return np.linalg.inv(self.grounded_laplacian().toarray())
 
-    def grounded_spectrum(self) -> Matrix:
+    def grounded_spectrum(self) -> Array:
         """Return the eigenvalues of the grounded Laplacian, ascending; computed once, read-only.
 
         All of them up to 400 followers, beyond that the smallest and the largest.
@@ -202,7 +219,7 @@ class Graph:
             for i in order
         )
 
-    def depths(self) -> Matrix:
+    def depths(self) -> Array:
         """Return (N,) how many edges away each agent's nearest leader is."""
         among = {"indices": self.leaders, "unweighted": True, "min_only": True}
         return csgraph.dijkstra(self.adjacency(), **among).astype(int)
@@ -277,27 +294,7 @@ class Graph:
         raise GraphError(f"the graph is disconnected: {_some(apart)} no path to agent 0.")
 
 
-class Exchange(eqx.Module):
-    """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
-
-    The agents' own values and the values that they said are separate arguments, since on a real
-    network the second may be old or lost.
-    """
-
-    receivers: Matrix
-    senders: Matrix
-    weights: Matrix
-
-    def __call__(self, own: States, said: States) -> States:
-        """Return z (N, n), z_i = sum_j A_ij (own_i - said_j)."""
-        weights = jnp.asarray(self.weights, own.dtype)[:, None]
-        # Differences before sums: at consensus they vanish exactly, while sums of positions would
-        # leave rounding.
-        differences = weights * (own[self.receivers] - said[self.senders])
-        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
-
-
-def _extremes(L: sp.csr_array) -> Matrix:
+def _extremes(L: sp.csr_array) -> Array:
     """Return the smallest and the largest eigenvalue of a sparse positive definite matrix."""
     # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
     symmetric = {"SymmetricMode": True}
@@ -308,93 +305,12 @@ def _extremes(L: sp.csr_array) -> Matrix:
     return np.concatenate([smallest, largest])
 
 
-def _split(edges: Iterable[Sequence[float]]) -> tuple[Matrix, Matrix]:
-    """Return pairs (E, 2) of whole numbers and weights (E,)."""
-    if isinstance(edges, np.ndarray) and edges.ndim == 2 and edges.shape[1] == 2:
-        return _whole(edges, "an edge is"), np.ones(len(edges))
-    edges = [tuple(edge) for edge in edges]
-    for edge in edges:
-        if len(edge) not in (2, 3):
-            raise GraphError(f"an edge is {list(edge)}, and must be [i, j] or [i, j, weight].")
-    weights = np.array([edge[2] if len(edge) == 3 else 1.0 for edge in edges], dtype=np.float64)
-    return _whole([edge[:2] for edge in edges], "an edge is").reshape(-1, 2), weights
-
-
-def _whole(values: Sequence[Any] | Matrix, what: str) -> Matrix:
-    """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
-    if not _are_whole(values):
-        for value in values:
-            if not _are_whole(value):
-                shown = list(value) if isinstance(value, tuple) else value
-                raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
-    return np.array(values, dtype=np.float64).astype(np.int64)
-
-
-def _are_whole(values: object) -> bool:
-    try:
-        numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return False
-    return bool((numbers == np.round(numbers)).all() and np.isfinite(numbers).all())
-
-
-def _count_agents(pairs: Matrix, agents: int | None) -> int:
-    named = int(pairs.max(initial=0)) + 1
-    if agents is None:
-        agents = named
-    _at_least(agents, 2, "graph")
-    if named > agents:
-        raise GraphError(
-            f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}."
-        )
-    return agents
-
-
-def _checked_edges(pairs: Matrix, weights: Matrix, agents: int) -> tuple[Matrix, Matrix]:
-    """Return the edges with the smaller agent first, and their weights."""
-    edges = np.sort(pairs, axis=1)
-    for i, j in pairs[edges[:, 0] < 0][:1]:
-        raise GraphError(
-            f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
-        )
-    for i, j in edges[edges[:, 0] == edges[:, 1]][:1]:
-        raise GraphError(
-            f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents."
-        )
-    _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
-    for i, j in edges[np.sort(first[count > 1])][:1]:
-        raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
-    wrong = ~((weights > 0.0) & (weights < np.inf))
-    for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
-        raise GraphError(
-            f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive and finite."
-        )
-    return edges, weights
-
-
-def _checked_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
-    chosen = tuple(sorted(set(_whole(list(leaders), "a leader is").tolist())))
-    if not chosen:
-        raise GraphError("the graph has no leader; name at least one agent in `leaders`.")
-    for leader in chosen:
-        if not 0 <= leader < agents:
-            raise GraphError(
-                f"leader {leader} is no agent; agents are numbered from 0 to {agents - 1}."
-            )
-    return chosen
-
-
-def _at_least(agents: int, least: int, kind: str) -> None:
-    if agents < least:
-        raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
-
-
-def _some(agents: np.ndarray) -> str:
-    """Return a subject such as `agents 2, 3 have`, shortened when there are many."""
-    shown = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
-    return f"agent {shown} has" if len(agents) == 1 else f"agents {shown} have"
-
-
 def _leaders(graph: Graph) -> str:
     kind = "leader" if len(graph.leaders) == 1 else "leaders"
     return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"
+
+
+def shares(graph: Graph, agent: int, earlier: tuple[int, ...]) -> Array:
+    """Return what part each neighbour has in an agent's targets, by the edges' weights."""
+    weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
+    return weights / weights.sum()

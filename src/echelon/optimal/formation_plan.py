@@ -6,25 +6,15 @@ from typing import NamedTuple, final
 import numpy as np
 
 from echelon.core.errors import PlanError
-from echelon.core.types import Matrix
+from echelon.core.types import Array
+from echelon.models.inputs import normalized, physical
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.optimal.objectives import (
-    Grid,
-    Planning,
-    Targets,
-    coarse,
-    mean_targets,
-    normalized,
-    physical,
-    reference_targets,
-    shifted_targets,
-    spacing,
-    tracking,
-)
-from echelon.optimal.planner import Plan, Planner
+from echelon.network.graph import Graph, shares
+from echelon.optimal.objectives import Grid, TrackingOptions, coarse, spacing, tracking
 from echelon.optimal.problem import OptimalControl
+from echelon.optimal.solver import Solver, Trajectory
+from echelon.references.flatness import Targets, mean_targets, reference_targets, shifted_targets
 from echelon.references.reference import Reference
 
 _EASIER = (1e2, 1e4)
@@ -58,7 +48,7 @@ class FormationPlan(NamedTuple):
     """
 
     grid: Grid
-    plans: tuple[Plan, ...]
+    plans: tuple[Trajectory, ...]
     seconds: tuple[float, ...]
     iterations: tuple[int, ...]
     failures: int
@@ -69,11 +59,11 @@ def plan_formation(
     model: ControlAffine,
     graph: Graph,
     formation: Formation,
-    states: Matrix,
+    states: Array,
     grid: Grid,
     *,
     reference: Reference | None,
-    planning: Planning,
+    planning: TrackingOptions,
     limits: bool,
 ) -> FormationPlan:
     """Return the plans of all agents from their states (N, n), leaders first.
@@ -87,7 +77,7 @@ def plan_formation(
     """
     targets = reference_targets(model, reference, grid.times)
     desk = _Desk(model, planning, grid, limits)
-    plans: dict[int, Plan] = {}
+    plans: dict[int, Trajectory] = {}
     for agent, earlier in graph.outward():
         if not earlier:
             own = shifted_targets(model, targets, formation.offsets[agent])
@@ -113,12 +103,12 @@ def plan_formation(
 
 def plan_tracking(
     model: ControlAffine,
-    start: Matrix,
+    start: Array,
     targets: Targets,
     grid: Grid,
-    planning: Planning,
+    planning: TrackingOptions,
     limits: bool,
-) -> Plan:
+) -> Trajectory:
     """Return the plan of one agent that follows targets.
 
     Raises:
@@ -128,14 +118,12 @@ def plan_tracking(
     return _Desk(model, planning, grid, limits).follow(0, start, targets)
 
 
-def shares(graph: Graph, agent: int, earlier: tuple[int, ...]) -> Matrix:
-    """Return what part each neighbour has in an agent's targets, by the edges' weights."""
-    weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
-    return weights / weights.sum()
-
-
 def _beside(
-    model: ControlAffine, graph: Graph, formation: Formation, agent: int, plans: dict[int, Plan]
+    model: ControlAffine,
+    graph: Graph,
+    formation: Formation,
+    agent: int,
+    plans: dict[int, Trajectory],
 ) -> Targets:
     """Return the targets that the plans of earlier neighbours leave an agent."""
     states = np.stack([p.states - formation.displacement(agent, j) for j, p in plans.items()])
@@ -148,14 +136,16 @@ def _beside(
 class _Desk:
     """Solvers made ready once and used by all agents whose problems have the same form."""
 
-    def __init__(self, model: ControlAffine, planning: Planning, grid: Grid, limits: bool) -> None:
+    def __init__(
+        self, model: ControlAffine, planning: TrackingOptions, grid: Grid, limits: bool
+    ) -> None:
         self.model, self.planning, self.grid, self.limits = model, planning, grid, limits
         self.seconds: dict[int, float] = {}
         self.iterations: dict[int, int] = {}
         self.failures, self.setup_seconds = 0, 0.0
-        self._ready: dict[tuple[object, ...], tuple[Planner, Planner | None]] = {}
+        self._ready: dict[tuple[object, ...], tuple[Solver, Solver | None]] = {}
 
-    def follow(self, agent: int, start: Matrix, targets: Targets) -> Plan:
+    def follow(self, agent: int, start: Array, targets: Targets) -> Trajectory:
         """Return the plan of an agent that follows targets."""
         if ("targets",) not in self._ready:
             self._prepare(
@@ -170,11 +160,11 @@ class _Desk:
     def keep_apart(
         self,
         agent: int,
-        start: Matrix,
+        start: Array,
         targets: Targets,
-        places: list[Matrix],
-        wanted: list[Matrix],
-    ) -> Plan:
+        places: list[Array],
+        wanted: list[Array],
+    ) -> Trajectory:
         """Return the plan of an agent that keeps its distances from neighbours.
 
         Args:
@@ -204,18 +194,18 @@ class _Desk:
         began, solver = time.perf_counter(), self.planning.solver
         begun, resumed = (_PATIENCE, _PATIENCE | _RESUMED) if solver == "ipopt" else (None, None)
         finer = self.grid.hold > coarse(self.grid)
-        finely = Planner(second, solver, resumed) if finer else None
-        self._ready[key] = Planner(first, solver, begun), finely
+        finely = Solver(second, solver, resumed) if finer else None
+        self._ready[key] = Solver(first, solver, begun), finely
         self.setup_seconds += time.perf_counter() - began
 
     def _plan(
         self,
         agent: int,
         key: tuple[object, ...],
-        start: Matrix,
-        known: Matrix,
+        start: Array,
+        known: Array,
         targets: Targets,
-    ) -> Plan:
+    ) -> Trajectory:
         """Solve on coarse steps, which take most iterations, and go on from there on fine ones."""
         coarsely, finely = self._ready[key]
         self.seconds[agent], self.iterations[agent] = 0.0, 0
@@ -240,13 +230,13 @@ class _Desk:
     def _attempt(
         self,
         agent: int,
-        planner: Planner,
-        start: Matrix,
-        known: Matrix,
+        planner: Solver,
+        start: Array,
+        known: Array,
         targets: Targets,
-        guess: Plan | tuple[Matrix, Matrix],
+        guess: Trajectory | tuple[Array, Array],
         factor: float,
-    ) -> Plan:
+    ) -> Trajectory:
         weight = np.full((len(known), 1), factor * self.planning.input_weight)
         plan = planner.solve(start, np.hstack([known, targets.inputs, weight]), guess)
         self.seconds[agent] += plan.seconds

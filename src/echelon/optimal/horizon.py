@@ -16,7 +16,7 @@ import scipy.sparse
 
 from echelon.core.errors import PlanError, listing
 from echelon.core.numerics import precision, rk4
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.optimal.casadi import casadi, casadi_function
@@ -89,7 +89,7 @@ class MPC:
                     f"`{name}` is `{getattr(self, name)}`, allowed are {listing(allowed)}."
                 )
 
-    def weights(self, model: ControlAffine) -> tuple[Matrix, Matrix]:
+    def weights(self, model: ControlAffine) -> tuple[Array, Array]:
         """Return the diagonals of Q (n,) and R (m,).
 
         Raises:
@@ -105,14 +105,14 @@ class MPC:
         return Q, R
 
 
-def _shown(model: ControlAffine) -> Matrix:
+def _shown(model: ControlAffine) -> Array:
     """Tell which states the output depends on at the trim, (n,)."""
     with precision("float64"):
         slopes = jax.jacfwd(model.output)(jnp.asarray(np.asarray(model.trim[0], float)))
     return np.array(np.asarray(slopes).any(axis=0))
 
 
-def _weights(name: str, given: Any, count: int) -> Matrix:
+def _weights(name: str, given: Any, count: int) -> Array:
     try:
         weights = np.asarray(given, np.float64)
     except (TypeError, ValueError):
@@ -127,8 +127,8 @@ def _weights(name: str, given: Any, count: int) -> Matrix:
 class Course(NamedTuple):
     """States (N + 1, n) and normalized inputs (N, m) over a horizon."""
 
-    states: Matrix
-    inputs: Matrix
+    states: Array
+    inputs: Array
 
 
 class Answer(NamedTuple):
@@ -170,7 +170,7 @@ class Horizon:
         self._flow, self._matrix = _assembly(model, steps, dt, rows)
         self._solve = _program(ca, mpc, self._hessian, self._matrix.sparsity_out(0))
 
-    def solve(self, start: Matrix, targets: Course, near: Course) -> Answer:
+    def solve(self, start: Array, targets: Course, near: Course) -> Answer:
         """Return the plan from a start (n,), linearized along a course near it."""
         n, m, N = self.n, self.m, self.steps
         states = np.vstack([start, near.states[1:]])
@@ -197,18 +197,18 @@ class Horizon:
             return Answer(None, str(told["return_status"]))
         return Answer(Course(np.vstack([start, w[:, m:]]), w[:, :m]), "")
 
-    def shifted(self, course: Course, last: Matrix) -> Course:
+    def shifted(self, course: Course, last: Array) -> Course:
         """Return a course one step later, its new last input (m,) given."""
         end = np.array(self._flow(course.states[-1], last)).ravel()
         end = end if np.isfinite(end).all() else course.states[-1]
         return Course(np.vstack([course.states[1:], end]), np.vstack([course.inputs[1:], last]))
 
 
-def _interleaved(inputs: Matrix, states: Matrix) -> Matrix:
+def _interleaved(inputs: Array, states: Array) -> Array:
     return np.hstack([inputs, states]).ravel()
 
 
-def _cost_to_go(model: ControlAffine, Q: Matrix, R: Matrix, dt: float) -> Matrix:
+def _cost_to_go(model: ControlAffine, Q: Array, R: Array, dt: float) -> Array:
     """Return the cost matrix of the best linear feedback near the trim, on steps of dt."""
     A, B = linearize(model)
     n, m = B.shape
@@ -226,7 +226,7 @@ def _cost_to_go(model: ControlAffine, Q: Matrix, R: Matrix, dt: float) -> Matrix
         ) from error
 
 
-def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Matrix, Matrix, Matrix]:
+def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Array, Array, Array]:
     """Return low <= G v <= high on normalized inputs, each row divided by its size."""
     if not limits or model.input_limits is None:
         return np.zeros((0, len(model.input_names))), np.zeros(0), np.zeros(0)
@@ -237,7 +237,7 @@ def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Matrix, Matrix, Mat
     return rows / size[:, None], (low - held) / size, (high - held) / size
 
 
-def _assembly(model: ControlAffine, steps: int, dt: float, rows: Matrix) -> tuple[Any, Any]:
+def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple[Any, Any]:
     """Return the flow (x, v) -> x after dt, and what makes the equations along a course.
 
     The latter takes states (n, N) and inputs (m, N), and returns the matrix of the program and the

@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.core.errors import LawError
 from echelon.core.numerics import precision, rk4
-from echelon.core.types import Input, Matrix, Scalar, State
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import feedback
@@ -21,8 +21,8 @@ from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
-from echelon.optimal.objectives import Planning, grid, reference_targets
-from echelon.references.flatness import reference_warnings
+from echelon.optimal.objectives import TrackingOptions, grid
+from echelon.references.flatness import reference_targets, reference_warnings
 from echelon.references.reference import Reference
 
 _STEP = 0.005
@@ -49,12 +49,12 @@ class OptimalTracking(Law):
 
     reference: Reference
     gain: Gain | None
-    states: Matrix | None
-    inputs: Matrix | None
+    states: Array | None
+    inputs: Array | None
     horizon: float = eqx.field(static=True)
     start_error: tuple[tuple[str, float], ...] = eqx.field(static=True)
     limits: bool = eqx.field(static=True)
-    planning: Planning = eqx.field(static=True)
+    planning: TrackingOptions = eqx.field(static=True)
 
     def __init__(
         self,
@@ -62,17 +62,17 @@ class OptimalTracking(Law):
         horizon: float = 10.0,
         start_error: Mapping[str, float] | None = None,
         limits: bool = True,
-        planning: Planning | None = None,
+        planning: TrackingOptions | None = None,
         gain: Gain | None = None,
     ) -> None:
         """Keep the problem; `prepared` solves it."""
         self.reference, self.gain, self.states, self.inputs = reference, gain, None, None
         self.horizon, self.limits = horizon, limits
         self.start_error = tuple((start_error or {}).items())
-        self.planning = Planning() if planning is None else planning
+        self.planning = TrackingOptions() if planning is None else planning
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def information(self) -> tuple[str, ...]:
         """The whole reference."""
         return ("the reference, all of it before the start",)
 

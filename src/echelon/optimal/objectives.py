@@ -8,17 +8,14 @@ import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import PlanError, listing
-from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.optimal.problem import Constraint, OptimalControl, Stage
-from echelon.references.reference import COORDINATES, Reference
 
 SPECIFICATIONS = ("offset", "distance")
 _INSIDE = 0.9
@@ -29,7 +26,7 @@ _SUBSTEP = 0.025
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Planning:
+class TrackingOptions:
     """How the plans of a formation are posed.
 
     Args:
@@ -69,7 +66,7 @@ class Planning:
             # A law holds this, and JAX asks of it that it can be hashed.
             object.__setattr__(self, "output_weight", tuple(np.ravel(self.output_weight).tolist()))
 
-    def weights(self, model: ControlAffine) -> Matrix:
+    def weights(self, model: ControlAffine) -> Array:
         """Return the weights of the outputs, (q,).
 
         Raises:
@@ -102,7 +99,7 @@ class Grid(NamedTuple):
         return self.hold * self.dt
 
     @property
-    def times(self) -> Matrix:
+    def times(self) -> Array:
         """The ends of the intervals, (steps + 1,) s."""
         return self.interval * np.arange(self.steps + 1)
 
@@ -122,93 +119,11 @@ def grid(horizon: float, dt: float, interval: float) -> Grid:
     return Grid(-(-count // hold), hold, dt)
 
 
-class Targets(NamedTuple):
-    """What a plan follows at T times.
-
-    States (T, n) are a guess of the motion, outputs (T, q) are what counts, inputs (T, m) are
-    normalized.
-    """
-
-    states: Matrix
-    outputs: Matrix
-    inputs: Matrix
-
-
-def reference_targets(model: ControlAffine, reference: Reference | None, times: Matrix) -> Targets:
-    """Return what a leader follows: its reference by the model's flatness map, or its trim.
-
-    Raises:
-        PlanError: the model has no such map, or the reference is not finite.
-    """
-    if reference is None:
-        x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
-        return _targets(model, x, np.zeros((len(times), len(model.input_names))))
-    unknown = [name for name in model.flat_outputs if name not in COORDINATES]
-    if not model.flat_outputs or unknown:
-        raise PlanError(
-            f"`{type(model).__name__}` cannot be led along a reference: it needs `flat_outputs` "
-            f"out of {listing(COORDINATES)}, `flat_order` and `flat`."
-        )
-    with precision("float64"):
-        x, u = (np.asarray(part) for part in _flat(model, reference, jnp.asarray(times)))
-    if not (np.isfinite(x).all() and np.isfinite(u).all()):
-        raise PlanError(
-            f"the reference `{type(reference).__name__}` cannot be followed by "
-            f"`{type(model).__name__}`: its flat state and input are not finite."
-        )
-    return _targets(model, x, normalized(model, u))
-
-
-@eqx.filter_jit
-def _flat(
-    model: ControlAffine, reference: Reference, times: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    def at(t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
-
-    return jax.vmap(at)(times)
-
-
-def shifted_targets(model: ControlAffine, targets: Targets, offset: Matrix) -> Targets:
-    """Return the same targets an offset (n,) away."""
-    return _targets(model, targets.states + offset, targets.inputs)
-
-
-def mean_targets(model: ControlAffine, states: Matrix, inputs: Matrix, share: Matrix) -> Targets:
-    """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
-
-    A sum of squared errors to several targets is that to their mean and a constant.
-    """
-    return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
-
-
-def _targets(model: ControlAffine, x: Matrix, v: Matrix) -> Targets:
-    with precision("float64"):
-        outputs = np.asarray(_outputs(model, jnp.asarray(x)))
-    return Targets(x, outputs, v)
-
-
-@eqx.filter_jit
-def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
-    return jax.vmap(model.output)(states)
-
-
-def normalized(model: ControlAffine, u: Matrix) -> Matrix:
-    """Return the normalized inputs (..., m) of physical ones."""
-    deviation = np.asarray(u) - np.asarray(model.trim[1], float)
-    return deviation @ np.linalg.inv(np.asarray(model.input_scale, float)).T
-
-
-def physical(model: ControlAffine, v: Matrix) -> Matrix:
-    """Return the physical inputs (..., m) of normalized ones."""
-    return np.asarray(model.trim[1], float) + v @ np.asarray(model.input_scale, float).T
-
-
 # ---- problems ------------------------------------------------------------------------------------
 
 
 def tracking(
-    model: ControlAffine, planning: Planning, times: Grid, limits: bool, fine: bool
+    model: ControlAffine, planning: TrackingOptions, times: Grid, limits: bool, fine: bool
 ) -> OptimalControl:
     """Return the problem of an agent with targets.
 
@@ -230,7 +145,7 @@ def spacing(
     times: Grid,
     limits: bool,
     fine: bool,
-    distances: Matrix,
+    distances: Array,
 ) -> OptimalControl:
     """Return the problem of a follower with wanted distances (J,) from J neighbours.
 

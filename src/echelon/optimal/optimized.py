@@ -9,7 +9,7 @@ from echelon.core.errors import LawError
 from echelon.core.types import Input, State
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.model import ControlAffine
-from echelon.optimal.objectives import reference_targets
+from echelon.references.flatness import reference_targets
 from echelon.references.reference import Reference
 
 
@@ -25,7 +25,7 @@ class Optimized(Law):
     reference: Reference | None = None
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def information(self) -> tuple[str, ...]:
         """What the agents are told."""
         return self.told
 

@@ -7,17 +7,19 @@ from typing import final
 import numpy as np
 
 from echelon.core.numerics import Precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.engine.host import Flight, Progress, Stopped, fly, take_off
 from echelon.engine.initial import Initial
 from echelon.engine.result import Result, Settings
-from echelon.engine.work import figures_of, with_figures
+from echelon.engine.work import stats_of, with_stats
+from echelon.models.inputs import physical
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.optimal.formation_plan import plan_formation, shares
+from echelon.network.graph import Graph, shares
+from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.horizon import MPC, Answer, Course, Horizon
-from echelon.optimal.objectives import Planning, grid, physical, reference_targets
+from echelon.optimal.objectives import TrackingOptions, grid
+from echelon.references.flatness import reference_targets
 from echelon.references.reference import Reference
 from echelon.world.disturbance import Disturbance
 
@@ -31,7 +33,7 @@ def simulate_plans(
     formation: Formation,
     *,
     reference: Reference | None = None,
-    planning: Planning | None = None,
+    planning: TrackingOptions | None = None,
     initial: Initial = None,
     start_error: Mapping[str, float] | None = None,
     plant: ControlAffine | None = None,
@@ -58,7 +60,7 @@ def simulate_plans(
         EchelonError: a part is malformed, casadi is missing, or a plan misses a constraint (which,
             and by how much).
     """
-    planning = Planning() if planning is None else planning
+    planning = TrackingOptions() if planning is None else planning
     flight = take_off(
         model,
         graph,
@@ -90,7 +92,7 @@ def simulate_plans(
         progress=progress,
     )
     work = (made.seconds, made.iterations, made.failures, made.setup_seconds)
-    return with_figures(result, figures_of("optimization", planning.solver, *work))
+    return with_stats(result, stats_of("optimization", planning.solver, *work))
 
 
 def simulate_mpc(
@@ -117,7 +119,7 @@ def simulate_mpc(
 
     Every period the leaders plan first, then the followers outward, each given the plans that its
     neighbours before it have just made; each applies its first input. Computing takes no time in
-    the run; `solver_figures` says what it took.
+    the run; `solver_stats` says what it took.
 
     `reference` is what the leaders follow, without one they keep their trim, and `mpc` is the
     receding horizon. `limits` says whether the actuators' limits hold, in the plans and in the
@@ -148,7 +150,7 @@ def simulate_mpc(
         progress=progress,
     )
     work = (pilots.seconds, pilots.iterations, pilots.failures, pilots.setup_seconds)
-    return with_figures(result, figures_of("mpc", mpc.solver, *work))
+    return with_stats(result, stats_of("mpc", mpc.solver, *work))
 
 
 @final
@@ -174,7 +176,7 @@ class _Pilots:
         self.failures = 0
         self.setup_seconds = time.perf_counter() - began
 
-    def __call__(self, step: int, states: Matrix) -> Matrix:
+    def __call__(self, step: int, states: Array) -> Array:
         """Return the wanted inputs (N, m) of all agents, planned in the order of the graph.
 
         Raises:
@@ -188,7 +190,7 @@ class _Pilots:
             inputs[agent] = course.inputs[0]
         return physical(self.flight.model, inputs)
 
-    def _targets(self, agent: int, earlier: tuple[int, ...], share: Matrix, period: int) -> Course:
+    def _targets(self, agent: int, earlier: tuple[int, ...], share: Array, period: int) -> Course:
         """Return what an agent follows: the reference, or the mean of what its neighbours plan."""
         formation = self.flight.formation
         if not earlier:
@@ -202,7 +204,7 @@ class _Pilots:
             np.tensordot(share, np.stack([p.inputs for p in plans]), 1),
         )
 
-    def _course(self, agent: int, start: Matrix, targets: Course) -> Course:
+    def _course(self, agent: int, start: Array, targets: Course) -> Course:
         """Return an agent's plan, or its last one shifted where the solver fails."""
         began = time.perf_counter()
         last = self.courses.get(agent)

@@ -15,74 +15,14 @@ import numpy as np
 import scipy.linalg
 
 from echelon.core.errors import PlanError, listing
-from echelon.core.types import Input, InputMap, Matrix, Output, Scalar, State
-from echelon.models.model import ControlAffine, Limits, diagonal, positive
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.models.planar_quadrotor_linear import LinearPlanarQuadrotor
 from echelon.network.graph import Graph
-from echelon.optimal.planner import Plan, plan
 from echelon.optimal.problem import Constraint, OptimalControl
+from echelon.optimal.solver import Trajectory, solve
 
 TERMINALS = ("origin", "error", "none")
 SEPARATIONS = ("linear", "penalty", "constraint")
-
-
-class LinearPlanarQuadrotor(ControlAffine):
-    """yddot = -g roll, zddot = -g + u1 / m, rollddot = u2 / Ixx: hover's linearization.
-
-    The input u1 is the whole thrust, not its deviation from hover. Mass and inertia are the
-    Crazyflie's. The source prints neither; with these the published deviations come out.
-    """
-
-    mass: float = 0.028
-    inertia: float = 16.571710e-6
-    gravity: float = 9.81
-
-    state_names = ("y", "vy", "z", "vz", "roll", "roll_rate")
-    state_units = ("m", "m/s", "m", "m/s", "rad", "rad/s")
-    input_names = ("thrust", "torque")
-    input_units = ("N", "N m")
-    output_names = ("y", "z")
-    position = ("y", "z")
-    state_groups = {"position": ("y", "z"), "velocity": ("vy", "vz")}
-
-    def __check_init__(self) -> None:
-        """Refuse parameters that are not positive."""
-        positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)
-
-    @property
-    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Hover at the origin."""
-        return (0.0,) * 6, (self.mass * self.gravity, 0.0)
-
-    @property
-    def input_scale(self) -> tuple[tuple[float, ...], ...]:
-        """S = diag(m, Ixx)."""
-        return diagonal(self.mass, self.inertia)
-
-    @property
-    def input_limits(self) -> Limits:
-        """|u1| <= 1.2 m g and |u2| <= Ixx pi / 10, as printed."""
-        high = (1.2 * self.mass * self.gravity, self.inertia * float(np.pi) / 10.0)
-        return Limits(diagonal(1.0, 1.0), (-high[0], -high[1]), high)
-
-    def limit(self, u: Input) -> Input:
-        """Return the input clipped entry by entry."""
-        limits = self.input_limits
-        return jnp.clip(u, jnp.asarray(limits.low, u.dtype), jnp.asarray(limits.high, u.dtype))
-
-    def drift(self, x: State) -> State:
-        """Return f(x)."""
-        zero, fall = jnp.zeros((), x.dtype), jnp.asarray(-self.gravity, x.dtype)
-        return jnp.stack([x[1], -self.gravity * x[4], x[3], fall, x[5], zero])
-
-    def input_map(self, x: State) -> InputMap:
-        """Return g."""
-        g = np.zeros((6, 2))
-        g[3, 0], g[5, 1] = 1.0 / self.mass, 1.0 / self.inertia
-        return jnp.asarray(g, x.dtype)
-
-    def output(self, x: State) -> Output:
-        """Return y and z."""
-        return x[0:3:2]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +80,7 @@ class PlanarBaseline:
         return cls(**{"terminal": "error", "separation": "constraint", **changes})
 
     @property
-    def reference(self) -> Matrix:
+    def reference(self) -> Array:
         """The leader's reference states on the grid, (steps + 1, 6)."""
         speed = 2.0 * np.pi / self.horizon
         y = np.linspace(-np.pi, np.pi, self.steps + 1)
@@ -195,7 +135,7 @@ class PlanarBaseline:
             transcription="collocation",
         )
 
-    def plans(self, graph: Graph, offsets: Matrix) -> tuple[Plan, ...]:
+    def plans(self, graph: Graph, offsets: Array) -> tuple[Trajectory, ...]:
         """Return each agent's plan by IPOPT, planned outward from the leader.
 
         Args:
@@ -214,24 +154,24 @@ class PlanarBaseline:
             )
         starts = np.zeros((graph.agents, 6))
         starts[:, [0, 2]] = self.reference[0, [0, 2]] + offsets
-        plans: dict[int, Plan] = {}
+        plans: dict[int, Trajectory] = {}
         for agent, earlier in graph.outward():
             if not earlier:
-                plans[agent] = plan(self.leader(), starts[agent], self.reference)
+                plans[agent] = solve(self.leader(), starts[agent], self.reference)
                 continue
             first = plans[earlier[0]]
             known = np.hstack([plans[j].states for j in earlier])
             # Flying beside the first neighbour is the guess: it meets all that is asked but the
             # distances from others.
             guess = first.states + starts[agent] - starts[earlier[0]], first.inputs
-            plans[agent] = plan(self.follower(len(earlier)), starts[agent], known, guess=guess)
+            plans[agent] = solve(self.follower(len(earlier)), starts[agent], known, guess=guess)
         return tuple(plans[agent] for agent in range(graph.agents))
 
-    def tracking_rmse(self, states: Matrix) -> float:
+    def tracking_rmse(self, states: Array) -> float:
         """Return the root-mean-square distance of a leader's states (N, 6) from the reference."""
         return float(np.sqrt(((states - self.reference)[:, [0, 2]] ** 2).sum(axis=1).mean()))
 
-    def with_noise(self, plan: Plan, seed: int) -> Matrix:
+    def with_noise(self, plan: Trajectory, seed: int) -> Array:
         """Return the states (steps + 1, 6) of a plan flown open loop under the noise.
 
         The roll acceleration is drawn anew at each step and held over it. The agent is linear, so

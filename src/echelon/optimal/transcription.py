@@ -11,7 +11,7 @@ import numpy as np
 
 from echelon.core.errors import PlanError
 from echelon.core.numerics import rk4
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.optimal.casadi import casadi, casadi_function
 from echelon.optimal.problem import Constraint, OptimalControl
@@ -43,8 +43,8 @@ class Program(NamedTuple):
     """
 
     problem: dict[str, Any]
-    low: Matrix
-    high: Matrix
+    low: Array
+    high: Array
     rows: tuple[Row, ...]
 
 
@@ -164,7 +164,7 @@ def _scalar(name: str, function: Any) -> Any:
     return function
 
 
-def _rows(problem: OptimalControl) -> tuple[Matrix, Matrix, tuple[Row, ...]]:
+def _rows(problem: OptimalControl) -> tuple[Array, Array, tuple[Row, ...]]:
     """Return the bounds of g and what each row says, in the order of `transcribe`."""
     motion = [(0.0, 0.0, Row(f"motion of {name}")) for name in problem.model.state_names]
     begin = [(0.0, 0.0, Row(f"start of {name}")) for name in problem.model.state_names]

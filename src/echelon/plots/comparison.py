@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.engine.result import Result
 from echelon.plots import style as draw
 from echelon.results.metrics import SETTLED, formation_errors, output_errors
@@ -75,7 +75,7 @@ def _tracking_error(flown: _Flown) -> "Figure | None":
     return _over_time([(k, row) for k, row in flown if k in lines], lines, text)
 
 
-def _alike(flown: _Flown, lines: dict[int, Matrix]) -> dict[int, int]:
+def _alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
     """Return how many lines each stands for: laws that share a leader draw one over the other."""
     stands: dict[int, int] = {}
     for k, _ in flown:
@@ -84,7 +84,7 @@ def _alike(flown: _Flown, lines: dict[int, Matrix]) -> dict[int, int]:
     return stands
 
 
-def _over_time(flown: _Flown, lines: dict[int, Matrix], text: str) -> "Figure":
+def _over_time(flown: _Flown, lines: dict[int, Array], text: str) -> "Figure":
     """Return errors on a logarithmic axis, no lower than the rounding of a metre."""
     stands = _alike(flown, lines)
     longest = max((_result(row) for _, row in flown), key=lambda result: result.times[-1])

@@ -1,29 +1,25 @@
 """The pictures of `design`: the modes of a loop, and what is certified beside what is observed."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from echelon.core.errors import GainError, did_you_mean, listing
-from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.gains.gain import Gain
-from echelon.models.linearization import linearize
-from echelon.models.model import ControlAffine
 from echelon.plots import style as draw
 from echelon.promises.certified_set import certified_at_rest
 from echelon.promises.closed_loop import CheckedLoop
-from echelon.scenario.build import Parts
 from echelon.studies.basin import (
+    Radii,
     Slice,
     Trial,
+    chosen_slice,
     converged,
     grid,
     observed_radius,
+    prepare_trial,
     side_of,
-    slice_of,
-    trial,
 )
 
 if TYPE_CHECKING:
@@ -32,72 +28,6 @@ if TYPE_CHECKING:
 _MOST = 500
 _LOST, _HELD = "#F0C9A8", "#CFE3F1"  # pale, so that the sets' outlines stand out on them
 _CERTIFIED, _OBSERVED = draw.COLOURS[2], draw.COLOURS[0]
-
-
-class Radii(NamedTuple):
-    """Both radii of sum_i delta_i'P delta_i, for a leader at rest at the trim, and the slice.
-
-    `certified` is None where no set is; `observed` counts only starts of the slice, and `largest`
-    is where the trying ended.
-    """
-
-    states: tuple[str, str]
-    certified: float | None
-    observed: float
-    largest: float
-    horizon: float
-
-    def sentence(self) -> str:
-        """Say both, side by side."""
-        proved = "none, since no set is certified"
-        if self.certified is not None:
-            proved = "everywhere" if self.certified == np.inf else f"{self.certified:.3g}"
-        seen = f"{self.observed:.3g}" if self.observed < self.largest else "all that was tried,"
-        seen += "" if self.observed < self.largest else f" up to {self.largest:.3g}"
-        return (
-            f"Radius r of sum_i delta_i'P delta_i <= r^2, leader at rest: certified {proved}; "
-            f"observed {seen}, for starts in `{self.states[0]}` and `{self.states[1]}` alone, "
-            f"run for {self.horizon:.3g} s."
-        )
-
-
-def chosen_slice(model: ControlAffine, gain: Gain, asked: str | None) -> tuple[int, int]:
-    """Return the two states of a slice: those asked for, as `y,roll`, or a telling pair.
-
-    That is a velocity with the angle that drives it; where there is none, the first two coordinates
-    of the position, or the first two states.
-
-    Raises:
-        GainError: those asked for are not two different states of the model.
-    """
-    names = model.state_names
-    if asked is not None:
-        parts = [part.strip() for part in asked.split(",")]
-        for name in parts:
-            if name not in names:
-                raise GainError(
-                    f"`--slice` names `{name}`, and the states are {listing(names)}"
-                    f"{did_you_mean(name, names)}."
-                )
-        if len(set(parts)) != 2 or len(parts) != 2:
-            raise GainError(f"`--slice` is `{asked}`, and must be two states such as `y,roll`.")
-        return names.index(parts[0]), names.index(parts[1])
-    if len(names) < 2:
-        raise GainError(f"a slice needs two states, and `{type(model).__name__}` has one.")
-    return _telling(model, gain)
-
-
-def _telling(model: ControlAffine, gain: Gain) -> tuple[int, int]:
-    """Return a pair of states in which the loop is seen to work."""
-    groups = model.state_groups
-    if "velocity" in groups and "attitude" in groups:
-        moved, turned = model.states_called("velocity"), model.states_called("attitude")
-        with precision("float64"):
-            push = np.abs(linearize(model).A[np.ix_(moved, turned)])
-        row, column = np.unravel_index(int(push.argmax()), push.shape)
-        return moved[row], turned[column]
-    places = model.position_indices()
-    return (places[0], places[1]) if len(places) > 1 else (0, 1)
 
 
 def save_design_figures(
@@ -158,7 +88,7 @@ def _modes(loop: CheckedLoop) -> "Figure":
     return figure
 
 
-def _wide_axis(ax: Any, real: Matrix, imaginary: Matrix) -> None:
+def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
     """Use scales that show slow and fast poles alike, and end a little right of the axis."""
     from matplotlib.ticker import FuncFormatter
 
@@ -178,7 +108,7 @@ def _wide_axis(ax: Any, real: Matrix, imaginary: Matrix) -> None:
         ax.set_ylim(-1.0, 1.0)
 
 
-def _label_bar(bar: Any, values: Matrix) -> None:
+def _label_bar(bar: Any, values: Array) -> None:
     """Name each eigenvalue on the colour bar where they are few, else only powers of ten."""
     from matplotlib.ticker import NullLocator
 
@@ -200,7 +130,7 @@ def _certified_set(
     from matplotlib.figure import Figure
 
     parts = loop.parts
-    run, plane = _prepared(parts, gain, states)
+    run, plane = prepare_trial(parts, gain, states)
     certified, observed = certified_at_rest(loop), observed_radius(run, plane)
     named = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(named, certified, observed, plane.largest, run.horizon)
@@ -225,13 +155,7 @@ def _certified_set(
     return figure, radii
 
 
-def _prepared(parts: Parts, gain: Gain, states: tuple[int, int]) -> tuple[Trial, Slice]:
-    settings = parts.settings
-    run = trial(parts.model, parts.graph, gain, float(settings["dt"]), bool(settings["limits"]))
-    return run, slice_of(parts.model, gain, len(parts.graph.followers), states)
-
-
-def _starts(ax: Any, run: Trial, plane: Slice, half: Matrix) -> None:
+def _starts(ax: Any, run: Trial, plane: Slice, half: Array) -> None:
     """Colour a grid of starts by whether they converge."""
     from matplotlib.colors import ListedColormap
 
@@ -246,7 +170,7 @@ def _starts(ax: Any, run: Trial, plane: Slice, half: Matrix) -> None:
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
 
 
-def _ellipses(ax: Any, plane: Slice, radii: Radii, half: Matrix) -> None:
+def _ellipses(ax: Any, plane: Slice, radii: Radii, half: Array) -> None:
     """Draw the certified and the observed set where they fit into the axes."""
     shown: list[Any] = [(radii.observed, _OBSERVED, (0, (5, 2)), "none")]
     if radii.certified and radii.certified < np.inf:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.engine.result import Result
 from echelon.plots import style as draw
 from echelon.results.metrics import SETTLED, formation_errors, output_errors
@@ -20,7 +20,7 @@ _EDGES = 5000  # A graph with more edges than this would be a black patch.
 _PANELS = 12
 
 
-def figures(result: Result, lyapunov: Sequence[Matrix] | None = None) -> "dict[str, Figure]":
+def figures(result: Result, lyapunov: Sequence[Array] | None = None) -> "dict[str, Figure]":
     """Return the figures that make sense for a run, by name.
 
     `leader_3d` is the first leader with its reference: in space or in the plane where the model has
@@ -51,7 +51,7 @@ def figures(result: Result, lyapunov: Sequence[Matrix] | None = None) -> "dict[s
 
 
 def save_figures(
-    result: Result, folder: Path, lyapunov: Sequence[Matrix] | None = None
+    result: Result, folder: Path, lyapunov: Sequence[Array] | None = None
 ) -> list[Path]:
     """Write each figure of a run as PNG (150 dpi) and PDF under `folder`/figures; return the paths.
 
@@ -108,7 +108,7 @@ def _trajectories(result: Result) -> "Figure":
     return draw.finish(figure, cut)
 
 
-def _snapshots(ax: Any, result: Result, paths: Matrix) -> None:
+def _snapshots(ax: Any, result: Result, paths: Array) -> None:
     """Draw the graph at a few times, agents hollow at the start and square at the end."""
     agents, last = result.graph.agents, len(paths) - 1
     # More snapshots of a swarm would hide each other.
@@ -128,7 +128,7 @@ def _snapshots(ax: Any, result: Result, paths: Matrix) -> None:
         draw.plot(ax, nowhere, label=name, **look)
 
 
-def _graph(ax: Any, result: Result, places: Matrix, times: Matrix) -> None:
+def _graph(ax: Any, result: Result, places: Array, times: Array) -> None:
     """Draw the graph's edges between places (S, N, k) at S times, the later the darker."""
     ends = places[:, result.graph.edges]
     gaps = np.full_like(ends[:, :, :1], np.nan)
@@ -141,7 +141,7 @@ def _graph(ax: Any, result: Result, places: Matrix, times: Matrix) -> None:
         draw.plot(ax, _listed(links[k]), label=name, color=str(shade), **look)
 
 
-def _listed(points: Matrix) -> Matrix:
+def _listed(points: Array) -> Array:
     return points.reshape(-1, points.shape[-1])
 
 
@@ -153,7 +153,7 @@ def _colours(result: Result) -> dict[str, list[int]]:
     return groups
 
 
-def _reference(result: Result, leader: int) -> Matrix | None:
+def _reference(result: Result, leader: int) -> Array | None:
     """Return the states (T, n) that a leader should have, or None where it follows nothing."""
     return None if result.reference is None else result.reference + result.formation.offsets[leader]
 
@@ -235,7 +235,7 @@ def _formation_error(result: Result) -> "Figure":
     return draw.finish(figure)
 
 
-def _lyapunov(result: Result, value: Matrix, rate: Matrix) -> "Figure":
+def _lyapunov(result: Result, value: Array, rate: Array) -> "Figure":
     """Return V, and how fast it falls or rises, on logarithmic axes."""
     keep, floor = draw.thin(len(value)), draw.FLOOR**2
     times, value, rate = result.times[keep], np.maximum(value[keep], floor), rate[keep]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -95,7 +95,7 @@ def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> di
     }
 
 
-def plot(ax: Any, *columns: Matrix, **look: Any) -> None:
+def plot(ax: Any, *columns: Array, **look: Any) -> None:
     """Draw a line through points, given as arrays (T, k) of coordinates; one point as a dot."""
     points = np.column_stack(columns)
     if len(points) == 1 and "marker" not in look:
@@ -104,13 +104,13 @@ def plot(ax: Any, *columns: Matrix, **look: Any) -> None:
     ax.plot(*points.T, clip_on=ax.name != "3d", **look)
 
 
-def thin(frames: int, lines: int = 1) -> Matrix:
+def thin(frames: int, lines: int = 1) -> Array:
     """Return the frames to draw: all of them, or evenly spread ones with the first and the last."""
     count = int(np.clip(_ALL_POINTS // max(lines, 1), 100, _POINTS))
     return np.unique(np.linspace(0, frames - 1, min(frames, count)).round().astype(int))
 
 
-def bounded(values: Matrix, *anchors: Matrix) -> tuple[Matrix, bool]:
+def bounded(values: Array, *anchors: Array) -> tuple[Array, bool]:
     """Return values (..., k) with NaN where they have run away, and whether any has.
 
     Some have when they are a million times farther off than the anchors (..., k) reach; what is
@@ -134,7 +134,7 @@ def label(name: str, unit: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-def panels(times: Matrix, horizon: float, rows: int, height: float) -> "tuple[Figure, list[Any]]":
+def panels(times: Array, horizon: float, rows: int, height: float) -> "tuple[Figure, list[Any]]":
     """Return panels above each other that share the axis of time, `height` inches each."""
     from matplotlib.figure import Figure
 
@@ -165,7 +165,7 @@ def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
     return figure, ax
 
 
-def frame(ax: Any, points: Matrix, alike: bool = True) -> None:
+def frame(ax: Any, points: Array, alike: bool = True) -> None:
     """Fit axes around points (..., 2 or 3), where `alike` with one scale for all directions."""
     points = points.reshape(-1, points.shape[-1])
     points = points[np.isfinite(points).all(axis=1)]
@@ -183,7 +183,7 @@ def frame(ax: Any, points: Matrix, alike: bool = True) -> None:
         ax.figure.set_figheight(np.clip(0.7 + 5.0 * half[1] / half[0], 2.4, 5.2))
 
 
-def _fit_box(ax: Any, half: Matrix) -> None:
+def _fit_box(ax: Any, half: Array) -> None:
     """Let the box of a space fill the width or the height, and the figure be no higher than it."""
     room, left = np.array([_SIDE, _SIDE]), 0.5
     ax.set_position((0.0, 0.0, _SIDE / _WIDTH, _SIDE / _WIDTH))
@@ -202,7 +202,7 @@ def _fit_box(ax: Any, half: Matrix) -> None:
     _label_box(ax, half)
 
 
-def _label_box(ax: Any, half: Matrix) -> None:
+def _label_box(ax: Any, half: Array) -> None:
     """Choose the ticks of a box, and set their labels and the axes' off by the same on any box."""
     from matplotlib.ticker import MaxNLocator
 
@@ -215,7 +215,7 @@ def _label_box(ax: Any, half: Matrix) -> None:
         ax.tick_params(axis=name, pad=11.0 * stretch - 8.0)
 
 
-def _box_on_paper(ax: Any) -> tuple[Matrix, Matrix]:
+def _box_on_paper(ax: Any) -> tuple[Array, Array]:
     """Return the lower left and upper right of a space's box, in inches from the axes' corner."""
     ax.apply_aspect()
     corners = list(itertools.product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim(), [1.0]))
@@ -225,7 +225,7 @@ def _box_on_paper(ax: Any) -> tuple[Matrix, Matrix]:
     return inches.min(axis=0), inches.max(axis=0)
 
 
-def logarithmic(ax: Any, *values: Matrix) -> None:
+def logarithmic(ax: Any, *values: Array) -> None:
     """Make the value axis logarithmic, with room for the finite values and a sensible top."""
     from matplotlib.ticker import LogLocator, NullLocator
 

@@ -1,6 +1,5 @@
 """What a gain carries beyond the trim: its region, the set certified there, and what g does."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,21 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Kind, Region
+from echelon.certificates.certificate import Kind, RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import has_constant_input_map
 from echelon.core.errors import Outcome
-from echelon.core.types import Matrix, States
+from echelon.core.types import Array, States
 from echelon.engine.initial import initial_states
 from echelon.engine.simulate import simulate
-from echelon.laws.passive import Passive
+from echelon.laws.trim_input import TrimInput
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
-from echelon.promises.closed_loop import CheckedLoop, Line
-
-_SAMPLES = 400
-_NEAR = 0.5  # without a domain, g is looked at this far about the trim
+from echelon.promises.closed_loop import CheckedLoop
 
 
 class CertifiedSet(NamedTuple):
@@ -37,42 +33,6 @@ class CertifiedSet(NamedTuple):
     radius: float
     kind: Kind
     why: str
-
-
-def region_lines(loop: CheckedLoop, found: CertifiedSet | None) -> Iterator[Line]:
-    """Yield the region that the gain carries, the certified set, and the Killing residual of g."""
-    yield _region_line(loop)
-    yield _set_line(loop, found)
-    yield _killing_line(loop)
-
-
-def _region_line(loop: CheckedLoop) -> Line:
-    region = loop.region
-    if region is None:
-        text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
-        return Line("region of the gain", "not needed", "proof", "none", text)
-    what = {
-        "T1": "T1: errors of all sizes shrink while all agents stay in",
-        "T2": "T2, local: small errors shrink while the leader stays in",
-        "A5": "Assumption 5: the drift does not expand P while all agents stay in",
-    }[region.theorem]
-    holds = region.rate > 0.0 or region.theorem == "A5"
-    text = f"{what} {region.domain.in_words(loop.parts.model)}"
-    text += "" if holds else "; shrink the `domain`"
-    verdict = "holds" if holds else "fails"
-    return Line("region of the gain", verdict, region.kind, f"{region.rate:.3g} 1/s", text)
-
-
-def _set_line(loop: CheckedLoop, found: CertifiedSet | None) -> Line:
-    statement = "certified set"
-    if found is None:
-        local = loop.region is not None and loop.region.theorem == "T2"
-        text = "T2 is local and certifies no set" if local else "needs a region"
-        return Line(statement, "not needed", "proof", "", text)
-    verdict, number = (
-        ("holds", f"radius {found.radius:.3g}") if found.radius else ("fails", "empty")
-    )
-    return Line(statement, verdict, found.kind, number, found.why)
 
 
 def certified_set(loop: CheckedLoop) -> CertifiedSet | None:
@@ -103,11 +63,13 @@ def certified_at_rest(loop: CheckedLoop) -> float | None:
     return _less(loop, region, region.kind, nowhere).radius
 
 
-def _certifies(region: Region) -> bool:
+def _certifies(region: RegionCertificate) -> bool:
     return region.theorem == "A5" or region.theorem == "T1" and region.rate > 0.0
 
 
-def _less(loop: CheckedLoop, region: Region, kind: Kind, excursion: Matrix) -> CertifiedSet:
+def _less(
+    loop: CheckedLoop, region: RegionCertificate, kind: Kind, excursion: Array
+) -> CertifiedSet:
     """Return the set that is left when the leader goes so far from the trim, (n,)."""
     margins = region.domain.margins()
     radii = np.maximum(margins - excursion, 0.0) / np.sqrt(np.diag(np.linalg.inv(loop.closed.P)))
@@ -130,7 +92,7 @@ def _constant(loop: CheckedLoop, domain: Domain) -> bool:
     return has_constant_input_map(loop.parts.model, domain)
 
 
-def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Matrix | None, str]:
+def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Array | None, str]:
     """Return how far the leaders go from the trim, (n,), and the kind of that; or why not known.
 
     A leader that starts and stays at the trim goes nowhere, which needs no run.
@@ -148,7 +110,7 @@ def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Matrix | None, str]:
     return "samples", away.max(axis=0), ""
 
 
-def _leader_starts(loop: CheckedLoop) -> Matrix:
+def _leader_starts(loop: CheckedLoop) -> Array:
     """Return the states (L, n) in which the leaders start, less their offsets."""
     parts, keys = loop.parts, ("initial", "start_error", "seed")
     given = (parts.settings[key] for key in keys)
@@ -156,7 +118,7 @@ def _leader_starts(loop: CheckedLoop) -> Matrix:
     return (states - parts.formation.offsets)[list(parts.graph.leaders)]
 
 
-def _leader_paths(loop: CheckedLoop) -> Matrix | None:
+def _leader_paths(loop: CheckedLoop) -> Array | None:
     """Return the states (K, n) of the leaders in a run of their own, or None if it diverges."""
     starts, settings = _leader_starts(loop), loop.parts.settings
     count = len(starts)
@@ -168,7 +130,7 @@ def _leader_paths(loop: CheckedLoop) -> Matrix | None:
         graph,
         Formation(np.zeros_like(states)),
         leader=loop.parts.leader,
-        follower=Passive(),
+        follower=TrimInput(),
         initial=states,
         **{key: settings[key] for key in keys},
     )
@@ -180,55 +142,3 @@ def _leader_paths(loop: CheckedLoop) -> Matrix | None:
 @eqx.filter_jit
 def _differences(model: ControlAffine, states: States, base: jax.Array) -> jax.Array:
     return jax.vmap(lambda x: model.difference(x, base))(states)
-
-
-def _killing_line(loop: CheckedLoop) -> Line:
-    """Say how much the inputs themselves stretch distances, and so which theorem is to be had."""
-    model, region = loop.parts.model, loop.region
-    domain = _near(model) if region is None else region.domain
-    where = f"within {_NEAR:g} of the trim" if region is None else "on the domain"
-    residual, kind = killing_residual(model, loop.closed.P, domain)
-    number = f"{residual:.3g} 1/s"
-    statement = "Killing residual of g"
-    if kind == "proof":
-        text = f"g is constant {where}: a region is nonlocal (T1)"
-        return Line(statement, "holds", kind, number, text)
-    text = f"per unit of input, {where}: g varies, so a region is local (T2)"
-    text += "; a model with its inputs as states has constant g"
-    return Line(statement, "fails", kind, number, text)
-
-
-def killing_residual(model: ControlAffine, P: Matrix, domain: Domain) -> tuple[float, Kind]:
-    """Return how fast one unit of an input stretches or shrinks distances in P, 1/s, and the kind.
-
-    It is half the largest eigenvalue, in size, of P^-1/2 (P dg_k + dg_k'P) P^-1/2 over the inputs k
-    and states of the domain, dg_k the derivative of column k of g S: the Lie derivative of the
-    metric, zero where that column is a Killing field. It is 0 by proof where a hull shows g to be
-    constant, and is else read off 400 states.
-    """
-    states, _ = domain.sample(_SAMPLES)
-    base = np.asarray(model.trim[0], float)
-    slopes = np.asarray(_input_slopes(model, jnp.asarray(base + states)))
-    # A hull takes a second, and one slope that is not zero says what it would.
-    if not slopes.any() and has_constant_input_map(model, domain):
-        return 0.0, "proof"
-    weighted = P @ np.moveaxis(slopes, 2, 1)
-    root = np.linalg.inv(np.linalg.cholesky(P))
-    values = np.linalg.eigvalsh(root @ (weighted + weighted.swapaxes(-1, -2)) @ root.T)
-    return 0.5 * float(np.abs(values).max()), "samples"
-
-
-@eqx.filter_jit
-def _input_slopes(model: ControlAffine, states: States) -> jax.Array:
-    """Return the derivatives of g S, (S, n, m, n)."""
-    return jax.vmap(jax.jacfwd(model.normalized_input_map))(states)
-
-
-def _near(model: ControlAffine) -> Domain:
-    """Return a box about the trim, inside the model's chart."""
-    n, m = len(model.state_names), len(model.input_names)
-    reach, trim = np.full(n, _NEAR), np.asarray(model.trim[0], float)
-    for name, (low, high) in model.chart.items():
-        k = model.state_names.index(name)
-        reach[k] = min(_NEAR, 0.5 * (trim[k] - low), 0.5 * (high - trim[k]))
-    return Domain(-reach, reach, np.zeros(m), np.zeros(m))

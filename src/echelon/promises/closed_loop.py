@@ -5,33 +5,21 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Certificate, Kind, Region, certify, parent_modes
+from echelon.certificates.certificate import (
+    Certificate,
+    RegionCertificate,
+    certify,
+    parent_modes,
+)
 from echelon.certificates.margins import ClosedLoop, decays_between
-from echelon.core.types import Matrix
+from echelon.core.linear import held_radius
+from echelon.core.types import Array
+from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
-from echelon.scenario.build import Parts
 
 SHOWN = 32
 """Of more eigenvalues of the graph than these, so many stand for all in the margins."""
-
-
-class Line(NamedTuple):
-    """One statement: its verdict, the kind of argument, the number behind it, what to change."""
-
-    statement: str
-    verdict: str
-    kind: Kind | str
-    number: str
-    text: str
-
-
-class Checked(NamedTuple):
-    """All lines, whether the closed loop is promised anything, and the promise in a sentence."""
-
-    lines: tuple[Line, ...]
-    promised: bool
-    promise: str
 
 
 class CheckedLoop(NamedTuple):
@@ -62,7 +50,7 @@ class CheckedLoop(NamedTuple):
         return gain if isinstance(gain, Gain) else None
 
     @property
-    def region(self) -> Region | None:
+    def region(self) -> RegionCertificate | None:
         """What the gain promises on a domain; nothing where parents' inputs are fed forward.
 
         The modes are then no longer those of a symmetric matrix, which its proof rests on.
@@ -74,10 +62,10 @@ class CheckedLoop(NamedTuple):
     @property
     def fed_by_parents(self) -> bool:
         """Whether each follower is told the input of its parent."""
-        return self.parts.follower.asks() == "parent"
+        return self.parts.follower.feedforward == "parent"
 
     @property
-    def inner(self) -> Matrix:
+    def inner(self) -> Array:
         """The inner loop K (m, n) that is closed in A; zero without one."""
         gain = self.gain
         shape = self.linear.B.T.shape
@@ -113,7 +101,7 @@ class CheckedLoop(NamedTuple):
     @property
     def matched(self) -> bool:
         """Whether the followers are told an input, or the leader has none beyond the trim."""
-        return self.parts.follower.asks() != "none" or not self.moving
+        return self.parts.follower.feedforward != "none" or not self.moving
 
 
 def checked_loop(parts: Parts) -> CheckedLoop:
@@ -128,7 +116,7 @@ def checked_loop(parts: Parts) -> CheckedLoop:
         A = A if gain.inner is None else A - B @ gain.inner
     linear, P = Linearization(A, B), np.eye(n) if P is None else P
     modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
-    if parts.follower.asks() == "parent":
+    if parts.follower.feedforward == "parent":
         edge = None if edge is None else edge * modes[0]
         modes = parent_modes(graph)
         edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"
@@ -140,7 +128,7 @@ def checked_loop(parts: Parts) -> CheckedLoop:
     return CheckedLoop(parts, linear, closed, where, every, certificate, broken)
 
 
-def _looked_at(spectrum: Matrix, count: int, kind: str) -> tuple[Matrix, str]:
+def _looked_at(spectrum: Array, count: int, kind: str) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
     if len(spectrum) < count:
         values = np.geomspace(spectrum[0], spectrum[-1], SHOWN)
@@ -149,3 +137,10 @@ def _looked_at(spectrum: Matrix, count: int, kind: str) -> tuple[Matrix, str]:
         return spectrum, f"all {kind} of the graph"
     places = np.linspace(0, len(spectrum) - 1, SHOWN).round().astype(int)
     return spectrum[places], f"{SHOWN} of {count} {kind}, the extreme ones among them"
+
+
+def step_radius(loop: CheckedLoop, dt: float) -> float:
+    """Return the largest spectral radius of a step, over the eigenvalues looked at."""
+    A, B = loop.linear.A + loop.linear.B @ loop.inner, loop.linear.B
+    gains = loop.inner + loop.closed.strengths[:, None, None] * loop.closed.K
+    return max(held_radius(A, B, K, dt) for K in gains)

@@ -1,14 +1,18 @@
 """What a reference asks of the actuators, before anything is planned or simulated."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import LawError, PlanError, listing
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
+from echelon.models.inputs import normalized
 from echelon.models.model import ControlAffine
-from echelon.references.reference import Reference
+from echelon.references.reference import COORDINATES, Reference
 
 
 def reference_warnings(
@@ -41,7 +45,7 @@ def reference_warnings(
     )
 
 
-def flat_inputs(model: ControlAffine, reference: Reference, times: Matrix) -> Matrix:
+def flat_inputs(model: ControlAffine, reference: Reference, times: Array) -> Array:
     """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
     with precision("float64"):
         return np.asarray(_flat_inputs(model, reference, jnp.asarray(times)))
@@ -53,7 +57,7 @@ def _flat_inputs(model: ControlAffine, reference: Reference, times: jax.Array) -
     return jax.vmap(lambda t: model.flat(reference.derivatives(t, order, names))[1])(times)
 
 
-def demand(model: ControlAffine, inputs: Matrix) -> Matrix:
+def demand(model: ControlAffine, inputs: Array) -> Array:
     """Return for each input (T, m) how much of the actuators' room about the trim it takes, (T,).
 
     One is the limit; 0.5 leaves as much again. Without limits it is zero.
@@ -66,3 +70,94 @@ def demand(model: ControlAffine, inputs: Matrix) -> Matrix:
     room = np.where(moved > 0.0, high - held, held - low)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(moved == 0.0, 0.0, np.abs(moved) / np.maximum(room, 0.0)).max(axis=1)
+
+
+class Targets(NamedTuple):
+    """What a plan follows at T times.
+
+    States (T, n) are a guess of the motion, outputs (T, q) are what counts, inputs (T, m) are
+    normalized.
+    """
+
+    states: Array
+    outputs: Array
+    inputs: Array
+
+
+def reference_targets(model: ControlAffine, reference: Reference | None, times: Array) -> Targets:
+    """Return what a leader follows: its reference by the model's flatness map, or its trim.
+
+    Raises:
+        PlanError: the model has no such map, or the reference is not finite.
+    """
+    if reference is None:
+        x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
+        return _targets(model, x, np.zeros((len(times), len(model.input_names))))
+    unknown = [name for name in model.flat_outputs if name not in COORDINATES]
+    if not model.flat_outputs or unknown:
+        raise PlanError(
+            f"`{type(model).__name__}` cannot be led along a reference: it needs `flat_outputs` "
+            f"out of {listing(COORDINATES)}, `flat_order` and `flat`."
+        )
+    with precision("float64"):
+        x, u = (np.asarray(part) for part in _flat(model, reference, jnp.asarray(times)))
+    if not (np.isfinite(x).all() and np.isfinite(u).all()):
+        raise PlanError(
+            f"the reference `{type(reference).__name__}` cannot be followed by "
+            f"`{type(model).__name__}`: its flat state and input are not finite."
+        )
+    return _targets(model, x, normalized(model, u))
+
+
+@eqx.filter_jit
+def _flat(
+    model: ControlAffine, reference: Reference, times: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    def at(t: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
+
+    return jax.vmap(at)(times)
+
+
+def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Targets:
+    """Return the same targets an offset (n,) away."""
+    return _targets(model, targets.states + offset, targets.inputs)
+
+
+def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
+    """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
+
+    A sum of squared errors to several targets is that to their mean and a constant.
+    """
+    return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
+
+
+def _targets(model: ControlAffine, x: Array, v: Array) -> Targets:
+    with precision("float64"):
+        outputs = np.asarray(_outputs(model, jnp.asarray(x)))
+    return Targets(x, outputs, v)
+
+
+@eqx.filter_jit
+def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
+    return jax.vmap(model.output)(states)
+
+
+def check_flat(model: ControlAffine) -> None:
+    """Check that a model has a flatness map, of outputs that a reference gives.
+
+    Raises:
+        LawError: it has none.
+    """
+    if not model.flat_outputs:
+        raise LawError(
+            f"the law `tracking` cannot lead `{type(model).__name__}`, "
+            "which defines no `flat` map; "
+            "use `passive`, or add `flat_outputs`, `flat_order` and `flat` to the model."
+        )
+    unknown = [name for name in model.flat_outputs if name not in COORDINATES]
+    if unknown:
+        raise LawError(
+            f"`flat_outputs` of `{type(model).__name__}` names {listing(unknown)}, "
+            f"and a reference gives {listing(COORDINATES)}."
+        )

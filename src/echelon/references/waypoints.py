@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import ReferenceError
-from echelon.core.types import Matrix, Scalar
+from echelon.core.types import Array, Scalar
 from echelon.references.reference import Reference, finite, in_space
 
 
@@ -29,8 +29,8 @@ class Waypoints(Reference):
         ReferenceError: the times do not increase or the points do not match them.
     """
 
-    knots: Matrix
-    coefficients: Matrix
+    knots: Array
+    coefficients: Array
     yaw: float = eqx.field()
 
     def __init__(

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from echelon.core.errors import Outcome
-from echelon.engine.work import SolverFigures
+from echelon.engine.work import SolverStats
 from echelon.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.reports.run import say
 from echelon.studies.compare import Comparison, Row
@@ -146,7 +146,7 @@ def _remarks(row: Row) -> Iterator[str]:
     yield from row.flight.result.warnings
 
 
-def _solving(figures: SolverFigures) -> str:
+def _solving(figures: SolverStats) -> str:
     """Return what solving took, in a sentence."""
     return (
         f"{figures.solver} made {figures.solves} plans with {figures.failures} failures, in "

@@ -6,12 +6,13 @@ import numpy as np
 
 from echelon.certificates.certificate import Certificate, certify, parent_modes
 from echelon.core.errors import Outcome
-from echelon.core.numerics import held_radius, precision
-from echelon.engine.result import Result
+from echelon.core.linear import held_radius
+from echelon.core.numerics import precision
+from echelon.engine.result import Result, imperfections
 from echelon.gains.gain import Gain
+from echelon.laws.law import gain_of
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
-from echelon.results.dataset import gain_of, imperfections
 from echelon.results.lyapunov import Lyapunov, lyapunov
 from echelon.results.metrics import Metrics, formation_errors
 
@@ -66,7 +67,7 @@ def _story(result: Result, numbers: Metrics) -> Iterator[str]:
 
 def _why_growth(result: Result) -> Iterator[str]:
     """Name the structural cause of growth where the linearization shows one."""
-    gain = gain_of(result)
+    gain = gain_of(result.follower)
     if gain is None:
         return
     yield from _unseen(result)
@@ -82,7 +83,7 @@ def _why_growth(result: Result) -> Iterator[str]:
 
 def _unseen(result: Result) -> Iterator[str]:
     """Tell of directions of disagreement that never enter an input."""
-    gain, n = gain_of(result), len(result.model.state_names)
+    gain, n = gain_of(result.follower), len(result.model.state_names)
     if gain is not None and gain.certificate.observable < n:
         rank = gain.certificate.observable
         yield (
@@ -111,7 +112,7 @@ def _long_step(result: Result, gain: Gain) -> Iterator[str]:
 
 def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
     worst = numbers.worst_steady
-    if worst is None or worst <= _LAG or result.follower.asks() != "none":
+    if worst is None or worst <= _LAG or result.follower.feedforward != "none":
         return
     if result.reference is not None and np.ptp(result.reference, axis=0).max() > 0.0:
         yield (
@@ -133,11 +134,11 @@ def _imperfections(result: Result) -> Iterator[str]:
 
 def _promises(result: Result) -> Iterator[str]:
     """Say what the gain promises, and what the law needs to be told."""
-    gain = gain_of(result)
+    gain = gain_of(result.follower)
     if gain is not None:
         certificate = gain.certificate
         abscissa, from_on = certificate.abscissa, certificate.edge
-        if result.follower.asks() == "parent":
+        if result.follower.feedforward == "parent":
             abscissa, from_on = _with_parents(result, gain)
         verdict = _verdict(abscissa)
         edge = "" if from_on is None else f" (guaranteed for linear agents from {from_on:.4g} on)"
@@ -146,7 +147,7 @@ def _promises(result: Result) -> Iterator[str]:
             f"slowest mode {abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
             f"{_region(certificate, result.model)}."
         )
-    needs = ", ".join(result.follower.needs) or "nothing from others"
+    needs = ", ".join(result.follower.information) or "nothing from others"
     yield f"Each follower is told: {needs}."
 
 

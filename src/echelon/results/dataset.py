@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from echelon.engine.result import Result
-from echelon.gains.gain import Gain
+from echelon.engine.result import Result, imperfections
+from echelon.laws.law import gain_of
 from echelon.results.lyapunov import lyapunov
 from echelon.results.metrics import Metrics, metrics
-from echelon.world.plant import differences
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -64,7 +63,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         key: int(v) if isinstance(v, bool) else v for key, v in result.settings._asdict().items()
     }
     laws = {
-        f"{role}_needs": "; ".join(law.needs) or "nothing"
+        f"{role}_needs": "; ".join(law.information) or "nothing"
         for role, law in (("leader", result.leader), ("follower", result.follower))
     }
     told = {key: text for key, text in imperfections(result).items() if text is not None}
@@ -80,30 +79,15 @@ def _attributes(result: Result) -> dict[str, Any]:
     }
 
 
-def imperfections(result: Result) -> dict[str, str | None]:
-    """Return in words how the plant differs from the model, and what disturbed it; else None."""
-    plant, disturbance = result.plant, result.disturbance
-    return {
-        "plant": None if plant is None else differences(result.model, plant),
-        "disturbance": None if disturbance is None else str(disturbance),
-    }
-
-
 def save_dataset(result: Result, path: Path) -> None:
     """Write the dataset of a run as netCDF."""
     dataset(result).to_netcdf(path, engine="h5netcdf")
 
 
-def gain_of(result: Result) -> Gain | None:
-    """Return the followers' gain, where their law has one."""
-    gain = getattr(result.follower, "gain", None)
-    return gain if isinstance(gain, Gain) else None
-
-
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
     """Return the run's summary, ready for JSON; what does not exist is None."""
     numbers = metrics(result) if numbers is None else numbers
-    gain = gain_of(result)
+    gain = gain_of(result.follower)
     eigenvalues = result.graph.grounded_spectrum()
     return {
         "scenario": result.provenance.get("scenario", ""),

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.engine.result import Result
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
@@ -29,17 +29,17 @@ class Lyapunov(NamedTuple):
     met on this run, says that it is not positive.
     """
 
-    value: Matrix
-    rate: Matrix
-    drift: Matrix
+    value: Array
+    rate: Array
+    drift: Array
 
-    def rises(self) -> Matrix:
+    def rises(self) -> Array:
         """Return (T - 1,) booleans: where V rises to the next frame by more than rounding."""
         return np.diff(self.value) > 1e-9 * self.value[:-1] + _ROUNDING * self.value.max(
             initial=0.0
         )
 
-    def forbidden(self) -> Matrix:
+    def forbidden(self) -> Array:
         """Return (T - 1,) booleans: where V rises although theory says that it may not.
 
         Where drift and input both push V down at two successive frames, a rise in between is the
@@ -98,7 +98,7 @@ def _fields(
     return over(x, u, jnp.arange(x.shape[1]), steps)
 
 
-def _disagreement(graph: Graph, values: Matrix) -> Matrix:
+def _disagreement(graph: Graph, values: Array) -> Array:
     """Return the followers' z (T, N_f, n) of values (T, N, n)."""
     frames, agents, n = values.shape
     i, j = graph.edges.T
@@ -112,7 +112,7 @@ def _disagreement(graph: Graph, values: Matrix) -> Matrix:
     return z[:, list(graph.followers)]
 
 
-def _grounded_inverse(graph: Graph, z: Matrix) -> Matrix:
+def _grounded_inverse(graph: Graph, z: Array) -> Array:
     """Return delta with (L_g kron I) delta = z, for z (T, N_f, n)."""
     frames, followers, n = z.shape
     columns = np.moveaxis(z, 1, 0).reshape(followers, -1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.engine.result import Result, finite_or_none
 from echelon.models.model import ControlAffine
 
@@ -92,12 +92,12 @@ def metrics(result: Result, steady_window: float | None = None) -> Metrics:
         )
 
 
-def formation_errors(result: Result) -> Matrix:
+def formation_errors(result: Result) -> Array:
     """Return each agent's error length over time, (T, N), in the result's unit."""
     return np.linalg.norm(result.errors[:, :, list(result.measured)], axis=2)
 
 
-def output_errors(result: Result) -> Matrix | None:
+def output_errors(result: Result) -> Array | None:
     """Return the first leader's output minus the reference's, (T, q); None without a reference."""
     if result.reference is None or not len(result.times):
         return None
@@ -118,7 +118,7 @@ def _output_errors(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax
     return jax.vmap(one)(x, wanted)
 
 
-def _rms(values: Matrix) -> float | None:
+def _rms(values: Array) -> float | None:
     """Return the root of the mean of squares over the first axis, summed over the others."""
     if not len(values):
         return None
@@ -126,7 +126,7 @@ def _rms(values: Matrix) -> float | None:
     return finite_or_none(np.sqrt(squares.mean()))
 
 
-def _leader(result: Result, steady: Matrix, exists: bool) -> LeaderMetrics:
+def _leader(result: Result, steady: Array, exists: bool) -> LeaderMetrics:
     errors = output_errors(result) if exists else None
     if errors is None or result.reference is None:
         return LeaderMetrics(None, None, dict.fromkeys(result.model.output_names))
@@ -137,7 +137,7 @@ def _leader(result: Result, steady: Matrix, exists: bool) -> LeaderMetrics:
     return LeaderMetrics(_rms(off), _rms(off[steady]), by_output)
 
 
-def _followers(result: Result, steady: Matrix, exists: bool) -> tuple[FollowerMetrics, ...]:
+def _followers(result: Result, steady: Array, exists: bool) -> tuple[FollowerMetrics, ...]:
     errors = formation_errors(result)
     return tuple(
         FollowerMetrics(
@@ -152,7 +152,7 @@ def _followers(result: Result, steady: Matrix, exists: bool) -> tuple[FollowerMe
     )
 
 
-def _settling_time(times: Matrix, error: Matrix) -> float | None:
+def _settling_time(times: Array, error: Array) -> float | None:
     """Return the first time from which on the error stays below 1 cm, or None."""
     above = np.flatnonzero(~(error <= SETTLED))
     if not len(above):
@@ -170,7 +170,7 @@ def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:
     measured = list(result.measured)
     p, goals = result.states[:, :, measured], result.formation.offsets[:, measured]
 
-    def deviation(i: int, j: int) -> Matrix:
+    def deviation(i: int, j: int) -> Array:
         return np.linalg.norm(p[:, i] - p[:, j], axis=1) - np.linalg.norm(goals[i] - goals[j])
 
     pairs: Sequence[tuple[int, int]] = [(int(i), int(j)) for i, j in result.graph.edges]

@@ -10,7 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from echelon.core.errors import (
     EchelonError,
@@ -22,11 +22,11 @@ from echelon.core.errors import (
 )
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
+from echelon.engine.parts import Parts
 from echelon.engine.result import Result
 from echelon.engine.simulate import Progress, simulate
 from echelon.gains.file import load_gain
-from echelon.gains.gain import Gain
-from echelon.gains.synthesize import synthesize
+from echelon.gains.gain import Gain, synthesize
 from echelon.laws.law import Law
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
@@ -37,20 +37,6 @@ from echelon.scenario.scenario import Fault, Scenario, by_line
 from echelon.scenario.sections import GainSpec
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import check_plant, varied
-
-
-class Parts(NamedTuple):
-    """What a scenario is made of, ready for `simulate`; `settings` are its other arguments.
-
-    Plant and disturbance stand there too, None where the scenario has none.
-    """
-
-    model: ControlAffine
-    graph: Graph
-    formation: Formation
-    leader: Law
-    follower: Law
-    settings: dict[str, Any]
 
 
 class _Faults:

@@ -57,7 +57,7 @@ METHODS = {
     "riccati": Entry(
         "echelon.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"
     ),
-    "given": Entry("echelon.gains:Given", "a P (and R, coupling) of your own"),
+    "given": Entry("echelon.gains:FixedGain", "a P (and R, coupling) of your own"),
     "inner-loop": Entry(
         "echelon.gains:InnerLoop", "damp all but position, then any coupling works"
     ),
@@ -73,7 +73,7 @@ FOLLOWER_LAWS = {
     "agreement": Entry(
         "echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"
     ),
-    "passive": Entry("echelon.laws:Passive", "the trim input, nothing else"),
+    "passive": Entry("echelon.laws:TrimInput", "the trim input, nothing else"),
 }
 
 LEADER_LAWS = {
@@ -81,7 +81,8 @@ LEADER_LAWS = {
         "echelon.laws:Tracking", "flatness feed-forward and Riccati feedback on the reference"
     ),
     "optimal-tracking": Entry(
-        "echelon.laws:OptimalTracking", "a plan of least tracking error, and feedback about it"
+        "echelon.optimal.leader:OptimalTracking",
+        "a plan of least tracking error, and feedback about it",
     ),
     "agreement": FOLLOWER_LAWS["agreement"],
     "passive": FOLLOWER_LAWS["passive"],

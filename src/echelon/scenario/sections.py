@@ -21,9 +21,9 @@ from echelon.scenario.registry import (
 from echelon.scenario.values import (
     CLASS_IN_FILE,
     Agents,
+    Array,
     Count,
     Edges,
-    Matrix,
     MatrixOrIdentity,
     NotNegative,
     Numbers,
@@ -146,10 +146,10 @@ class GainSpec(BaseModel):
     method: Annotated[str, OneOf(METHODS)] = Field(
         default="riccati", description="Name of a method."
     )
-    Q: Matrix | None = Field(
+    Q: Array | None = Field(
         default=None, description="Weight of the states: its diagonal or rows; default the model's."
     )
-    R: Matrix | None = Field(
+    R: Array | None = Field(
         default=None,
         description="Weight of the normalised inputs: its diagonal or rows; default the model's.",
     )

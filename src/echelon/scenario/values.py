@@ -135,7 +135,7 @@ Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
 Agents = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
 Edge = Annotated[tuple[int, int, float], PlainValidator(_edge), WithJsonSchema(_EDGE)]
 Edges = Annotated[tuple[Edge, ...], Field(strict=False)]
-Matrix = Annotated[
+Array = Annotated[
     tuple[tuple[float, ...], ...],
     PlainValidator(_matrix),
     WithJsonSchema({"anyOf": [_DIAGONAL, _ROWS]}),

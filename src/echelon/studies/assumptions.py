@@ -5,11 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon.certificates.modes import obstacle
-from echelon.core.numerics import in_words
+from echelon.core.linear import in_words
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
-from echelon.promises.closed_loop import CheckedLoop, Line
+from echelon.promises.closed_loop import CheckedLoop
 from echelon.studies.finite_condition import finite_condition, goal_drifts
+from echelon.studies.lines import Line
 
 ZERO = 1e-9
 

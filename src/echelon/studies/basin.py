@@ -10,10 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import GainError, did_you_mean, listing
 from echelon.core.numerics import precision, rk4
-from echelon.core.types import Input, Matrix, State
+from echelon.core.types import Array, Input, State
+from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.laws.consensus import feedback
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
@@ -33,10 +36,10 @@ class Slice(NamedTuple):
     """
 
     states: tuple[int, int]
-    form: Matrix
-    reach: Matrix
+    form: Array
+    reach: Array
 
-    def extents(self, radius: float) -> Matrix:
+    def extents(self, radius: float) -> Array:
         """Return how far the ellipse s'form s = radius^2 reaches along both axes."""
         return radius * np.sqrt(np.diag(np.linalg.inv(self.form)))
 
@@ -45,7 +48,7 @@ class Slice(NamedTuple):
         """The radius of the largest ellipse that is tried, where it lies within reach."""
         return float((self.reach / self.extents(1.0)).max())
 
-    def ellipse(self, radius: float, points: int) -> Matrix:
+    def ellipse(self, radius: float, points: int) -> Array:
         """Return points (points, 2) of the ellipse of a radius."""
         angles = 2.0 * np.pi * np.arange(points) / points
         round_ = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -61,7 +64,7 @@ class Trial(NamedTuple):
 
     model: ControlAffine
     gain: Gain
-    laplacian: Matrix
+    laplacian: Array
     dt: float
     steps: int
     fallen: float
@@ -113,12 +116,12 @@ def observed_radius(run: Trial, plane: Slice) -> float:
     return float(radii[count - 1]) if count else 0.0
 
 
-def grid(plane: Slice, half: Matrix, side: int) -> tuple[Matrix, Matrix]:
+def grid(plane: Slice, half: Array, side: int) -> tuple[Array, Array]:
     """Return the two axes of a grid of starts, each symmetric about the goal."""
     return np.linspace(-half[0], half[0], side), np.linspace(-half[1], half[1], side)
 
 
-def converged(run: Trial, plane: Slice, starts: Matrix) -> Matrix:
+def converged(run: Trial, plane: Slice, starts: Array) -> Array:
     """Return for deviations (S, 2) in a slice whether the followers converge, (S,) of bool."""
     n = len(run.model.state_names)
     deviations = np.zeros((len(starts), n))
@@ -138,8 +141,8 @@ def converged(run: Trial, plane: Slice, starts: Matrix) -> Matrix:
 def _ratio(
     model: ControlAffine,
     gain: Gain,
-    laplacian: Matrix,
-    deviations: Matrix,
+    laplacian: Array,
+    deviations: Array,
     dt: float,
     steps: int,
     limits: bool,
@@ -165,3 +168,76 @@ def _ratio(
 
     start = trim[None, None] + jnp.repeat(jnp.asarray(deviations)[:, None], len(laplacian), axis=1)
     return size(jax.lax.fori_loop(0, steps, step, start)) / size(start)
+
+
+class Radii(NamedTuple):
+    """Both radii of sum_i delta_i'P delta_i, for a leader at rest at the trim, and the slice.
+
+    `certified` is None where no set is; `observed` counts only starts of the slice, and `largest`
+    is where the trying ended.
+    """
+
+    states: tuple[str, str]
+    certified: float | None
+    observed: float
+    largest: float
+    horizon: float
+
+    def sentence(self) -> str:
+        """Say both, side by side."""
+        proved = "none, since no set is certified"
+        if self.certified is not None:
+            proved = "everywhere" if self.certified == np.inf else f"{self.certified:.3g}"
+        seen = f"{self.observed:.3g}" if self.observed < self.largest else "all that was tried,"
+        seen += "" if self.observed < self.largest else f" up to {self.largest:.3g}"
+        return (
+            f"Radius r of sum_i delta_i'P delta_i <= r^2, leader at rest: certified {proved}; "
+            f"observed {seen}, for starts in `{self.states[0]}` and `{self.states[1]}` alone, "
+            f"run for {self.horizon:.3g} s."
+        )
+
+
+def chosen_slice(model: ControlAffine, gain: Gain, asked: str | None) -> tuple[int, int]:
+    """Return the two states of a slice: those asked for, as `y,roll`, or a telling pair.
+
+    That is a velocity with the angle that drives it; where there is none, the first two coordinates
+    of the position, or the first two states.
+
+    Raises:
+        GainError: those asked for are not two different states of the model.
+    """
+    names = model.state_names
+    if asked is not None:
+        parts = [part.strip() for part in asked.split(",")]
+        for name in parts:
+            if name not in names:
+                raise GainError(
+                    f"`--slice` names `{name}`, and the states are {listing(names)}"
+                    f"{did_you_mean(name, names)}."
+                )
+        if len(set(parts)) != 2 or len(parts) != 2:
+            raise GainError(f"`--slice` is `{asked}`, and must be two states such as `y,roll`.")
+        return names.index(parts[0]), names.index(parts[1])
+    if len(names) < 2:
+        raise GainError(f"a slice needs two states, and `{type(model).__name__}` has one.")
+    return _telling(model, gain)
+
+
+def _telling(model: ControlAffine, gain: Gain) -> tuple[int, int]:
+    """Return a pair of states in which the loop is seen to work."""
+    groups = model.state_groups
+    if "velocity" in groups and "attitude" in groups:
+        moved, turned = model.states_called("velocity"), model.states_called("attitude")
+        with precision("float64"):
+            push = np.abs(linearize(model).A[np.ix_(moved, turned)])
+        row, column = np.unravel_index(int(push.argmax()), push.shape)
+        return moved[row], turned[column]
+    places = model.position_indices()
+    return (places[0], places[1]) if len(places) > 1 else (0, 1)
+
+
+def prepare_trial(parts: Parts, gain: Gain, states: tuple[int, int]) -> tuple[Trial, Slice]:
+    """Return the loop that starts of a slice are run in, and the slice."""
+    settings = parts.settings
+    run = trial(parts.model, parts.graph, gain, float(settings["dt"]), bool(settings["limits"]))
+    return run, slice_of(parts.model, gain, len(parts.graph.followers), states)

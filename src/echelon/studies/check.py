@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 
 from echelon.core.numerics import precision
-from echelon.promises.certified_set import CertifiedSet, certified_set, region_lines
-from echelon.promises.closed_loop import Checked, CheckedLoop, Line, checked_loop
-from echelon.scenario.build import Parts
+from echelon.engine.parts import Parts
+from echelon.promises.certified_set import CertifiedSet, certified_set
+from echelon.promises.closed_loop import CheckedLoop, checked_loop, step_radius
 from echelon.studies.assumptions import drift_lines, graph_lines
-from echelon.studies.margins import law_lines, margin_lines, step_radius
+from echelon.studies.lines import Checked, Line
+from echelon.studies.margins import law_lines, margin_lines
+from echelon.studies.region import region_lines
 
 __all__ = ["Checked", "Line", "check"]
 

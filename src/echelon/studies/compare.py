@@ -9,20 +9,19 @@ import numpy as np
 from echelon.core.errors import EchelonError, LawError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.engine.initial import initial_states
-from echelon.engine.result import Result
+from echelon.engine.parts import Parts
+from echelon.engine.result import Result, imperfections
 from echelon.engine.simulate import simulate
-from echelon.engine.work import SolverFigures, solver_figures
-from echelon.gains.gain import Gain, Method
-from echelon.gains.given import Given
+from echelon.engine.work import SolverStats, solver_stats
+from echelon.gains.fixed import FixedGain
+from echelon.gains.gain import Gain, Method, synthesize
 from echelon.gains.inner_loop import InnerLoop
 from echelon.gains.riccati import Riccati
-from echelon.gains.synthesize import synthesize
 from echelon.laws.consensus import Consensus
 from echelon.laws.law import Feedforward
 from echelon.optimal.pilots import simulate_mpc, simulate_plans
-from echelon.results.dataset import imperfections
 from echelon.results.metrics import Metrics, metrics
-from echelon.scenario.build import Parts, build
+from echelon.scenario.build import build
 from echelon.scenario.scenario import Scenario
 
 LABELS = ("literal", "riccati-relay", "riccati", "inner-loop", "optimization", "mpc")
@@ -41,7 +40,7 @@ class Flight(NamedTuple):
     result: Result
     told: tuple[str, ...]
     computing: float
-    solver: SolverFigures | None
+    solver: SolverStats | None
 
 
 class Row(NamedTuple):
@@ -193,7 +192,10 @@ def _consensus(gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bo
             *parts[:3], leader=parts.leader, follower=law, progress=watch, **parts.settings
         )
         return Flight(
-            result, law.needs, watch.seconds / (parts.graph.agents * result.settings.horizon), None
+            result,
+            law.information,
+            watch.seconds / (parts.graph.agents * result.settings.horizon),
+            None,
         )
 
     return fly
@@ -245,16 +247,16 @@ def _optimized(fly: Callable[..., Result]) -> Fly:
     def flight(parts: Parts) -> Flight:
         reference = getattr(parts.leader, "reference", None)
         result = fly(*parts[:3], reference=reference, **parts.settings)
-        figures = solver_figures(result)
+        figures = solver_stats(result)
         assert figures is not None
         seconds = figures.seconds / (parts.graph.agents * result.settings.horizon)
-        return Flight(result, result.follower.needs, seconds, figures)
+        return Flight(result, result.follower.information, seconds, figures)
 
     return flight
 
 
 _FLY: Mapping[str, Fly] = {
-    "literal": _consensus(_synthesized(Given()), "none", trim=False),
+    "literal": _consensus(_synthesized(FixedGain()), "none", trim=False),
     "riccati-relay": _consensus(_riccati, "relay"),
     "riccati": _consensus(_riccati, "none"),
     "inner-loop": _consensus(_synthesized(InnerLoop()), "relay"),

@@ -8,16 +8,17 @@ import numpy as np
 from echelon.certificates import margins
 from echelon.certificates.certificate import Kind
 from echelon.core.errors import EchelonError
-from echelon.core.numerics import longest_step, precision
-from echelon.gains.gain import Gain
-from echelon.gains.synthesize import synthesize
+from echelon.core.linear import longest_step
+from echelon.core.numerics import precision
+from echelon.engine.parts import Parts
+from echelon.gains.gain import Gain, synthesize
 from echelon.laws.consensus import Consensus
-from echelon.network.topology import shorter
 from echelon.promises.certified_set import CertifiedSet, certified_set
 from echelon.promises.closed_loop import CheckedLoop, checked_loop
 from echelon.scenario import registry
-from echelon.scenario.build import Parts, resolve
+from echelon.scenario.build import resolve
 from echelon.scenario.scenario import Scenario
+from echelon.studies.speedup import speedup
 
 _NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
 _ADVISED = 100
@@ -63,7 +64,7 @@ def designs(scenario: Scenario, parts: Parts, only: str | None = None) -> tuple[
 def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
     """Return the stable design with the strongest promise, the fastest decay deciding a tie.
 
-    One that needs a step shorter than `dt` comes after those that do not.
+    One that needs a step speedup than `dt` comes after those that do not.
     """
     stable = [d for d in tried if d.gain is not None and d.gain.certificate.stable]
     return max(stable, key=lambda d: _merit(d, dt)) if stable else None
@@ -113,7 +114,7 @@ def _design(name: str, scenario: Scenario, parts: Parts) -> Design:
 
 def with_gain(parts: Parts, gain: Gain) -> CheckedLoop:
     """Return the closed loop of the scenario under another gain, the feed-forward kept."""
-    asked = parts.follower.asks()
+    asked = parts.follower.feedforward
     trim = getattr(parts.follower, "trim", True)
     law = Consensus(gain, feedforward=asked, trim=trim)
     with precision("float64"):
@@ -148,7 +149,7 @@ def _advice(name: str, loop: CheckedLoop) -> str:
     if name != "inner-loop" or gain is None or followers > _ADVISED:
         return ""
     more = int(followers > 1), int(len(graph.edges) < free)
-    return shorter(loop.parts.model, graph, gain, *more).sentence()
+    return speedup(loop.parts.model, graph, gain, *more).sentence()
 
 
 def _options(name: str, scenario: Scenario) -> dict[str, Any]:

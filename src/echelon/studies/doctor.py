@@ -11,8 +11,8 @@ import numpy as np
 from echelon.core import numerics
 from echelon.core.provenance import versions
 from echelon.engine.simulate import simulate
+from echelon.gains.gain import synthesize
 from echelon.gains.riccati import Riccati
-from echelon.gains.synthesize import synthesize
 from echelon.laws.consensus import Consensus
 from echelon.laws.tracking import Tracking
 from echelon.models import ControlAffine, Pendulum, Quadrotor

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import GainError
+from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix, States
-from echelon.gains.gain import check_definite
+from echelon.core.types import Array, States
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
@@ -45,7 +45,7 @@ class FiniteCondition(NamedTuple):
 
 
 def finite_condition(
-    P: Matrix, model: ControlAffine, formation: Formation, law: Law | None = None
+    P: Array, model: ControlAffine, formation: Formation, law: Law | None = None
 ) -> FiniteCondition:
     """Say whether P meets the finite condition at a formation's goals, the leaders' included.
 
@@ -79,19 +79,19 @@ def finite_condition(
     return FiniteCondition("holds" if holds else "fails", largest, pair, least, len(some))
 
 
-def goal_drifts(model: ControlAffine, offsets: Matrix, law: Law | None = None) -> Matrix:
+def goal_drifts(model: ControlAffine, offsets: Array, law: Law | None = None) -> Array:
     """Return the drift at the goals about the trim, (N, n), with the law's inner loop if any."""
     with precision("float64"):
         goals = jnp.asarray(np.asarray(model.trim[0], float) + offsets)
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 
-def pair_values(P: Matrix, d: Matrix, f: Matrix) -> Matrix:
+def pair_values(P: Array, d: Array, f: Array) -> Array:
     """Return d'P f for each pair, (...), from differences of goals and of drifts (..., n)."""
     return np.einsum("...a,ab,...b->...", d, P, f)
 
 
-def _largest(P: Matrix, offsets: Matrix, drifts: Matrix) -> tuple[float, tuple[int, int]]:
+def _largest(P: Array, offsets: Array, drifts: Array) -> tuple[float, tuple[int, int]]:
     """Return the largest value over all pairs, and the pair."""
     best, at = -np.inf, (0, 0)
     for start in range(0, len(offsets), _ROWS):

@@ -7,12 +7,12 @@ import numpy as np
 import scipy.sparse.csgraph as csgraph
 
 from echelon.certificates import margins
-from echelon.certificates.bounds import disturbance_ellipsoid, disturbance_l1
-from echelon.core.numerics import held_radius
-from echelon.core.types import Matrix
+from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
+from echelon.core.types import Array
 from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
-from echelon.promises.closed_loop import CheckedLoop, Line
+from echelon.promises.closed_loop import CheckedLoop, step_radius
+from echelon.studies.lines import Line
 
 _KIND = "linearization"
 
@@ -77,13 +77,6 @@ def _step_line(loop: CheckedLoop) -> Line:
     return Line(statement, _verdict(radius < 1.0), _KIND, f"dt {dt:g} s", text)
 
 
-def step_radius(loop: CheckedLoop, dt: float) -> float:
-    """Return the largest spectral radius of a step, over the eigenvalues looked at."""
-    A, B = loop.linear.A + loop.linear.B @ loop.inner, loop.linear.B
-    gains = loop.inner + loop.closed.strengths[:, None, None] * loop.closed.K
-    return max(held_radius(A, B, K, dt) for K in gains)
-
-
 def margin_lines(loop: CheckedLoop) -> Iterator[Line]:
     """Yield how far the loop is from losing what it promises."""
     if not (loop.every and loop.governed):
@@ -115,7 +108,7 @@ def _scaling_line(loop: CheckedLoop) -> Line:
 class _Push(NamedTuple):
     """A disturbance w that enters by E (n, q), and the states that are watched."""
 
-    E: Matrix
+    E: Array
     where: str
     watched: tuple[int, ...]
 
@@ -137,14 +130,14 @@ def _push_lines(loop: CheckedLoop) -> Iterator[Line]:
     units = {model.state_units[k] for k in watched}
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
-    def number(bounds: Matrix) -> str:
+    def number(bounds: Array) -> str:
         return ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
 
     text = f"{unit}per {where}: no push of that norm on all followers together takes any farther"
-    outer = disturbance_ellipsoid(loop.closed, E)
+    outer = invariant_ellipsoid(loop.closed, E)
     yield Line("disturbance, network", "holds", _KIND, number(outer), f"{text}; {loop.where}")
     text = f"{unit}per {where}: the exact peak, for a push shaped like the worst eigenvector"
-    exact = disturbance_l1(loop.closed, E)
+    exact = peak_gain(loop.closed, E)
     yield Line("disturbance, one mode", "holds", _KIND, number(exact), f"{text}; {loop.where}")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.verifier.file import SavedGraph
 
 ALL_MODES = 400
@@ -19,7 +19,7 @@ def followers(graph: SavedGraph) -> list[int]:
     return [k for k in range(graph.agents) if k not in graph.leaders]
 
 
-def grounded_rows(graph: SavedGraph, edges: Matrix) -> list[list[Fraction]]:
+def grounded_rows(graph: SavedGraph, edges: Array) -> list[list[Fraction]]:
     """Return the followers' block of the Laplacian, exactly."""
     rows = [[Fraction(0)] * graph.agents for _ in range(graph.agents)]
     for i, j, weight in edges:
@@ -32,7 +32,7 @@ def grounded_rows(graph: SavedGraph, edges: Matrix) -> list[list[Fraction]]:
     return [[rows[i][j] for j in kept] for i in kept]
 
 
-def spectrum(graph: SavedGraph, edges: Matrix) -> Matrix:
+def spectrum(graph: SavedGraph, edges: Array) -> Array:
     """Return the eigenvalues of the grounded Laplacian, or the extreme two of many.
 
     The smallest is the Rayleigh quotient of its vector, summed over edges: all terms are positive,
@@ -49,7 +49,7 @@ def spectrum(graph: SavedGraph, edges: Matrix) -> Matrix:
     return values if len(values) <= ALL_MODES else values[[0, -1]]
 
 
-def rightmost(matrix: Matrix) -> tuple[float, float]:
+def rightmost(matrix: Array) -> tuple[float, float]:
     """Return the largest real part of an eigenvalue, and what rounding may make of it."""
     balanced = scipy.linalg.matrix_balance(matrix, permute=False)[0]
     found: Any = scipy.linalg.eig(balanced, left=True, right=True)
@@ -60,7 +60,7 @@ def rightmost(matrix: Matrix) -> tuple[float, float]:
     return float(values[at].real), min(rounding / max(cosine, 1e-300), 1e-2 * rounding**0.25)
 
 
-def observable(A: Matrix, C: Matrix) -> int:
+def observable(A: Array, C: Array) -> int:
     """Return the dimension of the span of C', A'C', A'A'C', ..., grown one block at a time."""
     basis = np.zeros((len(A), 0))
     block = C.T
@@ -75,7 +75,7 @@ def observable(A: Matrix, C: Matrix) -> int:
     return basis.shape[1]
 
 
-def growth(P: Matrix, As: Matrix, Ws: Matrix, strength: float) -> tuple[float, float]:
+def growth(P: Array, As: Array, Ws: Array, strength: float) -> tuple[float, float]:
     """Return the largest x with det(P A + A'P - strength P W P - x P) = 0, and its rounding.
 
     It is the largest over all A (K, n, n) and W (K, n, n) of a pair.

@@ -12,7 +12,7 @@ import scipy.optimize
 
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.verifier.file import SavedGain, SavedModel, SavedRegion
 
@@ -27,8 +27,8 @@ _FAR = 10.0
 class Slopes(NamedTuple):
     """At each of K points: velocity's Jacobian (K, n, n) and normalized input map (K, n, m)."""
 
-    jacobians: Matrix
-    maps: Matrix
+    jacobians: Array
+    maps: Array
 
 
 class NoModel(NamedTuple):
@@ -71,14 +71,14 @@ def _frozen(value: object) -> object:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def velocity_at_trim(model: ControlAffine, saved: SavedModel) -> Matrix:
+def velocity_at_trim(model: ControlAffine, saved: SavedModel) -> Array:
     """Return f(x*) + g(x*) u*, which is zero at an equilibrium."""
     with precision("float64"):
         x, u = jnp.asarray(saved.state), jnp.asarray(saved.input)
         return np.asarray(model.drift(x) + model.input_map(x) @ u)
 
 
-def slopes(model: ControlAffine, saved: SavedModel, states: Matrix, inputs: Matrix) -> Slopes:
+def slopes(model: ControlAffine, saved: SavedModel, states: Array, inputs: Array) -> Slopes:
     """Differentiate f + g (u* + S v) backwards, at K deviations and normalized inputs."""
     with precision("float64"):
         x, v = jnp.asarray(saved.state + states), jnp.asarray(inputs)
@@ -102,8 +102,8 @@ def _slopes(
 class Points(NamedTuple):
     """Deviations (K, n) and inputs (K, m) of a domain; the first `corners` are all of its own."""
 
-    states: Matrix
-    inputs: Matrix
+    states: Array
+    inputs: Array
     corners: int
 
 
@@ -127,7 +127,7 @@ def points(saved: SavedGain, region: SavedRegion) -> Points:
     return Points(found[:, :n], found[:, n:], few if few <= _EACH else 0)
 
 
-def _corners(ends: Matrix, random: np.random.Generator) -> Matrix:
+def _corners(ends: Array, random: np.random.Generator) -> Array:
     """Return all corners of a box, or random ones of many."""
     count = ends.shape[1]
     if 2**count <= _EACH:
@@ -139,14 +139,14 @@ def _corners(ends: Matrix, random: np.random.Generator) -> Matrix:
     return np.take_along_axis(ends, picks, axis=0)
 
 
-def farthest_from_all(known: Matrix, samples: Matrix) -> float:
+def farthest_from_all(known: Array, samples: Array) -> float:
     """Return how far the worst sample is from the nearest of the known matrices, relative."""
     size = max(float(np.abs(known).max()), 1e-300)
     gaps = [float(np.abs(known - sample).max(axis=(1, 2)).min()) for sample in samples]
     return max(gaps, default=0.0) / size
 
 
-def farthest_outside(hull: Matrix, error: Matrix, samples: Matrix) -> float:
+def farthest_outside(hull: Array, error: Array, samples: Array) -> float:
     """Return how far the worst sample is from every convex combination of the corners.
 
     Each entry is measured beyond `error`, in units of its range over the corners, or of a

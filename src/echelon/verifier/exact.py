@@ -10,12 +10,12 @@ from collections.abc import Iterable
 from fractions import Fraction
 from typing import TypeAlias
 
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 
 Rows: TypeAlias = list[list[Fraction]]
 
 
-def rows_of(matrix: Matrix) -> Rows:
+def rows_of(matrix: Array) -> Rows:
     """Return a matrix of floats as the fractions that they are."""
     return [[Fraction(float(x)) for x in row] for row in matrix]
 
@@ -71,7 +71,13 @@ def inverse(matrix: Rows) -> Rows:
 
 
 def first_unproved(
-    P: Matrix, B: Matrix, R: Matrix, hull: Matrix, error: Matrix, strength: Fraction, rate: float
+    P: Array,
+    B: Array,
+    R: Array,
+    hull: Array,
+    error: Array,
+    strength: Fraction,
+    rate: float,
 ) -> int | None:
     """Return the first corner A at which the rate is not proved, or None where all hold.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from echelon.core.errors import GainError, listing
-from echelon.core.types import Matrix, PathLike
+from echelon.core.types import Array, PathLike
 
 _FORMAT = "echelon gain 2"
 _KINDS = ("proof", "vertices", "samples", "linearization")
@@ -26,11 +26,11 @@ class SavedModel(NamedTuple):
     parameters: Mapping[str, Any] | None
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
-    state: Matrix
-    input: Matrix
-    scale: Matrix
-    A: Matrix
-    B: Matrix
+    state: Array
+    input: Array
+    scale: Array
+    A: Array
+    B: Array
 
 
 class SavedGraph(NamedTuple):
@@ -38,8 +38,8 @@ class SavedGraph(NamedTuple):
 
     agents: int
     leaders: tuple[int, ...]
-    edges: Matrix | None
-    spectrum: Matrix
+    edges: Array | None
+    spectrum: Array
 
 
 class SavedRegion(NamedTuple):
@@ -50,12 +50,12 @@ class SavedRegion(NamedTuple):
     rate: float
     radius: float | None
     strength: float
-    lower: Matrix
-    upper: Matrix
-    input_lower: Matrix
-    input_upper: Matrix
-    hull: Matrix
-    error: Matrix
+    lower: Array
+    upper: Array
+    input_lower: Array
+    input_upper: Array
+    hull: Array
+    error: Array
 
 
 class SavedGain(NamedTuple):
@@ -63,9 +63,9 @@ class SavedGain(NamedTuple):
 
     method: str
     coupling: float
-    P: Matrix
-    R: Matrix
-    inner: Matrix | None
+    P: Array
+    R: Array
+    inner: Array | None
     model: SavedModel
     graph: SavedGraph
     kind: str
@@ -134,7 +134,7 @@ class _Part:
             raise self.fault(name, "must be a list of names")
         return tuple(value)
 
-    def array(self, key: str, *shape: int) -> Matrix:
+    def array(self, key: str, *shape: int) -> Array:
         """Return finite numbers of a shape, in which -1 is any length."""
         value, name = self.entry(key)
         found = _array(value)
@@ -148,7 +148,7 @@ class _Part:
             raise self.fault(name, f"must be {wanted} finite numbers (to 1e50)")
         return found
 
-    def bounds(self, key: str, size: int, absent: float) -> Matrix:
+    def bounds(self, key: str, size: int, absent: float) -> Array:
         """Return numbers, some of which may be None for an infinite bound."""
         value, name = self.entry(key)
         numbers = [absent if x is None else x for x in value] if isinstance(value, list) else []
@@ -164,7 +164,7 @@ def _is_number(value: object) -> bool:
     return -_LARGEST <= value <= _LARGEST
 
 
-def _array(value: object) -> Matrix | None:
+def _array(value: object) -> Array | None:
     """Return nested lists of finite numbers as an array, or None where they are anything else."""
 
     def plain(x: object) -> bool:
@@ -275,7 +275,7 @@ def _region(told: _Part, n: int, m: int) -> SavedRegion:
     )
 
 
-def _unpacked(told: _Part, n: int, wide: int) -> Matrix:
+def _unpacked(told: _Part, n: int, wide: int) -> Array:
     """Return the matrices of which the file holds one whole, and the changes of the others."""
     base = told.array("base", n, wide)
     if told.entry("places")[0] == []:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from echelon.core.types import Matrix, PathLike
+from echelon.core.types import Array, PathLike
 from echelon.models.model import ControlAffine
 from echelon.verifier import algebra as algebra
 from echelon.verifier import equations as equations
@@ -52,9 +52,9 @@ class _Facts(NamedTuple):
     """What was recomputed and later claims rest on."""
 
     saved: SavedGain
-    eigenvalues: Matrix
-    weighted: Matrix
-    closed: Matrix
+    eigenvalues: Array
+    weighted: Array
+    closed: Array
 
     @property
     def low(self) -> float:
@@ -161,7 +161,7 @@ def _graph(graph: SavedGraph, saved: SavedGain) -> Iterator[Finding]:
     yield _same("lambda_max", saved.lambda_max, float(found[-1]), slack)
 
 
-def _is_graph(edges: Matrix) -> bool:
+def _is_graph(edges: Array) -> bool:
     pairs = np.sort(edges[:, :2], axis=1)
     apart = bool((pairs[:, 0] < pairs[:, 1]).all())
     return apart and len(np.unique(pairs, axis=0)) == len(pairs) and bool((edges[:, 2] > 0.0).all())
@@ -258,7 +258,7 @@ def _radius(facts: _Facts, region: SavedRegion) -> Finding:
     return _same("radius", region.radius, widest)
 
 
-def _widest(P: Matrix, region: SavedRegion) -> float:
+def _widest(P: Array, region: SavedRegion) -> float:
     margins = np.minimum(region.upper, -region.lower)
     # A column of L^-1 for P = L L' has the length that its state reaches on x'P x = 1.
     reach = np.linalg.norm(
@@ -286,7 +286,7 @@ def _rate(facts: _Facts, region: SavedRegion) -> Iterator[Finding]:
     yield _said("error of the corners", fine, float(lost.max()), text="no more than rounding")
 
 
-def _split(facts: _Facts, hull: Matrix) -> tuple[Matrix, Matrix]:
+def _split(facts: _Facts, hull: Array) -> tuple[Array, Array]:
     """Return A and g S R^-1 (g S)' of each corner."""
     n = len(facts.saved.P)
     if hull.shape[2] == n:
@@ -294,7 +294,7 @@ def _split(facts: _Facts, hull: Matrix) -> tuple[Matrix, Matrix]:
     return hull[:, :, :n], hull[:, :, n:]
 
 
-def _rate_at(facts: _Facts, region: SavedRegion, As: Matrix, Ws: Matrix) -> tuple[float, float]:
+def _rate_at(facts: _Facts, region: SavedRegion, As: Array, Ws: Array) -> tuple[float, float]:
     """Return the slowest rate over matrices, and what rounding may make of it."""
     growth, slack = algebra.growth(facts.saved.P, As, Ws, region.strength)
     return -0.5 * growth, 0.5 * slack

@@ -16,7 +16,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
 from echelon.core.numerics import Field
-from echelon.core.types import Input, Matrix, State
+from echelon.core.types import Array, Input, State
 from echelon.models.model import ControlAffine
 
 _WIND, _NOISE = 0, 1
@@ -115,9 +115,9 @@ class Wind(eqx.Module):
     constant (n,), rms (n,), noise (m, m): S times the rms, key (2,), window: steps a draw lasts.
     """
 
-    constant: Matrix
-    rms: Matrix | None
-    noise: Matrix | None
+    constant: Array
+    rms: Array | None
+    noise: Array | None
     key: np.ndarray
     window: np.ndarray
     common: bool = eqx.field(static=True)
@@ -152,7 +152,7 @@ def disturbed(plant: ControlAffine, wind: Wind | None, step: jax.Array, agent: j
     return lambda x, u: plant.velocity(x, u if noise is None else u + noise) + push
 
 
-def _by_state(model: ControlAffine, named: Mapping[str, float]) -> Matrix:
+def _by_state(model: ControlAffine, named: Mapping[str, float]) -> Array:
     """Return a number for each state, (n,); a state's own wins over its group's."""
     values = np.zeros(len(model.state_names))
     for name in sorted(named, key=lambda name: name in model.state_names):
@@ -160,7 +160,7 @@ def _by_state(model: ControlAffine, named: Mapping[str, float]) -> Matrix:
     return values
 
 
-def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Matrix:
+def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Array:
     """Return a number for each input, (m,)."""
     for name in named:
         if name not in model.input_names:

@@ -5,7 +5,7 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.model import ControlAffine
 
 
-class Passive(Law):
+class TrimInput(Law):
     """u = u* + S v_ff, with nothing asked for and so v_ff = 0.
 
     It leaves the agent to its own unforced motion about the trim.

@@ -6,13 +6,14 @@ import numpy as np
 
 from echelon.certificates.certificate import certify
 from echelon.core.errors import GainError
-from echelon.gains.gain import Gain, Method, Weight, as_matrix, check_coupling, check_definite
+from echelon.core.linear import Weight, as_matrix, check_definite
+from echelon.gains.gain import Gain, Method, check_coupling
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
 
-class Given(Method):
+class FixedGain(Method):
     """The user's own P, with no promise beyond what its linearization shows.
 
     Args:

@@ -3,22 +3,85 @@
 import dataclasses
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import PlanError, listing
 from echelon.core.numerics import precision
-from echelon.core.types import Matrix
+from echelon.core.types import Array
 from echelon.models.check import check_model
 from echelon.optimal.casadi import casadi
-from echelon.optimal.infeasible import Violation, least_violations, violations
 from echelon.optimal.problem import OptimalControl
 from echelon.optimal.transcription import Program, transcribe
 
+FELT = 1e-6
+"""A constraint that is missed by less than this counts as met."""
+
+
+class Violation(NamedTuple):
+    """By how much a constraint is missed at most, in its own units, and when (s)."""
+
+    name: str
+    amount: float
+    time: float
+
+
+def violations(program: Program, g: Array) -> tuple[Violation, ...]:
+    """Return by how much each kind of constraint is missed at most, the largest first."""
+    sizes = np.array([row.size for row in program.rows])
+    amounts = sizes * np.maximum(program.low - g, g - program.high)
+    worst: dict[str, Violation] = {}
+    for k in np.flatnonzero(~(amounts <= FELT * sizes)):
+        name, amount = program.rows[k].name, float(amounts[k])
+        if name not in worst or not amount <= worst[name].amount:
+            worst[name] = Violation(name, amount, program.rows[k].time)
+    return tuple(sorted(worst.values(), key=lambda v: -v.amount))
+
+
+def least_violations(program: Program, w: Array, p: Array) -> tuple[Violation, ...]:
+    """Return what is missed where the sum of all misses of the problem's own constraints is least.
+
+    The motion, the start and the actuators' limits are kept. Where these alone contradict each
+    other, or no such point is found, nothing is returned.
+
+    Args:
+        program: has no feasible point.
+        w: where to begin.
+        p: the program's data.
+    """
+    ca = casadi()
+    own = np.flatnonzero([row.own for row in program.rows])
+    if not len(own):
+        return ()
+    above, below = ca.MX.sym("a", len(own)), ca.MX.sym("b", len(own))
+    place = ca.DM(np.eye(len(program.rows))[:, own])
+    elastic = {
+        "x": ca.vertcat(program.problem["x"], above, below),
+        "f": ca.sum1(above) + ca.sum1(below),
+        "g": program.problem["g"] + ca.mtimes(ca.sparsify(place), below - above),
+        "p": program.problem["p"],
+    }
+    quiet = {"print_time": False, "error_on_fail": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    solver = ca.nlpsol("elastic", "ipopt", elastic, quiet)
+    free, slack = np.full(len(w), np.inf), np.ones(2 * len(own))
+    solution: dict[str, Any] = solver(
+        x0=np.concatenate([w, slack]),
+        lbx=np.concatenate([-free, 0.0 * slack]),
+        lbg=program.low,
+        ubg=program.high,
+        p=p,
+    )
+    if not solver.stats()["success"]:
+        return ()
+    slacks = np.array(solution["x"]).ravel()[len(w) :]
+    g = np.array(solution["g"]).ravel()
+    g[own] -= slacks[len(own) :] - slacks[: len(own)]
+    return violations(program, g)
+
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class Trajectory:
     """A trajectory of one agent, and how its solver ended.
 
     Attributes:
@@ -35,16 +98,16 @@ class Plan:
         multipliers: of the variables' bounds and of the constraints, for a warm start.
     """
 
-    times: Matrix
-    states: Matrix
-    inputs: Matrix
+    times: Array
+    states: Array
+    inputs: Array
     cost: float
     solved: bool
     message: str
     violations: tuple[Violation, ...]
     iterations: int
     seconds: float
-    multipliers: tuple[Matrix, Matrix]
+    multipliers: tuple[Array, Array]
 
 
 _DEFAULTS: dict[str, dict[str, Any]] = {
@@ -54,7 +117,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
 """What makes a solver silent, exact about limits, and aware of the structure."""
 
 
-class Planner:
+class Solver:
     """A problem made ready for a solver, to be solved again and again with other data.
 
     Args:
@@ -97,8 +160,8 @@ class Planner:
         self,
         start: Any,
         parameters: Any = None,
-        guess: "Plan | tuple[Matrix, Matrix] | None" = None,
-    ) -> Plan:
+        guess: "Trajectory | tuple[Array, Array] | None" = None,
+    ) -> Trajectory:
         """Return the plan from a start state.
 
         Args:
@@ -122,7 +185,7 @@ class Planner:
         seconds = time.perf_counter() - began
         return self._plan(solution, data["p"], self._solve.stats(), seconds)
 
-    def _begin(self, x: Matrix, guess: Any) -> dict[str, Any]:
+    def _begin(self, x: Array, guess: Any) -> dict[str, Any]:
         """Return where the solver begins."""
         problem = self.problem
         shapes = (problem.steps + 1, len(x)), (problem.nodes, len(problem.model.input_names))
@@ -132,7 +195,7 @@ class Planner:
                 np.tile(x, (shapes[0][0], 1)),
                 np.tile(problem.model.trim[1], (problem.nodes, 1)),
             )
-        elif isinstance(guess, Plan):
+        elif isinstance(guess, Trajectory):
             states, inputs = guess.states, guess.inputs
             multipliers = dict(zip(("lam_x0", "lam_g0"), guess.multipliers, strict=True))
         else:
@@ -144,7 +207,9 @@ class Planner:
         body = np.hstack([states[:N], v[:N]]).ravel()
         return {"x0": np.concatenate([body, states[N], v[N:].ravel()]), **multipliers}
 
-    def _plan(self, solution: Any, data: Matrix, stats: Mapping[str, Any], seconds: float) -> Plan:
+    def _plan(
+        self, solution: Any, data: Array, stats: Mapping[str, Any], seconds: float
+    ) -> Trajectory:
         problem = self.problem
         n, m, N = len(problem.model.state_names), len(problem.model.input_names), problem.steps
         w, g = np.array(solution["x"]).ravel(), np.array(solution["g"]).ravel()
@@ -154,7 +219,7 @@ class Planner:
         missed, least = violations(self.program, g), ()
         if status in _CONTRADICTION and self.explain:
             least = least_violations(self.program, w, data)
-        return Plan(
+        return Trajectory(
             times=problem.dt * np.arange(N + 1),
             states=np.vstack([body[:, :n], tail[:n]]),
             inputs=np.array(problem.model.trim[1]) + v @ _scale(problem).T,
@@ -171,16 +236,16 @@ class Planner:
         )
 
 
-def plan(
+def solve(
     problem: OptimalControl,
     start: Any,
     parameters: Any = None,
     *,
-    guess: Plan | tuple[Matrix, Matrix] | None = None,
+    guess: Trajectory | tuple[Array, Array] | None = None,
     solver: str = "ipopt",
     options: Mapping[str, Any] | None = None,
-) -> Plan:
-    """Solve an optimal control problem once; see `Planner` for solving it again with other data.
+) -> Trajectory:
+    """Solve an optimal control problem once; see `Solver` for solving it again with other data.
 
     Args:
         problem: what to solve.
@@ -193,14 +258,14 @@ def plan(
     Raises:
         EchelonError: the model, the problem or its data is malformed, or casadi is missing.
     """
-    return Planner(problem, solver, options).solve(start, parameters, guess)
+    return Solver(problem, solver, options).solve(start, parameters, guess)
 
 
-def _scale(problem: OptimalControl) -> Matrix:
+def _scale(problem: OptimalControl) -> Array:
     return np.array(problem.model.input_scale)
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...], repeat: bool = False) -> Matrix:
+def _numbers(name: str, value: Any, shape: tuple[int, ...], repeat: bool = False) -> Array:
     """Return finite numbers of a shape; a single row of it is repeated if that is allowed."""
     try:
         array = np.asarray(value, np.float64)

@@ -1,0 +1,39 @@
+"""`echelon check`: the paper's assumptions on a scenario."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from echelon.cli import tables
+from echelon.cli.console import JsonOption, ScenarioArgument
+
+
+def check(
+    scenario: ScenarioArgument,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a value before checking."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Walk through the paper's assumptions on a scenario; exit code 0 if something is promised."""
+    from echelon.scenario.scenario import load_scenario
+
+    checked = load_scenario(scenario, set_ or [])
+    from echelon.scenario.build import build
+    from echelon.studies.check import check as examine
+
+    found = examine(build(checked))
+    if as_json:
+        lines = [line._asdict() for line in found.lines]
+        print(
+            json.dumps(
+                {"promised": found.promised, "promise": found.promise, "lines": lines}, indent=2
+            )
+        )
+    else:
+        console = tables.console()
+        console.print(tables.lines_table(found.lines), soft_wrap=not console.is_terminal)
+        console.print(found.promise, highlight=False, soft_wrap=not console.is_terminal)
+    raise typer.Exit(0 if found.promised else 1)

@@ -1,0 +1,86 @@
+"""`echelon design`: gain methods side by side."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from echelon.cli import tables
+from echelon.cli.console import JsonOption, ScenarioArgument
+
+if TYPE_CHECKING:
+    from echelon.engine.parts import Parts
+    from echelon.gains.gain import Gain
+
+
+def design(
+    scenario: ScenarioArgument,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a value before designing."),
+    ] = None,
+    method: Annotated[str | None, typer.Option(help="Only this method.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Save the gain to this file.")] = None,
+    figures: Annotated[
+        Path | None, typer.Option(help="Draw modes and certified set into this folder.")
+    ] = None,
+    slice_: Annotated[
+        str | None, typer.Option("--slice", metavar="STATE,STATE", help="What the set is drawn in.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Try all gain methods on a scenario, recommend one, save its gain, draw what it promises."""
+    from echelon.scenario.scenario import load_scenario
+
+    checked = load_scenario(scenario, set_ or [])
+    from echelon.gains.file import save_gain
+    from echelon.scenario.build import build
+    from echelon.studies.design import because, designs, recommended
+
+    _known_method(method)
+    parts = build(checked)
+    dt = checked.simulation.dt
+    tried = designs(checked, parts, method)
+    best = recommended(tried, dt)
+    sentence = "No method gives a stable loop here."
+    told: dict[str, Any] = {"recommended": None}
+    if best is not None and best.gain is not None:
+        sentence = because(best, tried, dt)
+        told = {"recommended": best.method, "because": sentence}
+        if out is not None:
+            save_gain(best.gain, parts.model, parts.graph, out)
+        if figures is not None:
+            radii = _design_figures(parts, best.gain, figures, slice_)
+            sentence += f"\n{radii}" if radii else ""
+            told["radii"] = radii
+    told["methods"] = [tables.design_row(each) for each in tried]
+    if as_json:
+        print(json.dumps(told, indent=2))
+    else:
+        tables.print_designs(told["methods"], sentence)
+    raise typer.Exit(0 if best is not None else 1)
+
+
+def _design_figures(parts: "Parts", gain: "Gain", folder: Path, asked: str | None) -> str | None:
+    """Draw a design's figures, and return a sentence on its radii if it has any."""
+    from echelon.core.errors import OutputError
+    from echelon.plots.design import save_design_figures
+    from echelon.studies.design import with_gain
+
+    try:
+        _, radii = save_design_figures(with_gain(parts, gain), folder, asked)
+    except OSError as error:
+        raise OutputError(f"`{folder}` cannot be written: {error.strerror or error}.") from error
+    return None if radii is None else radii.sentence()
+
+
+def _known_method(method: str | None) -> None:
+    from echelon.core.errors import GainError, did_you_mean, listing
+    from echelon.scenario.registry import METHODS
+
+    if method is not None and method not in METHODS:
+        raise GainError(
+            f"`--method` is `{method}`, allowed are {listing(METHODS)}"
+            f"{did_you_mean(method, METHODS)}."
+        )

@@ -1,0 +1,149 @@
+"""Linear systems theory that knows no agent: held steps, controllability, Riccati."""
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+import scipy.linalg
+
+from echelon.core.errors import GainError
+from echelon.core.types import Array
+
+
+def held_radius(A: np.ndarray, B: np.ndarray, K: np.ndarray, dt: float) -> float:
+    """Return the spectral radius of a step of xdot = A x - B K x(t_k), the input held over dt."""
+    n, m = B.shape
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = A, B
+    flow = scipy.linalg.expm(block * dt)
+    return float(np.abs(np.linalg.eigvals(flow[:n, :n] - flow[:n, n:] @ K)).max())
+
+
+def longest_step(A: np.ndarray, B: np.ndarray, gains: Sequence[np.ndarray]) -> float:
+    """Return the longest dt (s) with which every loop xdot = A x - B K x(t_k) still decays.
+
+    The step is lengthened by tenths from a thousandth of the fastest mode's time until a loop
+    grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
+    slowest mode's.
+    """
+    poles = np.concatenate([np.linalg.eigvals(A - B @ K) for K in gains])
+    dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
+
+    def decays(dt: float) -> bool:
+        return all(held_radius(A, B, K, dt) < 1.0 for K in gains)
+
+    while decays(1.1 * dt):
+        dt *= 1.1
+        if dt > end:
+            return float("inf")
+    low, high = dt, 1.1 * dt
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if decays(middle) else (low, middle)
+    return float(low)
+
+
+def in_words(eigenvalue: complex) -> str:
+    """Return an eigenvalue as text, without an imaginary part that is zero."""
+    real = f"{eigenvalue.real + 0.0:.3g}"
+    return real if eigenvalue.imag == 0.0 else f"{real} +- {abs(eigenvalue.imag):.3g}i"
+
+
+def symmetric_part(matrix: np.ndarray) -> np.ndarray:
+    """Return (M + M^T) / 2."""
+    return 0.5 * (matrix + matrix.T)
+
+
+def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np.ndarray]]:
+    """Return the eigenvalues of A that input B cannot move, each with its left eigenvector.
+
+    This is the PBH test: a mode counts as uncontrollable when the smallest singular value of
+    [s I - A, B] is below 1e-9 times the norm of the pair.
+    """
+    scale = max(1.0, float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)))
+    found = []
+    for s in np.linalg.eigvals(A):
+        pencil = np.hstack([s * np.eye(len(A)) - A, B])
+        left, singular, _ = np.linalg.svd(pencil)
+        if singular[-1] <= 1e-9 * scale:
+            found.append((complex(s), left[:, -1].conj()))
+    return found
+
+
+def observability_rank(A: np.ndarray, C: np.ndarray) -> int:
+    """Return the rank of the observability matrix [C; C A; ...], each block scaled to unit norm."""
+    block, rows = C, [C]
+    for _ in range(len(A) - 1):
+        block = block @ A
+        size = np.linalg.norm(block)
+        if size == 0.0:
+            break
+        block = block / size
+        rows.append(block)
+    return int(np.linalg.matrix_rank(np.vstack(rows)))
+
+
+def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return the stabilizing solution P of A'P + P A - P B R^-1 B'P + Q = 0.
+
+    Raises:
+        GainError: the equation has no stabilizing solution.
+    """
+    if not len(A):
+        return np.zeros((0, 0))
+    try:
+        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise GainError(
+            f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "
+            "check that every undamped mode is weighted by `Q`."
+        ) from error
+    return symmetric_part(P)
+
+
+Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Array
+
+
+def check_definite(name: str, matrix: np.ndarray) -> None:
+    """Check that a matrix is finite, symmetric (to 1e-9 of its size) and positive definite.
+
+    Raises:
+        GainError: it is not.
+    """
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise GainError(f"`{name}` has shape {matrix.shape}, and must be square.")
+    if not np.isfinite(matrix).all():
+        raise GainError(f"`{name}` holds a number that is not finite.")
+    gap = np.abs(matrix - matrix.T)
+    if gap.max() > 1e-9 * np.abs(matrix).max():
+        i, j = np.unravel_index(np.argmax(gap), gap.shape)
+        raise GainError(
+            f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} "
+            f"and entry [{j}, {i}] is {matrix[j, i]:.6g}."
+        )
+    least = float(np.linalg.eigvalsh(matrix)[0])
+    if least <= 0.0:
+        raise GainError(
+            f"`{name}` is not positive definite: its smallest eigenvalue is {least:.6g}."
+        )
+
+
+def as_matrix(name: str, value: Weight, size: int) -> Array:
+    """Return a weight as a square matrix; a plain list of numbers is a diagonal.
+
+    Raises:
+        GainError: it is neither `size` numbers nor a `size` x `size` matrix.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise GainError(
+            f"`{name}` is {value}, and must be {size} numbers or {size} x {size}."
+        ) from None
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape != (size, size):
+        raise GainError(
+            f"`{name}` has shape {array.shape}, and must be {size} numbers or {size} x {size}."
+        )
+    return array

@@ -1,0 +1,41 @@
+"""What a branch amplifies where each agent is fed its parent's input."""
+
+import numpy as np
+
+from echelon.certificates.margins import ClosedLoop, string_gain
+from echelon.core.errors import GainError
+from echelon.gains.gain import Gain
+from echelon.models.linearization import linearize
+from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
+
+
+def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+    """Return a sentence on ||T||_inf along the branch that amplifies most (theory page, T4)."""
+    linear = linearize(model)
+    A = linear.A if gain.inner is None else linear.A - linear.B @ gain.inner
+    depth, parents = graph.depths(), graph.parents()
+    i, j = graph.edges.T
+    weight = np.ones(graph.agents)
+    weight[np.where(depth[i] > depth[j], i, j)] = graph.weights
+    used = np.unique(weight[list(graph.followers)])
+    try:
+        gains = [
+            string_gain(ClosedLoop(A, linear.B, gain.P, gain.R, gain.coupling * w, used)).gain
+            for w in used
+        ]
+    except GainError:
+        return (
+            f"with the parent's input fed forward, coupling {gain.coupling:.4g} times an edge's "
+            f"weight, {used[0]:.4g}, is too weak: a mode of the formation does not decay.",
+        )
+    growth = np.ones(graph.agents)
+    for agent in np.argsort(depth, kind="stable"):
+        if depth[agent]:
+            growth[agent] = growth[parents[agent]] * gains[np.searchsorted(used, weight[agent])]
+    worst = int(growth.argmax())
+    return (
+        "with the parent's input fed forward, each agent of a branch amplifies a push by up to "
+        f"||T|| = {max(gains):.3g}, and the {depth[worst]} agents up from agent {worst} by up to "
+        f"{growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
+    )

@@ -1,0 +1,99 @@
+"""Reading and checking the edges and leaders that a graph is made from."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from echelon.core.errors import GraphError
+from echelon.core.types import Array
+
+
+def split_weights(edges: Iterable[Sequence[float]]) -> tuple[Array, Array]:
+    """Return pairs (E, 2) of whole numbers and weights (E,)."""
+    if isinstance(edges, np.ndarray) and edges.ndim == 2 and edges.shape[1] == 2:
+        return _whole(edges, "an edge is"), np.ones(len(edges))
+    edges = [tuple(edge) for edge in edges]
+    for edge in edges:
+        if len(edge) not in (2, 3):
+            raise GraphError(f"an edge is {list(edge)}, and must be [i, j] or [i, j, weight].")
+    weights = np.array([edge[2] if len(edge) == 3 else 1.0 for edge in edges], dtype=np.float64)
+    return _whole([edge[:2] for edge in edges], "an edge is").reshape(-1, 2), weights
+
+
+def _whole(values: Sequence[Any] | Array, what: str) -> Array:
+    """Return agent numbers, or rows of them, as integers, after checking that they are whole."""
+    if not _are_whole(values):
+        for value in values:
+            if not _are_whole(value):
+                shown = list(value) if isinstance(value, tuple) else value
+                raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
+    return np.array(values, dtype=np.float64).astype(np.int64)
+
+
+def _are_whole(values: object) -> bool:
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return bool((numbers == np.round(numbers)).all() and np.isfinite(numbers).all())
+
+
+def count_agents(pairs: Array, agents: int | None) -> int:
+    """Return the number of agents, that of the largest named when left out."""
+    named = int(pairs.max(initial=0)) + 1
+    if agents is None:
+        agents = named
+    check_at_least(agents, 2, "graph")
+    if named > agents:
+        raise GraphError(
+            f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}."
+        )
+    return agents
+
+
+def check_edges(pairs: Array, weights: Array, agents: int) -> tuple[Array, Array]:
+    """Return the edges with the smaller agent first, and their weights."""
+    edges = np.sort(pairs, axis=1)
+    for i, j in pairs[edges[:, 0] < 0][:1]:
+        raise GraphError(
+            f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
+        )
+    for i, j in edges[edges[:, 0] == edges[:, 1]][:1]:
+        raise GraphError(
+            f"edge [{i}, {j}] links agent {i} to itself, and an edge must link two agents."
+        )
+    _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    for i, j in edges[np.sort(first[count > 1])][:1]:
+        raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
+    wrong = ~((weights > 0.0) & (weights < np.inf))
+    for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
+        raise GraphError(
+            f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive and finite."
+        )
+    return edges, weights
+
+
+def check_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
+    """Return the leaders, sorted, after checking that each is an agent."""
+    chosen = tuple(sorted(set(_whole(list(leaders), "a leader is").tolist())))
+    if not chosen:
+        raise GraphError("the graph has no leader; name at least one agent in `leaders`.")
+    for leader in chosen:
+        if not 0 <= leader < agents:
+            raise GraphError(
+                f"leader {leader} is no agent; agents are numbered from 0 to {agents - 1}."
+            )
+    return chosen
+
+
+def check_at_least(agents: int, least: int, kind: str) -> None:
+    """Check that a kind of graph has enough agents."""
+    if agents < least:
+        raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
+
+
+def _some(agents: np.ndarray) -> str:
+    """Return a subject such as `agents 2, 3 have`, shortened when there are many."""
+    shown = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
+    return f"agent {shown} has" if len(agents) == 1 else f"agents {shown} have"
