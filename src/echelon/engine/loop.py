@@ -14,6 +14,7 @@ import numpy as np
 from echelon.core import numerics
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, Input, Inputs, State, States
+from echelon.core.words import Feedforward
 from echelon.engine.result import Settings
 from echelon.laws.law import Law, LocalView, Memory, without_certificates
 from echelon.models.model import ControlAffine
@@ -90,7 +91,7 @@ def assemble(
             f"with {shape[1]} states need {shape}."
         )
     leaders, followers = np.array(graph.leaders), np.array(graph.followers)
-    by_depth = follower.feedforward == "parent"
+    by_depth = follower.feedforward is Feedforward.PARENT
     nearest = np.array(graph.nearest_leader())
     return Loop(
         model=model,
@@ -179,7 +180,7 @@ def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) 
 
 def _told(loop: Loop, x: States, u: Inputs) -> jax.Array:
     """Return what is told of agents at x (K, n) with delivered inputs u (K, m)."""
-    if loop.follower.feedforward == "none":
+    if loop.follower.feedforward is Feedforward.NONE:
         return jnp.zeros_like(u)
     trim = jnp.asarray(loop.model.trim[1], u.dtype)
     v = (u - trim[None]) @ jnp.asarray(loop.normalizer, u.dtype).T

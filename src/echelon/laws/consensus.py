@@ -7,18 +7,23 @@ from jaxtyping import Float
 
 from echelon.core.errors import LawError, did_you_mean, listing
 from echelon.core.types import Array, Input, State
+from echelon.core.words import Feedforward
 from echelon.gains.gain import Gain
 from echelon.gains.strings import string_growth
-from echelon.laws.law import Feedforward, Law, LocalView, Memory, check_gain_fits
+from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
-_TOLD = {
-    "none": (),
-    "relay": ("the leader's input of the same step",),
-    "relay-velocity": ("the velocity that the leader's input of the same step makes",),
-    "parent": ("its parent's input of the same step",),
-}
+
+def _feedforward(name: object) -> Feedforward:
+    try:
+        return Feedforward.named(name)
+    except KeyError:
+        names = list(map(str, Feedforward))
+        raise LawError(
+            f"`feedforward` is `{name}`, allowed are {listing(names)}"
+            f"{did_you_mean(str(name), names)}."
+        ) from None
 
 
 class Consensus(Law):
@@ -38,26 +43,24 @@ class Consensus(Law):
     """
 
     gain: Gain
-    feedforward: Feedforward = eqx.field(default="none", static=True)
+    feedforward: Feedforward = eqx.field(
+        default=Feedforward.NONE, static=True, converter=_feedforward
+    )
     trim: bool = eqx.field(default=True, static=True)
 
     def __check_init__(self) -> None:
-        """Refuse what is no gain, and an unknown feed-forward."""
+        """Refuse what is no gain."""
         if not isinstance(self.gain, Gain):
             raise LawError(
                 f"`gain` of `Consensus` is {self.gain!r}, and must be a `Gain`, as `synthesize` "
                 "returns it."
             )
-        if self.feedforward not in _TOLD:
-            raise LawError(
-                f"`feedforward` is `{self.feedforward}`, allowed are {listing(_TOLD)}"
-                f"{did_you_mean(self.feedforward, _TOLD)}."
-            )
 
     @property
     def information(self) -> tuple[str, ...]:
         """Neighbours' states, and what is fed forward."""
-        return ("neighbours' states", *_TOLD[self.feedforward])
+        silent = self.feedforward is Feedforward.NONE
+        return ("neighbours' states", *(() if silent else (self.feedforward.value,)))
 
     def metric(self, model: ControlAffine) -> Array:
         """Return the gain's P."""
@@ -66,18 +69,20 @@ class Consensus(Law):
     def prepared(self, model: ControlAffine, graph: Graph) -> "Consensus":
         """Check that the gain fits the model, and the feed-forward the graph."""
         check_gain_fits(self, model, self.gain.P.shape, self.gain.R.shape)
-        if self.feedforward == "parent":
+        if self.feedforward is Feedforward.PARENT:
             graph.parents()
         return self
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Tell by how much a branch amplifies, where the parent's input is fed forward."""
-        return string_growth(self.gain, model, graph) if self.feedforward == "parent" else ()
+        return (
+            string_growth(self.gain, model, graph) if self.feedforward is Feedforward.PARENT else ()
+        )
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
         told = view.feedforward
-        if self.feedforward == "relay-velocity":
+        if self.feedforward is Feedforward.RELAY_VELOCITY:
             told = _matching(self.gain, model, view.x, told)
         v = told - feedback(self.gain, model, view.x, view.disagreement)
         return model.physical(v + self.gain.inner_loop(model, view.x), trim=self.trim), memory
@@ -85,7 +90,7 @@ class Consensus(Law):
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return the input beyond the inner loop, v - kappa(x), or the velocity that it makes."""
         beyond = v - self.gain.inner_loop(model, x)
-        if self.feedforward == "relay-velocity":
+        if self.feedforward is Feedforward.RELAY_VELOCITY:
             return model.normalized_input_map(x) @ beyond
         return beyond
 

@@ -1,7 +1,7 @@
 """The interface of a control law, and all that one agent may know when it runs one."""
 
 import abc
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 from echelon.core.errors import LawError
 from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.words import Feedforward
 from echelon.gains.gain import Gain
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
-Feedforward: TypeAlias = Literal["none", "relay", "relay-velocity", "parent"]
 Memory: TypeAlias = Any
 
 
@@ -44,12 +44,11 @@ class Law(eqx.Module):
     It is the same for one agent in its own process and for a million in a batch.
 
     Attributes:
-        feedforward: which feed-forward the law asks for. `none`; `relay` or `relay-velocity`: its
-            leader's broadcast of the same step; `parent`: that of its parent, the one neighbour
-            nearer to a leader.
+        feedforward: which feed-forward the law asks for, none unless replaced by a field, an
+            attribute or a property.
     """
 
-    feedforward: ClassVar[Feedforward] = "none"
+    feedforward = Feedforward.NONE
 
     @property
     def information(self) -> tuple[str, ...]:

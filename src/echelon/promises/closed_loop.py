@@ -14,6 +14,7 @@ from echelon.certificates.certificate import (
 from echelon.certificates.margins import ClosedLoop, decays_between
 from echelon.core.linear import held_radius
 from echelon.core.types import Array
+from echelon.core.words import Feedforward
 from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
@@ -62,7 +63,7 @@ class CheckedLoop(NamedTuple):
     @property
     def fed_by_parents(self) -> bool:
         """Whether each follower is told the input of its parent."""
-        return self.parts.follower.feedforward == "parent"
+        return self.parts.follower.feedforward is Feedforward.PARENT
 
     @property
     def inner(self) -> Array:
@@ -101,7 +102,7 @@ class CheckedLoop(NamedTuple):
     @property
     def matched(self) -> bool:
         """Whether the followers are told an input, or the leader has none beyond the trim."""
-        return self.parts.follower.feedforward != "none" or not self.moving
+        return self.parts.follower.feedforward is not Feedforward.NONE or not self.moving
 
 
 def checked_loop(parts: Parts) -> CheckedLoop:
@@ -116,7 +117,7 @@ def checked_loop(parts: Parts) -> CheckedLoop:
         A = A if gain.inner is None else A - B @ gain.inner
     linear, P = Linearization(A, B), np.eye(n) if P is None else P
     modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
-    if parts.follower.feedforward == "parent":
+    if parts.follower.feedforward is Feedforward.PARENT:
         edge = None if edge is None else edge * modes[0]
         modes = parent_modes(graph)
         edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"

@@ -8,6 +8,7 @@ from echelon.certificates.certificate import Certificate, certify, parent_modes
 from echelon.core.errors import Outcome
 from echelon.core.linear import held_radius
 from echelon.core.numerics import precision
+from echelon.core.words import Feedforward
 from echelon.engine.result import Result, imperfections
 from echelon.gains.gain import Gain
 from echelon.laws.law import gain_of
@@ -112,7 +113,7 @@ def _long_step(result: Result, gain: Gain) -> Iterator[str]:
 
 def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
     worst = numbers.worst_steady
-    if worst is None or worst <= _LAG or result.follower.feedforward != "none":
+    if worst is None or worst <= _LAG or result.follower.feedforward is not Feedforward.NONE:
         return
     if result.reference is not None and np.ptp(result.reference, axis=0).max() > 0.0:
         yield (
@@ -138,7 +139,7 @@ def _promises(result: Result) -> Iterator[str]:
     if gain is not None:
         certificate = gain.certificate
         abscissa, from_on = certificate.abscissa, certificate.edge
-        if result.follower.feedforward == "parent":
+        if result.follower.feedforward is Feedforward.PARENT:
             abscissa, from_on = _with_parents(result, gain)
         verdict = _verdict(abscissa)
         edge = "" if from_on is None else f" (guaranteed for linear agents from {from_on:.4g} on)"

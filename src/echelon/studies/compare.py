@@ -8,6 +8,7 @@ import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, did_you_mean, listing
 from echelon.core.numerics import precision
+from echelon.core.words import Feedforward
 from echelon.engine.initial import initial_states
 from echelon.engine.parts import Parts
 from echelon.engine.result import Result, imperfections
@@ -18,7 +19,6 @@ from echelon.gains.gain import Gain, Method, synthesize
 from echelon.gains.inner_loop import InnerLoop
 from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import Consensus
-from echelon.laws.law import Feedforward
 from echelon.optimal.pilots import simulate_mpc, simulate_plans
 from echelon.results.metrics import Metrics, metrics
 from echelon.scenario.build import build
@@ -229,7 +229,9 @@ def _own(parts: Parts) -> dict[str, Fly]:
         return {}
     if gain.method in ("riccati", "inner-loop", "given"):
         return {}
-    label = gain.method if law.feedforward == "none" else f"{gain.method}-{law.feedforward}"
+    label = (
+        gain.method if law.feedforward is Feedforward.NONE else f"{gain.method}-{law.feedforward}"
+    )
     return {label: _consensus(lambda parts: gain, law.feedforward, law.trim)}
 
 
@@ -256,10 +258,10 @@ def _optimized(fly: Callable[..., Result]) -> Fly:
 
 
 _FLY: Mapping[str, Fly] = {
-    "literal": _consensus(_synthesized(FixedGain()), "none", trim=False),
-    "riccati-relay": _consensus(_riccati, "relay"),
-    "riccati": _consensus(_riccati, "none"),
-    "inner-loop": _consensus(_synthesized(InnerLoop()), "relay"),
+    "literal": _consensus(_synthesized(FixedGain()), Feedforward.NONE, trim=False),
+    "riccati-relay": _consensus(_riccati, Feedforward.RELAY),
+    "riccati": _consensus(_riccati, Feedforward.NONE),
+    "inner-loop": _consensus(_synthesized(InnerLoop()), Feedforward.RELAY),
     "optimization": _optimized(simulate_plans),
     "mpc": _optimized(simulate_mpc),
 }

@@ -1,0 +1,77 @@
+"""The words that tables and files hold, each a type whose value is what it means.
+
+Nothing here needs JAX, so a scenario's checks can read them. Rooms compare members, never names.
+"""
+
+import enum
+from typing import Self
+
+
+class Word(enum.Enum):
+    """A word with a meaning: its name stands in tables and files, its value is the meaning."""
+
+    def __str__(self) -> str:
+        """Return the word as tables and files have it."""
+        return self.name.lower().replace("_", "-")
+
+    @classmethod
+    def named(cls, name: object) -> Self:
+        """Return the member of a name; a member is returned as it is.
+
+        Raises:
+            KeyError: there is none.
+        """
+        if isinstance(name, cls):
+            return name
+        return {str(member): member for member in cls}[str(name)]
+
+
+class Feedforward(Word):
+    """What a follower is sent of others' inputs of the same step, after their limits."""
+
+    NONE = "nothing of others' inputs"
+    RELAY = "the leader's input of the same step"
+    RELAY_VELOCITY = "the velocity that the leader's input of the same step makes"
+    PARENT = "its parent's input of the same step"
+
+
+class Kind(Word):
+    """The kind of an argument, and how a promise that rests on it begins; the strongest first."""
+
+    PROOF = "Proved in exact arithmetic, in continuous time and within the inputs' limits"
+    VERTICES = (
+        "By eigenvalues at the corners of a hull of all Jacobians, in continuous time and within "
+        "the inputs' limits"
+    )
+    SAMPLES = "Seen at samples, which is no proof"
+    LINEARIZATION = "By linearization at the trim"
+
+    @property
+    def strength(self) -> int:
+        """How strong the argument is: 3 for a proof, 0 for linearization."""
+        return len(Kind) - 1 - list(Kind).index(self)
+
+
+class Theorem(Word):
+    """A theorem of the theory page, and what it says of errors."""
+
+    T1 = "errors of all sizes shrink while all agents stay in"
+    T2 = "small errors shrink while the leader stays in"
+    A5 = "the drift does not expand P while all agents stay in"
+
+    def __str__(self) -> str:
+        """Return the theorem's name as the theory page has it."""
+        return self.name
+
+
+class Verdict(Word):
+    """What a line of a check ends in."""
+
+    HOLDS = "holds"
+    FAILS = "fails"
+    NOT_NEEDED = "not needed"
+    VACUOUS = "vacuous"
+
+    def __str__(self) -> str:
+        """Return the verdict."""
+        return self.value
