@@ -8,6 +8,7 @@ import scipy.linalg
 from oracles import laplacian
 
 from echelon.core.errors import EchelonError, ScenarioError
+from echelon.core.words import Feedforward
 from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
@@ -224,7 +225,7 @@ class Counting(Law):
 
     @property
     def feedforward(self):
-        return "parent"
+        return Feedforward.PARENT
 
     def init(self):
         return jnp.zeros(())
@@ -339,7 +340,7 @@ def test_the_report_promises_the_modes_that_parents_leave():
 
 def test_a_scenario_may_ask_for_it_and_is_told_where_it_cannot():
     parts = build(load_scenario("paper", ["follower.feedforward=parent"]))
-    assert parts.follower.feedforward == "parent"
+    assert parts.follower.feedforward is Feedforward.PARENT
     asked = ["follower.feedforward=parent", "graph={name: ring, agents: 4}"]
     with pytest.raises(ScenarioError, match="follower: the graph is no tree: agent 2 has more"):
         build(load_scenario("paper", asked))

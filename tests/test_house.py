@@ -128,7 +128,7 @@ def is_abstract(cls: type) -> bool:
     return (
         inspect.isabstract(cls)
         or any(getattr(cls, name, None) for name in ("__abstractvars__", "__abstractclassvars__"))
-        or any(base.__name__ in ("ABC", "Protocol") for base in cls.__bases__)
+        or any(base.__name__ in ("ABC", "Protocol", "Enum") for base in cls.__bases__)
     )
 
 

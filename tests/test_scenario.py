@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import echelon.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
+from echelon.scenario import registry
 from echelon.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.scenario.scenario import (
     Fault,
@@ -231,7 +232,7 @@ def test_yaml_1_2_decides_what_a_word_is(load, refused):
 def planted():
     """Pairs of a faulty line and its sentence."""
     text = (Path(__file__).parent / "scenario_faults.txt").read_text("utf-8")
-    text = re.sub("<([A-Z_]+)>", lambda table: listing(getattr(_registry, table[1])), text)
+    text = re.sub("<([A-Z_]+)>", lambda table: listing(getattr(registry, table[1])), text)
     blocks = [block.splitlines() for block in text.split("\n\n") if not block.startswith("#")]
     assert len(blocks) > 90
     return [pytest.param(line, fault, id=line) for line, fault in blocks]

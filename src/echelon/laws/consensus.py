@@ -75,9 +75,9 @@ class Consensus(Law):
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Tell by how much a branch amplifies, where the parent's input is fed forward."""
-        return (
-            string_growth(self.gain, model, graph) if self.feedforward is Feedforward.PARENT else ()
-        )
+        if self.feedforward is not Feedforward.PARENT:
+            return ()
+        return string_growth(self.gain, model, graph)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""

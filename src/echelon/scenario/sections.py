@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from echelon.core.words import Feedforward
 from echelon.scenario.registry import (
     FOLLOWER_LAWS,
     FORMATIONS,
@@ -206,7 +207,7 @@ class FollowerSpec(BaseModel):
         default="consensus", description="Name of a law."
     )
     gain: GainSpec = Field(default_factory=GainSpec, description="Gain of the law `consensus`.")
-    feedforward: Literal["none", "relay", "relay-velocity", "parent"] = Field(
+    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = Field(
         default="relay",
         description="What every follower is told of the same step: `relay`, the leader's input; "
         "`relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer "
