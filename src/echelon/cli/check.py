@@ -24,7 +24,7 @@ def check(
     from echelon.scenario.build import build
     from echelon.studies.check import check as examine
 
-    found = examine(build(checked))
+    found = examine(*build(checked))
     if as_json:
         lines = [line._asdict() for line in found.lines]
         print(

@@ -10,13 +10,12 @@ from echelon.certificates.certificate import Kind
 from echelon.core.errors import EchelonError
 from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
-from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain, synthesize
 from echelon.laws.consensus import Consensus
 from echelon.promises.certified_set import CertifiedSet, certified_set
 from echelon.promises.closed_loop import CheckedLoop, checked_loop
 from echelon.scenario import registry
-from echelon.scenario.build import resolve
+from echelon.scenario.build import Built, resolve
 from echelon.scenario.scenario import Scenario
 from echelon.studies.speedup import speedup
 
@@ -55,10 +54,10 @@ class Design(NamedTuple):
     seconds: float = 0.0
 
 
-def designs(scenario: Scenario, parts: Parts, only: str | None = None) -> tuple[Design, ...]:
+def designs(scenario: Scenario, built: Built, only: str | None = None) -> tuple[Design, ...]:
     """Try the methods on a built scenario, or `only` one of them."""
     names = [only] if only else [name for name in registry.METHODS if name != "given"]
-    return tuple(_design(name, scenario, parts) for name in names)
+    return tuple(_design(name, scenario, built) for name in names)
 
 
 def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
@@ -97,28 +96,29 @@ def _merit(design: Design, dt: float) -> tuple[bool, int, float]:
     return design.step > dt, strength, -certificate.abscissa
 
 
-def _design(name: str, scenario: Scenario, parts: Parts) -> Design:
+def _design(name: str, scenario: Scenario, built: Built) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
     options = _options(name, scenario)
     if name in _NEEDS_DOMAIN and "domain" not in options:
         return Design(name, None, "give `follower.gain.domain` to try it")
     began = time.perf_counter()
     try:
-        gain = synthesize(parts.model, parts.graph, resolve(registry.METHODS[name])(**options))
+        gain = synthesize(
+            built.parts.model, built.parts.graph, resolve(registry.METHODS[name])(**options)
+        )
     except EchelonError as error:
         return Design(name, None, str(error), seconds=time.perf_counter() - began)
     seconds = time.perf_counter() - began
     with precision("float64"):
-        return _known(name, with_gain(parts, gain))._replace(seconds=seconds)
+        return _known(name, with_gain(built, gain))._replace(seconds=seconds)
 
 
-def with_gain(parts: Parts, gain: Gain) -> CheckedLoop:
+def with_gain(built: Built, gain: Gain) -> CheckedLoop:
     """Return the closed loop of the scenario under another gain, the feed-forward kept."""
-    asked = parts.follower.feedforward
-    trim = getattr(parts.follower, "trim", True)
-    law = Consensus(gain, feedforward=asked, trim=trim)
+    parts, settings = built
+    drive = parts.drive.with_follower(Consensus(gain, parts.drive.feedforward, parts.drive.trimmed))
     with precision("float64"):
-        return checked_loop(parts._replace(follower=law))
+        return checked_loop(parts.replace(drive=drive), settings)
 
 
 def _known(name: str, loop: CheckedLoop) -> Design:

@@ -68,7 +68,7 @@ def _decay_line(loop: CheckedLoop) -> Line:
 
 def _step_line(loop: CheckedLoop) -> Line:
     """Whether it still decays with the input held over the scenario's step."""
-    statement, dt = "step, input held", float(loop.parts.settings["dt"])
+    statement, dt = "step, input held", loop.settings.dt
     if not loop.every:
         return Line(statement, "not needed", _KIND, f"dt {dt:g} s", "there is nothing to lose")
     radius = step_radius(loop, dt)
