@@ -29,7 +29,7 @@ settings.load_profile("echelon")
 @pytest.fixture
 def echelon(monkeypatch, capsys):
     """Run the command line in this process: exit code, standard output, standard error."""
-    from echelon import cli
+    from echelon.cli import app as cli
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])

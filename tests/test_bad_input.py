@@ -3,6 +3,7 @@
 import networkx as nx
 import numpy as np
 import pytest
+from runs import simulate
 
 from echelon.core.errors import (
     EchelonError,
@@ -14,7 +15,6 @@ from echelon.core.errors import (
     ReferenceError,
     SimulationError,
 )
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput

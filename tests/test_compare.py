@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon import cli
+from echelon.cli import app as cli
 from echelon.reports.comparison import comparison_report, verdict
 from echelon.studies.compare import LABELS, Comparison
 

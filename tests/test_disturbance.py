@@ -8,9 +8,9 @@ import pytest
 import scipy.linalg
 import scipy.stats
 from oracles import laplacian
+from runs import simulate
 
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Consensus, Tracking, TrimInput

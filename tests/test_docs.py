@@ -13,7 +13,7 @@ import matplotlib
 import pytest
 
 import echelon as ech
-from echelon import cli
+from echelon.cli import app as cli
 from echelon.reports.printed import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]

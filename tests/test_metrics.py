@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from runs import simulate
 
 import echelon as ech
 from echelon.core.errors import Outcome
@@ -127,7 +128,7 @@ def test_the_relay_is_a_fixed_point_of_the_formation():
     """Started on their goals, followers told the leader's input stay there to rounding."""
     model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
     formation = ech.Formation.from_offsets(model, graph, {1: (1, 0, 0), 2: (2, 0, 0)})
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         formation,

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from runs import simulate
 
 import echelon as ech
 from echelon.core.errors import LawError, PlanError
@@ -21,7 +22,7 @@ def led(leader, **more):
     given = {"horizon": 1.0, "dt": 0.005, "start_error": ERROR, "store_every": 10, **more}
     formation = given.pop("formation", DRAWN)
     follower = ech.laws.Consensus(GAIN, feedforward="relay")
-    return ech.simulate(QUADROTOR, TREE, formation, leader=leader, follower=follower, **given)
+    return simulate(QUADROTOR, TREE, formation, leader=leader, follower=follower, **given)
 
 
 def prepared(**how):
@@ -109,8 +110,8 @@ simulation: {horizon: 1.0, dt: 0.005, store_every: 10}
     file.write_text(text)
     scenario = ech.load_scenario(file)
     parts = ech.build(scenario)
-    assert isinstance(parts.leader, ech.optimal.OptimalTracking)
-    assert parts.leader.states == pytest.approx(LAW.states, abs=1e-5)
+    assert isinstance(parts.drive.leader, ech.optimal.OptimalTracking)
+    assert parts.drive.leader.states == pytest.approx(LAW.states, abs=1e-5)
     result = ech.run(scenario)
     assert rmse(result) == pytest.approx(rmse(led(LAW)), abs=1e-6)
 

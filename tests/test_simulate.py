@@ -17,11 +17,11 @@ from oracles import (
     newton_euler,
     quadrotor_input_map,
 )
+from runs import simulate
 from scipy.integrate import solve_ivp
 
 from echelon.core.errors import EchelonError, Outcome
 from echelon.engine import simulate as _simulate
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput
@@ -547,7 +547,6 @@ import jax
 import numpy as np
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
-from echelon.engine.simulate import simulate
 from echelon.gains.synthesize import synthesize
 from echelon.gains import Riccati
 from echelon.laws import Consensus, Tracking

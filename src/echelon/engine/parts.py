@@ -18,7 +18,7 @@ Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.nd
 
 
 @final
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Parts:
     """Agents, who hears whom, where each belongs, what drives them, how they start, their world.
 

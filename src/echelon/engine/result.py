@@ -20,7 +20,7 @@ from echelon.world.world import World
 
 
 @final
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Result:
     """A run: T stored frames of N agents with n states and m inputs.
 
