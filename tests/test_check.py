@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from echelon.studies.region import killing_residual
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,7 +17,6 @@ from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
 from echelon.studies.check import check
 from echelon.studies.finite_condition import pair_values
-from echelon.studies.region import killing_residual
 
 PATH = ech.Graph.path(4)
 LOW, _, HIGH = PATH.grounded_spectrum()

@@ -32,6 +32,7 @@ class RegionCertificate(eqx.Module):
             all Jacobians A, or samples of them. For `T2`, whose g varies, it is (K, n, 2n): each A
             with its g S R^-1 (g S)' to the right.
         error: one such matrix, what floats may have moved a corner by, entry by entry.
+        why: what kept the kind from being stronger; empty where nothing did, or nothing was tried.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -42,6 +43,7 @@ class RegionCertificate(eqx.Module):
     strength: float
     hull: Array
     error: Array
+    why: str = eqx.field(default="", static=True)
 
 
 class Certificate(eqx.Module):

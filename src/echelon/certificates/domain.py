@@ -80,6 +80,18 @@ class Domain:
         ]
         return ", ".join(told) or "all states"
 
+    def __eq__(self, other: object) -> bool:
+        """Tell whether two domains have the same bounds."""
+        return isinstance(other, Domain) and self._bounds() == other._bounds()
+
+    def __hash__(self) -> int:
+        """Hash what `__eq__` compares."""
+        return hash(self._bounds())
+
+    def _bounds(self) -> tuple[tuple[float, ...], ...]:
+        arrays = (self.lower, self.upper, self.input_lower, self.input_upper)
+        return tuple(tuple(array.tolist()) for array in arrays)
+
     def margins(self) -> Array:
         """Return (n,) how far each state may deviate from the trim to both sides."""
         return np.minimum(self.upper, -self.lower)

@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from echelon.core.errors import GainError
+from echelon.core.kept import kept
 from echelon.core.types import Array
 
 Number: TypeAlias = float | Fraction
@@ -181,6 +182,7 @@ def rationalize(P: Array, bits: int = 24) -> Array:
     return rounded
 
 
+@kept
 def prove_contraction(
     vertices: Array, error: Array, B: Array, P: Array, rho: Number, rate: Number
 ) -> ContractionProof:

@@ -10,6 +10,7 @@ import numpy as np
 from echelon.certificates.certificate import Kind
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError
+from echelon.core.kept import kept
 from echelon.core.types import Array
 from echelon.enclosure.hull import Box, Hull, jacobian_hull
 from echelon.models.model import ControlAffine
@@ -25,13 +26,16 @@ class Jacobians(NamedTuple):
 
     `kind` says what they stand for: `vertices` of a polytope that holds every Jacobian, up to
     `error` (n, n) entry by entry, or `samples` taken at random in the domain and at its corners.
+    `why` says what kept samples from being vertices.
     """
 
     matrices: Array
     error: Array
     kind: Kind
+    why: str = ""
 
 
+@kept
 def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     """Return the Jacobians of f + g (u* + S v) over a domain of states and normalized inputs.
 
@@ -44,6 +48,7 @@ def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     return _over(model_jacobian(model), model, domain)
 
 
+@kept
 def weighted_jacobians(model: ControlAffine, domain: Domain, R: Array) -> Jacobians:
     """Return the same with g S R^-1 (g S)' to the right of each Jacobian: (K, n, 2n).
 
@@ -66,13 +71,14 @@ def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians
     names = [*model.state_names, *model.input_names]
     try:
         hull = jacobian_hull(function, *_boxes(model, domain), names)
-    except GainError:
-        samples = _sampled(function, model, domain)
-        return Jacobians(samples, np.zeros(samples.shape[1:]), "samples")
+    except GainError as error:
+        samples, why = _sampled(function, model, domain), str(error).rstrip(".")
+        return Jacobians(samples, np.zeros(samples.shape[1:]), "samples", why)
     _check_bounded(model, domain, hull)
     return Jacobians(hull.vertices, hull.error, "vertices")
 
 
+@kept
 def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
     """Tell whether g is proved constant on the domain: the condition of the nonlocal theorem T1."""
 

@@ -103,7 +103,7 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
     cones = [P - unit >> 0, kappa * unit - P >> 0, kappa <= condition_max]
     solved = _least(cp, kappa, cones, _gaps(cp, slopes, x))
     P = symmetric_part(P.value / d[:, None] / d) if solved else np.zeros_like(unit)
-    if _condition(P) >= 0.999 * condition_max or not _falls(P, As):
+    if _condition(P) >= 0.999 * condition_max or not falls(P, As):
         raise GainError(
             f"no constant metric of condition number below {condition_max:g} was found that no "
             f"vertex of {len(As)} expands, though none alone forbids it; shrink the domain, add "
@@ -225,7 +225,7 @@ def _condition(P: Array) -> float:
     return float(high / low) if low > 0.0 else np.inf
 
 
-def _falls(P: Array, As: Array) -> bool:
+def falls(P: Array, As: Array) -> bool:
     """Return whether no P^-1 (P A_k + A_k'P) has an eigenvalue above what rounding makes."""
     inverse = np.abs(np.linalg.inv(np.linalg.cholesky(P)))
     size = inverse @ _drift(np.abs(P), np.abs(As), None, 0.0) @ inverse.T

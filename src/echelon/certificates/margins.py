@@ -120,17 +120,22 @@ def gain_margin(loop: ClosedLoop) -> GainMargin:
 
 
 def decays_between(loop: ClosedLoop) -> bool:
-    """Tell whether a mode decays for every lambda from the least eigenvalue to the largest.
+    """Tell whether a mode decays for every lambda from the least eigenvalue to the largest."""
+    return slowest_between(loop) < 0.0
+
+
+def slowest_between(loop: ClosedLoop) -> float:
+    """Return the largest real part of a mode (1/s) at points that decide on all between extremes.
 
     So the extremes of a large graph's spectrum speak for all of it: between the candidates of
-    `gain_margin` nothing can change, and one sample decides.
+    `gain_margin` nothing can change its sign, and one sample decides.
     """
     G, strengths = loop.B @ loop.K, loop.strengths
     edges = _crossings(loop.A, G, strengths[-1])
     ends = np.union1d(strengths, edges[edges > strengths[0]])
     probes = np.union1d(ends, 0.5 * (ends[:-1] + ends[1:]))
     closed = loop.A - probes[:, None, None] * G
-    return bool(np.linalg.eigvals(closed).real.max() < 0.0)
+    return float(np.linalg.eigvals(closed).real.max())
 
 
 def delay_margin(loop: ClosedLoop) -> DelayMargin:

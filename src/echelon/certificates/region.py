@@ -18,6 +18,7 @@ from echelon.certificates.lmi import rate_of
 from echelon.core.errors import GainError
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 # The exact proof is of a rate a little below the one that eigenvalues show, for their rounding.
 _SAFE = 1.0 - 1e-6
@@ -84,12 +85,13 @@ def contracting_region(
     )
     if rate <= 0.0:
         return None
-    kind = found.kind
+    kind, why = found.kind, found.why
     if exact and constant and kind == "vertices":
         shown = float(Fraction(rate * _SAFE).limit_denominator(10**6))
         weighted = B @ np.linalg.cholesky(np.linalg.inv(R))
         proof = prove_contraction(found.matrices, found.error, weighted, P, strength, shown)
         kind, rate = ("proof", shown) if proof.holds else (kind, rate)
+        why = "" if proof.holds else f"exact arithmetic does not confirm corner {proof.failed}"
     return RegionCertificate(
         kind=kind,
         rate=rate,
@@ -100,6 +102,7 @@ def contracting_region(
         strength=strength,
         hull=found.matrices,
         error=found.error,
+        why=why,
     )
 
 
@@ -110,6 +113,27 @@ def _rate_where_g_varies(P: Array, pairs: Array, strength: float) -> float:
     """
     A, W = np.split(pairs, 2, axis=2)
     return rate_of(P, A - 0.5 * strength * W @ P)
+
+
+def drift_region(
+    model: ControlAffine, domain: Domain, found: Jacobians, P: Array, graph: Graph
+) -> RegionCertificate:
+    """Return what a metric (n, n) promises that the drift expands at none of its Jacobians."""
+    reach = radius(domain, P)
+    if reach is not None and not has_constant_input_map(model, domain):
+        # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
+        reach *= float(np.sqrt(np.divide(*graph.grounded_spectrum()[[0, -1]])))
+    return RegionCertificate(
+        kind=found.kind,
+        rate=0.0,
+        theorem="A5",
+        domain=domain,
+        radius=reach,
+        strength=0.0,
+        hull=found.matrices,
+        error=found.error,
+        why=found.why,
+    )
 
 
 def radius(domain: Domain, P: Array) -> float | None:

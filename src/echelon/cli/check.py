@@ -26,14 +26,11 @@ def check(
 
     found = examine(*build(checked))
     if as_json:
-        lines = [line._asdict() for line in found.lines]
-        print(
-            json.dumps(
-                {"promised": found.promised, "promise": found.promise, "lines": lines}, indent=2
-            )
-        )
+        lines = [line.as_mapping() for line in found.lines]
+        print(json.dumps({"promise": found.promise.as_mapping(), "lines": lines}, indent=2))
     else:
         console = tables.console()
-        console.print(tables.lines_table(found.lines), soft_wrap=not console.is_terminal)
-        console.print(found.promise, highlight=False, soft_wrap=not console.is_terminal)
+        whole = not console.is_terminal
+        console.print(tables.statements_table(found.lines), soft_wrap=whole)
+        console.print(found.promise.sentence(), highlight=False, markup=False, soft_wrap=whole)
     raise typer.Exit(0 if found.promised else 1)

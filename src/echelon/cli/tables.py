@@ -8,9 +8,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from echelon.studies.check import Line
+    from echelon.promises.statement import Statement
     from echelon.studies.design import Design
-    from echelon.verifier.verify import Finding
 
 
 def console() -> "Console":
@@ -115,17 +114,20 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-_CHECKED = ("statement", "verdict", "kind", "number", "why, or what to change")
+def statements_table(lines: "Iterable[Statement]") -> "Table":
+    """Return the lines of a check as a table."""
+    rows = ((x.statement, str(x.verdict), str(x.kind), x.shown, x.explanation) for x in lines)
+    return plain_table(("statement", "verdict", "kind", "number", "why, or what to change"), rows)
 
 
-def lines_table(lines: "Iterable[Line | Finding]", columns: tuple[str, ...] = _CHECKED) -> "Table":
-    """Return the lines of a check as a table, with the titles of its columns."""
+def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table":
+    """Return rows of plain text as a table with the titles of its columns."""
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         table.add_column(column)
-    for line in lines:
-        table.add_row(*(text.replace("[", "\\[") for text in line))
+    for row in rows:
+        table.add_row(*(text.replace("[", "\\[") for text in row))
     return table

@@ -26,6 +26,6 @@ def verify(
         console = tables.console()
         titles = ("claim", "stored", "recomputed", "verdict", "how, or why not")
         whole = not console.is_terminal
-        console.print(tables.lines_table(found.findings, titles), soft_wrap=whole)
+        console.print(tables.plain_table(titles, found.findings), soft_wrap=whole)
         console.print(found.sentence, highlight=False, markup=False, soft_wrap=whole)
     raise typer.Exit(0 if found.holds else 1)

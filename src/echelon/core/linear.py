@@ -1,36 +1,66 @@
 """Linear systems theory that knows no agent: held steps, controllability, Riccati."""
 
-from collections.abc import Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, cast
 
 import numpy as np
 import scipy.linalg
 
 from echelon.core.errors import GainError
+from echelon.core.numerics import INTEGRATORS
 from echelon.core.types import Array
 
 
-def held_radius(A: np.ndarray, B: np.ndarray, K: np.ndarray, dt: float) -> float:
-    """Return the spectral radius of a step of xdot = A x - B K x(t_k), the input held over dt."""
+def held_step(
+    A: np.ndarray, B: np.ndarray, dt: float, integrator: str | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (F, G) of a step x+ = F x + G u of xdot = A x + B u, u held over dt (s).
+
+    An integrator makes of a linear field a linear map, read off what it does to unit vectors; the
+    exact flow is taken without one.
+    """
     n, m = B.shape
-    block = np.zeros((n + m, n + m))
-    block[:n, :n], block[:n, n:] = A, B
-    flow = scipy.linalg.expm(block * dt)
-    return float(np.abs(np.linalg.eigvals(flow[:n, :n] - flow[:n, n:] @ K)).max())
+    unit = np.eye(n + m)
+    if integrator is None:
+        block = np.zeros((n + m, n + m))
+        block[:n, :n], block[:n, n:] = A, B
+        moved = scipy.linalg.expm(block * dt)[:n]
+    else:
+        step = cast(Callable[..., np.ndarray], INTEGRATORS[integrator])
+        moved = step(lambda x, u: A @ x + B @ u, unit[:n], unit[n:], dt)
+    return moved[:, :n], moved[:, n:]
 
 
-def longest_step(A: np.ndarray, B: np.ndarray, gains: Sequence[np.ndarray]) -> float:
+def held_radius(
+    A: np.ndarray, B: np.ndarray, gains: np.ndarray, dt: float, integrator: str | None = None
+) -> float:
+    """Return the largest spectral radius of a step of xdot = A x - B K x(t_k), u held over dt.
+
+    Args:
+        A: (n, n).
+        B: (n, m).
+        gains: (m, n), or (K, m, n) for several loops.
+        dt: s.
+        integrator: its name; the exact flow without.
+    """
+    F, G = held_step(A, B, dt, integrator)
+    return float(np.abs(np.linalg.eigvals(F - G @ gains)).max())
+
+
+def longest_step(
+    A: np.ndarray, B: np.ndarray, gains: np.ndarray, integrator: str | None = None
+) -> float:
     """Return the longest dt (s) with which every loop xdot = A x - B K x(t_k) still decays.
 
     The step is lengthened by tenths from a thousandth of the fastest mode's time until a loop
     grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
-    slowest mode's.
+    slowest mode's. Gains are (K, m, n).
     """
-    poles = np.concatenate([np.linalg.eigvals(A - B @ K) for K in gains])
+    poles = np.linalg.eigvals(A - B @ gains)
     dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
 
     def decays(dt: float) -> bool:
-        return all(held_radius(A, B, K, dt) < 1.0 for K in gains)
+        return held_radius(A, B, gains, dt, integrator) < 1.0
 
     while decays(1.1 * dt):
         dt *= 1.1

@@ -61,12 +61,14 @@ class Laws(Drive):
         return getattr(self.follower, "trim", True)
 
     def prepare(self, model: ControlAffine, graph: Graph) -> "Laws":
-        """Return both laws completed.
+        """Return both laws completed; the same where they are.
 
         Raises:
             LawError: one does not fit the model or the graph.
         """
-        return Laws(self.leader.prepared(model, graph), self.follower.prepared(model, graph))
+        leader, follower = (law.prepared(model, graph) for law in (self.leader, self.follower))
+        same = leader is self.leader and follower is self.follower
+        return self if same else Laws(leader, follower)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws."""

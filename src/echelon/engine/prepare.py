@@ -36,7 +36,9 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     with precision("float64"):
         warnings = check_model(model) + parts.world.check(model)
         _check_offsets(model, parts)
-        parts = parts.replace(drive=parts.drive.prepare(model, graph))
+        drive = parts.drive.prepare(model, graph)
+        # What is complete stays the same object, so that what is known of it is found again.
+        parts = parts if drive is parts.drive else parts.replace(drive=drive)
         problem = Problem(
             model,
             graph,

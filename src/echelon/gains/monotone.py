@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from echelon.certificates.certificate import RegionCertificate, certify
+from echelon.certificates.certificate import certify
 from echelon.certificates.domain import Bound, Domain
-from echelon.certificates.jacobians import has_constant_input_map, jacobians
+from echelon.certificates.jacobians import jacobians
 from echelon.certificates.lmi import monotone
-from echelon.certificates.region import radius, the_domain
+from echelon.certificates.region import drift_region, the_domain
 from echelon.gains.gain import Gain, Method, check_coupling
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
@@ -41,19 +41,6 @@ class Monotone(Method):
         domain, linear = the_domain(model, self.domain), linearize(model)
         found = jacobians(model, domain)
         P = monotone(found.matrices, names=model.state_names).P
-        R, reach = np.eye(len(model.input_names)), radius(domain, P)
-        if reach is not None and not has_constant_input_map(model, domain):
-            # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
-            reach *= float(np.sqrt(np.divide(*graph.grounded_spectrum()[[0, -1]])))
-        region = RegionCertificate(
-            kind=found.kind,
-            rate=0.0,
-            theorem="A5",
-            domain=domain,
-            radius=reach,
-            strength=0.0,
-            hull=found.matrices,
-            error=found.error,
-        )
+        R, region = np.eye(len(model.input_names)), drift_region(model, domain, found, P, graph)
         certificate = certify(linear, graph, P, R, self.coupling, edge=0.0, region=region)
         return Gain(P, R, self.coupling, "monotone", certificate)

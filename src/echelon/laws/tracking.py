@@ -42,14 +42,16 @@ class Tracking(Law):
         return ("the reference", *(("neighbours' states",) if self.reaction is not None else ()))
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
-        """Complete the gain, and check that the model can follow a reference."""
+        """Complete the gain where it is not, and check that the model can follow a reference."""
         check_flat(model)
         gain = Riccati(coupling=1.0).solve(model, graph) if self.gain is None else self.gain
         for each in (gain, self.reaction):
             if each is not None:
                 check_gain_fits(self, model, each.P.shape, each.R.shape)
-        unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
-        law = Tracking(self.reference, unit, self.reaction)
+        law = self
+        if gain is not self.gain or gain.coupling != 1.0:
+            unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
+            law = Tracking(self.reference, unit, self.reaction)
         if not all(np.isfinite(part).all() for part in _targets(law, model, jnp.zeros(1))):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "

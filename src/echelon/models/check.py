@@ -1,6 +1,6 @@
 """The checks that a model passes once, when it enters `synthesize` or `simulate`."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,6 +11,13 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.models.model import ControlAffine
 
 _TRIM_TOLERANCE = 1e-9
+
+
+class Shortfall(NamedTuple):
+    """What the actuators deliver of an input, and what is asked of them."""
+
+    delivered: float
+    asked: float
 
 
 def check_model(model: ControlAffine) -> tuple[str, ...]:
@@ -42,9 +49,9 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     x, u = _trim(model, name, n, m)
     _check_values(model, name, x, u)
     # Step by step each operation would be compiled for itself, which takes seconds.
-    residual, delivered = _at_trim(model, jnp.asarray(x), jnp.asarray(u))
+    residual, _ = _at_trim(model, jnp.asarray(x), jnp.asarray(u))
     _check_trim(model, name, np.asarray(residual))
-    return (*_low_precision(model, name), *_weak_actuators(model, name, u, np.asarray(delivered)))
+    return (*_low_precision(model, name), *_weak_actuators(model, name))
 
 
 @eqx.filter_jit
@@ -168,18 +175,20 @@ def _check_trim(model: ControlAffine, name: str, residual: np.ndarray) -> None:
         )
 
 
-def _weak_actuators(
-    model: ControlAffine, name: str, u: np.ndarray, delivered: np.ndarray
-) -> tuple[str, ...]:
+def trim_shortfall(model: ControlAffine, wanted: np.ndarray | None = None) -> dict[str, Shortfall]:
+    """Return which inputs of a trim the actuators cut, by name; `wanted` (m,) is another's trim."""
+    x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
+    u = u if wanted is None else jnp.asarray(wanted)
+    asked, delivered = np.asarray(u).tolist(), np.asarray(_at_trim(model, x, u)[1]).tolist()
+    triples = zip(model.input_names, delivered, asked, strict=True)
+    return {name: Shortfall(got, wanted) for name, got, wanted in triples if got != wanted}
+
+
+def _weak_actuators(model: ControlAffine, name: str) -> tuple[str, ...]:
     """Warn of a trim that the actuators cannot hold."""
-    short = [
-        f"`{what}` {got:.4g} of {asked:.4g}"
-        for what, got, asked in zip(model.input_names, delivered, u, strict=True)
-        if got != asked
-    ]
-    if not short:
-        return ()
-    return (f"the actuators of `{name}` cannot hold its trim: they deliver {', '.join(short)}.",)
+    short = trim_shortfall(model).items()
+    told = ", ".join(f"`{what}` {got:.4g} of {asked:.4g}" for what, (got, asked) in short)
+    return (f"the actuators of `{name}` cannot hold its trim: they deliver {told}.",) * bool(short)
 
 
 def _low_precision(model: ControlAffine, name: str) -> tuple[str, ...]:

@@ -1,25 +1,17 @@
-"""What a gain carries beyond the trim: its region, the set certified there, and what g does."""
+"""The set of starts from which no follower leaves the domain of a promise."""
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Kind, RegionCertificate
-from echelon.certificates.domain import Domain
+from echelon.certificates.certificate import RegionCertificate
 from echelon.certificates.jacobians import has_constant_input_map
-from echelon.core.errors import Outcome
-from echelon.core.types import Array, States
-from echelon.engine.initial import initial_states
+from echelon.core.types import Array
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
-from echelon.engine.simulate import simulate
-from echelon.laws.trim_input import TrimInput
-from echelon.models.model import ControlAffine
-from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.promises.closed_loop import CheckedLoop
+from echelon.engine.settings import Settings
+from echelon.promises.leaders import Leaders, excursion, own_paths
+from echelon.promises.statement import Statement, verdict_of
 
 
 class CertifiedSet(NamedTuple):
@@ -27,7 +19,7 @@ class CertifiedSet(NamedTuple):
 
     Attributes:
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
-        kind: of the argument; `samples` where the leader's excursion is read off a run of its own.
+        kind: of the argument; samples where the leader's excursion is read off a run of its own.
         why: what limits the radius, or why there is none.
     """
 
@@ -36,102 +28,90 @@ class CertifiedSet(NamedTuple):
     why: str
 
 
-def certified_set(loop: CheckedLoop) -> CertifiedSet | None:
+def certified_set(
+    parts: Parts, settings: Settings, leaders: Leaders, region: RegionCertificate | None
+) -> CertifiedSet | None:
     """Return the set that a region of theorem T1 or A5 certifies, less the leader's excursion.
 
     r^2 = min_j (margin_j - excursion_j)^2 / W_jj, W = P^-1. Where only the drift is known (A5) and
     g varies, what cannot rise is V = delta'(L kron P) delta, which costs the factor
     lambda_min / lambda_max.
     """
-    region = loop.region
-    if region is None or not _certifies(region):
+    if region is None or Theorem.named(region.theorem) is Theorem.T2:
         return None
-    if region.theorem == "A5" and loop.moving and not _constant(loop, region.domain):
+    kind, free = Kind.named(region.kind), Theorem.named(region.theorem) is Theorem.A5
+    if free and not leaders.rest and not _constant(parts, region):
         text = "g varies, and a leader that moves then adds to V; needs a constant g"
-        return CertifiedSet(0.0, region.kind, text)
-    kind, excursion, why = _excursion(loop)
-    if excursion is None:
-        return CertifiedSet(0.0, region.kind, why)
-    return _less(loop, region, region.kind if kind is None else kind, excursion)
+        return CertifiedSet(0.0, kind, text)
+    trim = np.asarray(parts.model.trim[0], float)
+    if leaders.rest and (leaders.starts == trim).all():
+        return certified_at_rest(parts, region)
+    if leaders.answer:
+        text = "the leader reacts, so its excursion is not its own; `reacts: false`"
+        return CertifiedSet(0.0, kind, text)
+    paths = own_paths(parts, settings, leaders.starts)
+    if paths is None:
+        return CertifiedSet(0.0, kind, "the leader alone diverges; see Assumption 4")
+    return _less(parts, region, Kind.SAMPLES, excursion(parts, paths))
 
 
-def certified_at_rest(loop: CheckedLoop) -> float | None:
-    """Return the radius of the certified set for a leader that rests at the trim."""
-    region = loop.region
-    if region is None or not _certifies(region):
-        return None
-    nowhere = np.zeros(len(loop.parts.model.state_names))
-    return _less(loop, region, region.kind, nowhere).radius
+def certified_at_rest(parts: Parts, region: RegionCertificate) -> CertifiedSet:
+    """Return the certified set for a leader that rests at the trim."""
+    nowhere = np.zeros(len(parts.model.state_names))
+    return _less(parts, region, Kind.named(region.kind), nowhere)
 
 
-def _certifies(region: RegionCertificate) -> bool:
-    return region.theorem == "A5" or region.theorem == "T1" and region.rate > 0.0
-
-
-def _less(
-    loop: CheckedLoop, region: RegionCertificate, kind: Kind, excursion: Array
-) -> CertifiedSet:
+def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> CertifiedSet:
     """Return the set that is left when the leader goes so far from the trim, (n,)."""
-    margins = region.domain.margins()
-    radii = np.maximum(margins - excursion, 0.0) / np.sqrt(np.diag(np.linalg.inv(loop.closed.P)))
+    gain, model, margins = parts.drive.gain, parts.model, region.domain.margins()
+    assert gain is not None
+    radii = np.maximum(margins - away, 0.0) / np.sqrt(np.diag(np.linalg.inv(gain.P)))
     if not np.isfinite(radii).any():
-        return CertifiedSet(np.inf, region.kind, "everywhere: the domain bounds no state")
+        return CertifiedSet(
+            np.inf, Kind.named(region.kind), "everywhere: the domain bounds no state"
+        )
     j = int(np.argmin(radii))
-    name, wide = loop.parts.model.state_names[j], margins[j]
+    name, wide = model.state_names[j], margins[j]
     if radii[j] == 0.0:
-        text = f"the leader alone reaches {excursion[j]:.3g} in `{name}`, and the domain {wide:.3g}"
+        text = f"the leader alone reaches {away[j]:.3g} in `{name}`, and the domain {wide:.3g}"
         return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
     shrink = 1.0
-    if region.theorem == "A5" and not _constant(loop, region.domain):
-        shrink = np.sqrt(loop.certificate.lambda_min / loop.certificate.lambda_max)
+    if Theorem.named(region.theorem) is Theorem.A5 and not _constant(parts, region):
+        shrink = np.sqrt(np.divide(*parts.graph.grounded_spectrum()[[0, -1]]))
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
-    text += f" less {excursion[j]:.3g} of the leader" if excursion.any() else ", leader at the trim"
+    text += f" less {away[j]:.3g} of the leader" if away.any() else ", leader at the trim"
     return CertifiedSet(float(shrink * radii[j]), kind, text)
 
 
-def _constant(loop: CheckedLoop, domain: Domain) -> bool:
-    return has_constant_input_map(loop.parts.model, domain)
+def _constant(parts: Parts, region: RegionCertificate) -> bool:
+    return has_constant_input_map(parts.model, region.domain)
 
 
-def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Array | None, str]:
-    """Return how far the leaders go from the trim, (n,), and the kind of that; or why not known.
-
-    A leader that starts and stays at the trim goes nowhere, which needs no run.
-    """
-    model = loop.parts.model
-    if loop.parts.drive.reacts:
-        return None, None, "the leader reacts, so its excursion is not its own; `reacts: false`"
-    trim = np.asarray(model.trim[0], float)
-    if not loop.moving and (_leader_starts(loop) == trim).all():
-        return None, np.zeros(len(trim)), ""
-    paths = _leader_paths(loop)
-    if paths is None:
-        return None, None, "the leader alone diverges; see Assumption 4"
-    away = np.abs(np.asarray(_differences(model, jnp.asarray(paths), jnp.asarray(trim))))
-    return "samples", away.max(axis=0), ""
+def size_of(parts: Parts, states: Array) -> float:
+    """Return r of the set {sum_i delta_i'P delta_i = r^2} on which states (N, n) lie."""
+    gain = parts.drive.gain
+    assert gain is not None
+    y = states - parts.formation.offsets
+    delta = y - y[list(parts.graph.nearest_leader())]
+    return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
 
 
-def _leader_starts(loop: CheckedLoop) -> Array:
-    """Return the states (L, n) in which the leaders start, less their offsets."""
-    parts = loop.parts
-    states = initial_states(parts, loop.settings.seed)
-    return (states - parts.formation.offsets)[list(parts.graph.leaders)]
-
-
-def _leader_paths(loop: CheckedLoop) -> Array | None:
-    """Return the states (K, n) of the leaders in a run of their own, or None if it diverges."""
-    parts, starts = loop.parts, _leader_starts(loop)
-    count = len(starts)
-    graph = Graph([(k, count) for k in range(count)], leaders=range(count))
-    states = np.concatenate([starts, np.asarray(parts.model.trim[0], float)[None]])
-    goals = Formation(np.zeros_like(states))
-    alone = Parts(parts.model, graph, goals, parts.drive.with_follower(TrimInput()), initial=states)
-    result = simulate(alone, loop.settings._replace(store_every=1, seed=0, precision="float64"))
-    if result.outcome is not Outcome.COMPLETED:
-        return None
-    return result.states[:, :count].reshape(-1, states.shape[1])
-
-
-@eqx.filter_jit
-def _differences(model: ControlAffine, states: States, base: jax.Array) -> jax.Array:
-    return jax.vmap(lambda x: model.difference(x, base))(states)
+def set_lines(
+    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
+) -> list[Statement]:
+    """Return the set as a line, and whether the starts (N, n) lie in it."""
+    name, starts = "certified set", "starts in the certified set"
+    if found is None:
+        local = region is not None and Theorem.named(region.theorem) is Theorem.T2
+        text = "T2 is local and certifies no set" if local else "needs a region"
+        return [Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)]
+    shown = f"radius {found.radius:.3g}" if found.radius else "empty"
+    verdict = verdict_of(found.radius > 0.0)
+    line = Statement(name, verdict, found.kind, found.radius, shown, found.why)
+    size = size_of(parts, states)
+    shown = f"{size:.3g} of {found.radius:.3g}"
+    text, remedy = "from there no follower leaves the domain", ""
+    if not size <= found.radius:
+        text, remedy = "what the set promises does not reach them", "start nearer to the goals"
+    verdict = verdict_of(size <= found.radius)
+    return [line, Statement(starts, verdict, found.kind, size, shown, text, remedy)]

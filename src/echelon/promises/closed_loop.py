@@ -1,148 +1,166 @@
-"""The closed loop that `check` looks at, and the lines in which it says what it found."""
+"""The closed loop near the trim: the modes into which the disagreement splits."""
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import equinox as eqx
 import numpy as np
 
-from echelon.certificates.certificate import (
-    Certificate,
-    RegionCertificate,
-    certify,
-    parent_modes,
-)
-from echelon.certificates.margins import ClosedLoop, decays_between
-from echelon.core.linear import held_radius
+from echelon.certificates.certificate import Certificate, certify, parent_modes
+from echelon.certificates.lmi import rate_of
+from echelon.certificates.margins import ClosedLoop, slowest_between
+from echelon.core.linear import held_radius, longest_step
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
+from echelon.engine.drive import Drive
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
+from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 
 SHOWN = 32
 """Of more eigenvalues of the graph than these, so many stand for all in the margins."""
+_FEW = 8  # modes that a longest step is sought with, the extreme ones among them
+_DENSE = 400
+_SLACK = 1e-9
+"""Relative; what rounding makes of the inequality behind an edge, which is often tight."""
 
 
-class CheckedLoop(NamedTuple):
-    """What every line reads: the parts, and their closed loop near the trim.
+class Loop(NamedTuple):
+    """The law near the trim, on the graph that runs.
 
     Attributes:
-        parts: what runs.
-        settings: how it is computed.
         linear: A (with the inner loop closed) and B at the trim.
+        inner: (m, n), the inner loop K that is closed in A; zero without one.
         closed: the modes that margins are taken of.
         where: which eigenvalues of the graph those are, in words.
+        symmetric: whether they are of a symmetric matrix between followers' errors.
         every: whether the modes of all eigenvalues of the graph decay, not only of those.
+        slowest: real part of the slowest mode, 1/s; of a large graph, of the modes looked at.
         certificate: of the linearization.
-        broken: offsets that are no symmetries, by agent.
     """
 
-    parts: Parts
-    settings: Settings
     linear: Linearization
+    inner: Array
     closed: ClosedLoop
     where: str
+    symmetric: bool
     every: bool
+    slowest: float
     certificate: Certificate
-    broken: dict[int, str]
 
     @property
-    def gain(self) -> Gain | None:
-        """The followers' gain, where their law has one."""
-        return self.parts.drive.gain
+    def gains(self) -> Array:
+        """What acts on the state in each mode, inner loop included, (K, m, n)."""
+        return self.inner + self.closed.strengths[:, None, None] * self.closed.K
+
+    def radius(self, settings: Settings) -> float:
+        """Return the largest spectral radius of a step of the integrator that runs."""
+        A, B = self.open
+        return held_radius(A, B, self.gains, settings.dt, settings.integrator)
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) of that integrator with which every mode decays."""
+        A, B = self.open
+        few = np.unique(np.linspace(0, len(self.gains) - 1, _FEW).astype(int))
+        return longest_step(A, B, self.gains[few], settings.integrator)
 
     @property
-    def region(self) -> RegionCertificate | None:
-        """What the gain promises on a domain; nothing where parents' inputs are fed forward.
-
-        The modes are then no longer those of a symmetric matrix, which its proof rests on.
-        """
-        if self.gain is None or self.fed_by_parents:
-            return None
-        return self.gain.certificate.region
-
-    @property
-    def fed_by_parents(self) -> bool:
-        """Whether each follower is told the input of its parent."""
-        return self.parts.drive.feedforward is Feedforward.PARENT
-
-    @property
-    def inner(self) -> Array:
-        """The inner loop K (m, n) that is closed in A; zero without one."""
-        gain = self.gain
-        shape = self.linear.B.T.shape
-        return np.zeros(shape) if gain is None or gain.inner is None else gain.inner
-
-    @property
-    def governed(self) -> bool:
-        """Whether the followers run a law that this page speaks of, u = u_ff - c R^-1 g'P z."""
-        return self.parts.drive.metric(self.parts.model) is not None
-
-    @property
-    def trimmed(self) -> bool:
-        """Whether the law applies the trim input, or there is none."""
-        trim = np.asarray(self.parts.model.trim[1], float)
-        return self.parts.drive.trimmed or not trim.any()
-
-    @property
-    def disturbed(self) -> str:
-        """What the scenario adds that no promise covers, in words; empty without any."""
-        told = []
-        if self.parts.world.disturbance is not None:
-            told.append("wind or noise acts on the agents")
-        if self.parts.world.plant is not None:
-            told.append("the agents differ from the model")
-        return " and ".join(told)
-
-    @property
-    def moving(self) -> bool:
-        """Whether the leader has a reference to follow."""
-        return self.parts.drive.reference_states(self.parts.model, jnp.zeros(1)) is not None
-
-    @property
-    def matched(self) -> bool:
-        """Whether the followers are told an input, or the leader has none beyond the trim."""
-        return self.parts.drive.feedforward is not Feedforward.NONE or not self.moving
+    def open(self) -> Linearization:
+        """A and B without any loop."""
+        return Linearization(self.linear.A + self.linear.B @ self.inner, self.linear.B)
 
 
-def checked_loop(parts: Parts, settings: Settings) -> CheckedLoop:
-    """Return the closed loop of built parts, in float64."""
-    model, graph = parts.model, parts.graph
-    gain = parts.drive.gain
+class Spectrum(NamedTuple):
+    """Eigenvalues by which the disagreement splits, ascending: `total` of them, or the extremes.
+
+    `symmetric` tells whether they are of the grounded Laplacian, which is.
+    """
+
+    values: Array
+    total: int
+    symmetric: bool
+    what: str = "eigenvalues"
+
+
+def loop_of(parts: Parts) -> Loop:
+    """Return the closed loop of prepared parts."""
+    model, gain = parts.model, parts.drive.gain
     n, m = len(model.state_names), len(model.input_names)
     A, B = linearize(model)
-    P, R, c, edge = parts.drive.metric(model), np.eye(m), 1.0, None
+    P, R, c, inner = parts.drive.metric(model), np.eye(m), 1.0, np.zeros((m, n))
+    P = np.eye(n) if P is None else P
     if gain is not None:
-        R, c, edge = gain.R, gain.coupling, gain.certificate.edge
-        A = A if gain.inner is None else A - B @ gain.inner
-    linear, P = Linearization(A, B), np.eye(n) if P is None else P
-    modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
+        R, c = gain.R, gain.coupling
+        inner = inner if gain.inner is None else gain.inner
+    linear, modes = Linearization(A - B @ inner, B), spectrum(parts)
+    edge = None if gain is None else _edge(gain, linear, float(modes.values[0]))
+    certificate = certify(linear, parts.graph, P, R, c, edge, modes=modes.values)
+    values, where = _representatives(modes)
+    closed = ClosedLoop(*linear, P, R, c, values)
+    slowest = certificate.abscissa
+    if len(modes.values) < modes.total:
+        slowest = max(slowest, slowest_between(closed))
+    return Loop(linear, inner, closed, where, modes.symmetric, slowest < 0.0, slowest, certificate)
+
+
+def spectrum(parts: Parts) -> Spectrum:
+    """Return the eigenvalues that the feed-forward leaves the disagreement.
+
+    Where the leaders obey the followers' law, nobody is grounded: the disagreement obeys the
+    Laplacian of all agents, whose eigenvalues but 0 lie above the least of the grounded one and,
+    by Anderson and Morley, below the largest sum of two neighbours' degrees.
+    """
+    graph = parts.graph
     if parts.drive.feedforward is Feedforward.PARENT:
-        edge = None if edge is None else edge * modes[0]
-        modes = parent_modes(graph)
-        edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"
-    certificate = certify(linear, graph, P, R, c, edge, modes=modes)
-    values, where = _looked_at(modes, count, kind)
-    closed = ClosedLoop(A, B, P, R, c, values)
-    every = certificate.stable and (certificate.modes == count or decays_between(closed))
-    broken = parts.formation.broken_symmetries(model)
-    return CheckedLoop(parts, settings, linear, closed, where, every, certificate, broken)
+        weights = parent_modes(graph)
+        return Spectrum(weights, len(weights), False, "edges' weights")
+    grounded = graph.grounded_spectrum()
+    if not all_alike(parts.drive, parts.model):
+        return Spectrum(grounded, len(graph.followers), True)
+    if graph.agents <= _DENSE:
+        whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
+        return Spectrum(whole, len(whole), False)
+    degrees = graph.laplacian().diagonal()
+    top = float(degrees[graph.edges].sum(axis=1).max())
+    return Spectrum(np.array([grounded[0], top]), graph.agents - 1, False)
 
 
-def _looked_at(spectrum: Array, count: int, kind: str) -> tuple[Array, str]:
+def all_alike(drive: Drive, model: ControlAffine) -> bool:
+    """Tell whether the leaders obey the followers' law, with nothing fed forward."""
+    leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)
+    same = leader is not None and type(leader) is type(follower)
+    silent = drive.feedforward is Feedforward.NONE and drive.metric(model) is not None
+    return same and silent and bool(eqx.tree_equal(leader, follower))
+
+
+def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
+    """Return the coupling from which on the gain's own argument holds here; None without one.
+
+    The argument is P A + A'P - rho P B R^-1 B'P <= 0 at a strength rho = 2 c lambda that is the
+    gain's own; it is looked at again with this A and B.
+    """
+    claim = gain.certificate
+    if claim.edge is None:
+        return None
+    rho = 2.0 * claim.edge * claim.lambda_min
+    rate = rate_of(gain.P, linear.A[None], linear.B, gain.R, rho)
+    return 0.5 * rho / low if rate >= -_SLACK * max(1.0, np.linalg.norm(linear.A, 2)) else None
+
+
+def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:
+    """Return the slowest mode, 1/s, as a gain's own certificate has it."""
+    return certify(linear, graph, gain.P, gain.R, gain.coupling, None).abscissa
+
+
+def _representatives(modes: Spectrum) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
-    if len(spectrum) < count:
-        values = np.geomspace(spectrum[0], spectrum[-1], SHOWN)
-        return values, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
-    if len(spectrum) <= SHOWN:
-        return spectrum, f"all {kind} of the graph"
-    places = np.linspace(0, len(spectrum) - 1, SHOWN).round().astype(int)
-    return spectrum[places], f"{SHOWN} of {count} {kind}, the extreme ones among them"
-
-
-def step_radius(loop: CheckedLoop, dt: float) -> float:
-    """Return the largest spectral radius of a step, over the eigenvalues looked at."""
-    A, B = loop.linear.A + loop.linear.B @ loop.inner, loop.linear.B
-    gains = loop.inner + loop.closed.strengths[:, None, None] * loop.closed.K
-    return max(held_radius(A, B, K, dt) for K in gains)
+    values, total, _, what = modes
+    if len(values) < total:
+        between = np.geomspace(values[0], values[-1], SHOWN)
+        return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
+    if len(values) <= SHOWN:
+        return values, f"all {what} of the graph"
+    places = np.linspace(0, len(values) - 1, SHOWN).round().astype(int)
+    return values[places], f"{SHOWN} of {total} {what}, the extreme ones among them"

@@ -1,4 +1,7 @@
-"""The paper's own statements on a scenario: its assumptions, lemmas, and conditions on P."""
+"""The paper's own statements on parts of one's own: its assumptions, lemmas, and conditions on P.
+
+Those that are hypotheses of a promise stand with it and are not repeated here.
+"""
 
 from collections.abc import Iterator
 
@@ -6,115 +9,92 @@ import numpy as np
 
 from echelon.certificates.modes import obstacle
 from echelon.core.linear import in_words
-from echelon.gains.gain import Gain
-from echelon.models.linearization import linearize
-from echelon.promises.closed_loop import CheckedLoop
-from echelon.studies.finite_condition import finite_condition, goal_drifts
-from echelon.studies.lines import Line
+from echelon.core.words import Kind, Verdict
+from echelon.engine.parts import Parts
+from echelon.promises.hypotheses import goal_drifts
+from echelon.promises.promise import Promise
+from echelon.promises.statement import Statement, verdict_of
+from echelon.studies.finite_condition import finite_condition
 
 ZERO = 1e-9
+_HOLDS, _PROOF = Verdict.HOLDS, Kind.PROOF
 
 
-def graph_lines(loop: CheckedLoop) -> Iterator[Line]:
-    """Yield what the paper asks of agents, graph and leader: Assumptions 1-4 and 6, Lemmas 1-3."""
-    graph, low = loop.parts.graph, loop.certificate.lambda_min
-    unit = bool((graph.weights == 1.0).all())
-    edges = f"{graph.agents} agents, {len(graph.edges)} edges"
-    yield _trim_line(loop)
-    yield Line("Assumption 1, autonomous", "holds", "proof", "", "f and g depend on x alone")
+def graph_lines(parts: Parts) -> Iterator[Statement]:
+    """Yield what the paper asks of agents and graph: Assumptions 1, 2 and 6, Lemmas 1 to 3."""
+    graph, spectrum = parts.graph, parts.graph.grounded_spectrum()
+    low, high = float(spectrum[0]), float(spectrum[-1])
+    text = "f and g depend on x alone"
+    yield Statement("Assumption 1, autonomous", _HOLDS, _PROOF, text=text)
+    unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
     text = "connected and static" + ("" if unit else "; weights need not be 1")
-    yield Line("Assumption 2, graph", "holds", "proof", edges, text)
-    yield _exact_line(loop)
-    yield _leader_line(loop)
-    number = f"lambda_min {low:.6g}, lambda_max {loop.certificate.lambda_max:.6g}"
-    yield Line("Assumption 6, M L = I", "holds", "proof", number, "for the grounded Laplacian")
-    yield Line("Lemma 1, L > 0", "holds", "proof", f"{low:.6g}", "grounded Laplacian")
-    yield Line("Lemma 2, Schur complement", "not needed", "proof", "", "the LMI is not used")
+    shown = f"{shown}, {len(graph.edges)} edges"
+    yield Statement("Assumption 2, graph", _HOLDS, _PROOF, len(graph.edges), shown, text)
+    shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
+    yield Statement("Assumption 6, M L = I", _HOLDS, _PROOF, low, shown, text)
+    yield Statement("Lemma 1, L > 0", _HOLDS, _PROOF, low, f"{low:.6g}", "grounded Laplacian")
+    text = "the LMI is not used"
+    yield Statement("Lemma 2, Schur complement", Verdict.NOT_NEEDED, _PROOF, text=text)
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
+    shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
-    yield Line("Lemma 3, sum over edges", "fails", "proof", f"row sum {rows:.3g}", text)
+    yield Statement("Lemma 3, sum over edges", Verdict.FAILS, _PROOF, rows, shown, text)
 
 
-def _trim_line(loop: CheckedLoop) -> Line:
-    """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
-    there = np.zeros_like(loop.parts.formation.offsets)
-    size = float(np.abs(goal_drifts(loop.parts.model, there, loop.parts.drive)).max())
-    number, text = f"|f + g u*| {size:.2g}", "about the trim, whose input the law applies"
-    if not loop.trimmed:
-        text = "the law leaves out the trim input; set `follower.trim: true`"
-    verdict = "holds" if loop.trimmed else "fails"
-    return Line("Definition 1, f(0) = 0", verdict, "proof", number, text)
-
-
-def _exact_line(loop: CheckedLoop) -> Line:
-    """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
-    text = "states are known exactly, and nothing disturbs the agents"
-    if loop.disturbed:
-        text = f"{loop.disturbed}; what holds without is said, and how far it may push is below"
-    verdict = "fails" if loop.disturbed else "holds"
-    return Line("Assumption 3, exact states", verdict, "proof", "", text)
-
-
-def _leader_line(loop: CheckedLoop) -> Line:
-    """Assumption 4: the leader tracks its reference, by linearization."""
-    gain = getattr(getattr(loop.parts.drive, "leader", None), "gain", None)
-    if not isinstance(gain, Gain):
-        return Line("Assumption 4, leader tracks", "not needed", "proof", "", "it follows nothing")
-    A, B = linearize(loop.parts.model)
-    K = np.linalg.solve(gain.R, B.T @ gain.P)
-    slow = float(np.linalg.eigvals(A - gain.coupling * B @ K).real.max())
-    verdict = "holds" if slow < -ZERO else "fails"
-    text = "at the trim"
-    if verdict == "fails":
-        text = "the tracking error is not damped at the trim; give `leader.gain` another method"
-    return Line("Assumption 4, leader tracks", verdict, "linearization", f"{slow:.3g} 1/s", text)
-
-
-def drift_lines(loop: CheckedLoop) -> Iterator[Line]:
-    """Yield what the paper asks of the drift: Assumption 5, Lemma 4, and its conditions on P."""
-    monotone = _monotone_line(loop)
+def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
+    """Yield what the paper asks of leader and drift: Assumptions 4, 5, Lemma 4, conditions on P."""
+    yield _leader_line(promise)
+    monotone = _monotone_line(parts, promise)
     yield monotone
-    symmetric = not loop.broken
-    agent, reason = next(iter(loop.broken.items()), (0, ""))
-    text = "f and g do not notice them"
-    if not symmetric:
-        text = f"agent {agent}: {reason}; offset only states that f and g ignore"
-    verdict = "holds" if symmetric else "fails"
-    yield Line("offsets are symmetries", verdict, "samples", f"{len(loop.broken)} broken", text)
-    both = symmetric and monotone.verdict == "holds"
+    both = not (promise.line("offsets are symmetries").fails or monotone.fails)
     text = "needs Assumption 5 and symmetric offsets"
-    yield Line("Lemma 4, drift along z", "holds" if both else "fails", "linearization", "", text)
-    largest = _printed_lmi(loop)
-    text = "infeasible for every P > 0: its upper left block is zero; use the finite condition"
-    yield Line("LMI as printed", "fails", "proof", f"eigenvalue {largest:.3g} > 0", text)
-    yield _finite_line(loop)
+    yield Statement("Lemma 4, drift along z", verdict_of(both), Kind.LINEARIZATION, text=text)
+    largest = _printed_lmi(parts, promise)
+    shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
+    text, remedy = f"{text}block is zero", "use the finite condition"
+    yield Statement("LMI as printed", Verdict.FAILS, _PROOF, largest, shown, text, remedy)
+    yield _finite_line(parts, promise)
 
 
-def _monotone_line(loop: CheckedLoop) -> Line:
+def _leader_line(promise: Promise) -> Statement:
+    """Assumption 4: the leader tracks its reference, by linearization."""
+    name, slow = "Assumption 4, leader tracks", promise.own
+    if slow is None:
+        return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
+    text, remedy = "at the trim", ""
+    if not slow < -ZERO:
+        text, remedy = "the tracking error is not damped at the trim", "give `leader.gain` another "
+        remedy += "method"
+    verdict, shown = verdict_of(slow < -ZERO), f"{slow:.3g} 1/s"
+    return Statement(name, verdict, Kind.LINEARIZATION, slow, shown, text, remedy)
+
+
+def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
-    A, P = loop.linear.A, loop.closed.P
+    A, P = promise.loop.linear.A, promise.loop.closed.P
     slope = P @ A + A.T @ P
     worst = float(np.linalg.eigvalsh(slope)[-1])
     holds = worst <= ZERO * max(1.0, float(np.abs(slope).max()))
     found = None if holds else obstacle(A[None])
-    text = "the drift does not expand P"
+    text, remedy = "the drift does not expand P", ""
     if found is not None:
-        names = ", ".join(f"`{loop.parts.model.state_names[k]}`" for k in found.states)
-        text = f"no P > 0 can: mode at {in_words(found.eigenvalue)} 1/s along {names}; "
-        text += "an `inner-loop` gain makes it hold, `riccati` does without"
+        names = ", ".join(f"`{parts.model.state_names[k]}`" for k in found.states)
+        text = f"no P > 0 can: mode at {in_words(found.eigenvalue)} 1/s along {names}"
+        remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
     elif not holds:
-        text = "this P does not; `monotone` or `inner-loop` find one, `riccati` does without"
-    verdict = "holds" if holds else "fails"
-    return Line("Assumption 5, P-monotone drift", verdict, "linearization", f"{worst:.3g}", text)
+        text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
+        remedy += "without"
+    name, verdict, shown = "Assumption 5, P-monotone drift", verdict_of(holds), f"{worst:.3g}"
+    return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
 
 
-def _printed_lmi(loop: CheckedLoop) -> float:
+def _printed_lmi(parts: Parts, promise: Promise) -> float:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
-    few = list(loop.parts.graph.followers[:4])
-    goals = np.asarray(loop.parts.model.trim[0]) + loop.parts.formation.offsets[few]
-    drifts = goal_drifts(loop.parts.model, loop.parts.formation.offsets, loop.parts.drive)[few]
+    few = list(parts.graph.followers[:4])
+    goals = np.asarray(parts.model.trim[0]) + parts.formation.offsets[few]
+    drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[few]
     count, n = goals.shape
-    values, vectors = np.linalg.eigh(loop.closed.P)
+    values, vectors = np.linalg.eigh(promise.loop.closed.P)
     X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)
     D, F = np.zeros((count * n, count)), np.zeros((count * n, count))
     for i in range(count):
@@ -125,21 +105,21 @@ def _printed_lmi(loop: CheckedLoop) -> float:
     return float(np.linalg.eigvalsh(np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]]))[-1])
 
 
-def _finite_line(loop: CheckedLoop) -> Line:
+def _finite_line(parts: Parts, promise: Promise) -> Statement:
     """Return the condition (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 on pairs of goals."""
-    parts, P = loop.parts, loop.closed.P
+    P, name = promise.loop.closed.P, "finite condition on P"
     # Any multiple of P serves the law as well, with the coupling divided by it.
     P = P / float(np.linalg.eigvalsh(P)[0])
     found = finite_condition(P, parts.model, parts.formation, parts.drive)
-    statement = "finite condition on P"
-    if found.verdict == "vacuous":
+    if found.verdict is Verdict.VACUOUS:
         text = "f is the same at all goals, so that every P passes: it says nothing"
-        return Line(statement, "vacuous", "proof", "0 <= 0", text)
+        return Statement(name, found.verdict, _PROOF, 0.0, "0 <= 0", text)
     every = found.agents == parts.graph.agents
     among = "" if every else f", for {found.agents} of {parts.graph.agents} agents"
-    text = f"at the goals only{among}; it says nothing of other states"
-    if found.verdict == "fails":
+    text, remedy = f"at the goals only{among}; it says nothing of other states", ""
+    if found.verdict is Verdict.FAILS:
         i, j = found.pair
-        text = f"goals of agents {i} and {j} drift apart in this P; choose other offsets or P"
-    kind = "proof" if every else "samples"
-    return Line(statement, found.verdict, kind, f"{found.largest:.3g}", text)
+        text, remedy = f"goals of agents {i} and {j} drift apart in this P", "choose other offsets "
+        remedy += "or P"
+    kind, shown = _PROOF if every else Kind.SAMPLES, f"{found.largest:.3g}"
+    return Statement(name, found.verdict, kind, found.largest, shown, text, remedy)

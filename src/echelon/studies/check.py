@@ -1,92 +1,46 @@
-"""The paper's assumptions and lemmas on a scenario of one's own, and what is promised of it."""
+"""The paper's assumptions and lemmas on parts of one's own, and what is promised of them."""
 
-from collections.abc import Iterator
+from typing import NamedTuple
 
 from echelon.core.numerics import precision
 from echelon.engine.parts import Parts
+from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
-from echelon.promises.certified_set import CertifiedSet, certified_set
-from echelon.promises.closed_loop import CheckedLoop, checked_loop, step_radius
+from echelon.promises.promise import Promise, promise
+from echelon.promises.statement import Statement
 from echelon.studies.assumptions import drift_lines, graph_lines
-from echelon.studies.lines import Checked, Line
-from echelon.studies.margins import law_lines, margin_lines
-from echelon.studies.region import region_lines
+from echelon.studies.killing import killing_line
+from echelon.studies.margins import margin_lines
 
-__all__ = ["Checked", "Line", "check"]
+__all__ = ["Checked", "check"]
+
+
+class Checked(NamedTuple):
+    """All lines, the hypotheses of the promise among them, and the promise."""
+
+    lines: tuple[Statement, ...]
+    promise: Promise
+
+    @property
+    def promised(self) -> bool:
+        """Whether anything is promised."""
+        return self.promise.promised
 
 
 def check(parts: Parts, settings: Settings) -> Checked:
-    """Walk through the paper's statements on built parts, the region of the gain, and margins."""
+    """Walk through the paper's statements on parts, the hypotheses of their promise, and margins.
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others.
+    """
+    parts = prepare(parts, settings).parts
+    found = promise(parts, settings)
     with precision("float64"):
-        loop = checked_loop(parts, settings)
-        found = certified_set(loop)
         lines = (
-            *graph_lines(loop),
-            *drift_lines(loop),
-            *law_lines(loop),
-            *region_lines(loop, found),
-            *margin_lines(loop),
+            *graph_lines(parts),
+            *drift_lines(parts, found),
+            *found.hypotheses,
+            killing_line(parts, found),
+            *margin_lines(parts, found),
         )
-        reasons = list(_reasons(loop))
-    if reasons:
-        return Checked(lines, False, f"Nothing is promised: {'; '.join(reasons)}.")
-    without = f" This is said without what the scenario adds: {loop.disturbed}."
-    promise = _promise(loop, found) + (without if loop.disturbed else "")
-    return Checked(lines, True, promise)
-
-
-def _reasons(loop: CheckedLoop) -> Iterator[str]:
-    """Yield what stands against any promise; each has its line, with what to change."""
-    if not loop.governed:
-        yield "the followers' law does not act on the disagreement"
-        return
-    if not loop.trimmed:
-        yield "the law leaves out the trim input"
-    if loop.broken:
-        yield "an offset is no symmetry of the dynamics"
-    if not loop.every:
-        yield "the disagreement does not decay"
-    elif step_radius(loop, loop.settings.dt) >= 1.0:
-        yield "with the input held over the step `dt` it grows"
-
-
-def _promise(loop: CheckedLoop, found: CertifiedSet | None) -> str:
-    """Return what is promised, in sentences, and no more than that."""
-    condition = "" if loop.matched else ", once the leader's input rests at its trim"
-    local = (
-        "Promised, by linearization: followers that start near enough to their goals, with the "
-        f"leader near enough to the trim, converge to them{condition}"
-    )
-    region = loop.region
-    if region is None or region.theorem != "A5" and not region.rate > 0.0:
-        return f"{local}; no region is proved."
-    return f"{local}. {_regional(loop, found, condition)}"
-
-
-_BY = {
-    "proof": "Proved in exact arithmetic, in continuous time and within the inputs' limits: ",
-    "vertices": "By eigenvalues at the corners of a hull of all Jacobians, in continuous time and "
-    "within the inputs' limits: ",
-    "samples": "Seen at samples, which is no proof: ",
-}
-
-
-def _regional(loop: CheckedLoop, found: CertifiedSet | None, condition: str) -> str:
-    """Return what the region adds, as strong as its own argument and no stronger."""
-    region = loop.region
-    assert region is not None
-    by, where = _BY[region.kind], region.domain.in_words(loop.parts.model)
-    theorem, what = region.theorem, f"errors shrink at {region.rate:.3g} 1/s or faster"
-    if theorem == "A5":
-        what = "V does not rise"
-    if found is None:
-        return f"{by}small {what}{condition}, while the leader stays in {where} ({theorem})."
-    if not found.radius:
-        return (
-            f"{by}{what}{condition}, for as long as all agents stay in {where} ({theorem}), and no "
-            f"start is certified to stay: {found.why}."
-        )
-    read = "" if found.kind == region.kind else ", the leader going as in a run of its own"
-    start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
-    start = "everywhere" if found.radius == float("inf") else start
-    return f"{by}from {start}, {what}{condition}{read} ({theorem})."
+    return Checked(lines, found)

@@ -1,4 +1,4 @@
-"""What `check` says of the law near the trim: whether it works, and by how much."""
+"""How far the loop near the trim is from losing what it promises."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -9,100 +9,47 @@ import scipy.sparse.csgraph as csgraph
 from echelon.certificates import margins
 from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
 from echelon.core.types import Array
+from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.engine.parts import Parts
 from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
-from echelon.promises.closed_loop import CheckedLoop, step_radius
-from echelon.studies.lines import Line
+from echelon.promises.closed_loop import Loop
+from echelon.promises.promise import Promise
+from echelon.promises.statement import Statement, verdict_of
 
-_KIND = "linearization"
-
-
-def law_lines(loop: CheckedLoop) -> Iterator[Line]:
-    """Yield what the law needs to work at all."""
-    model, certificate = loop.parts.model, loop.certificate
-    n, rank = len(model.state_names), certificate.observable
-    hidden = margins.detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
-    names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
-    along = ", ".join(f"`{model.state_names[k]}`" for k in names)
-    text = f"never felt by the input: {along}; choose another P" if hidden else "z = 0 is reached"
-    verdict = "fails" if hidden else "holds"
-    yield Line("detectability of (A, g'P)", verdict, _KIND, f"rank {rank} of {n}", text)
-    yield _matched_line(loop)
-    edge, c = certificate.edge, loop.closed.coupling
-    text = "no edge known"
-    if edge is not None:
-        text = "guaranteed for linear agents from the edge on"
-        text += "" if c >= edge else "; raise `coupling` to it"
-    number = f"c {c:.4g}" + ("" if edge is None else f", edge {edge:.4g}")
-    fine = edge is None or c >= edge
-    yield Line("coupling", "holds" if fine else "fails", "proof", number, text)
-    yield _decay_line(loop)
-    yield _step_line(loop)
+_KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 
 
-def _matched_line(loop: CheckedLoop) -> Line:
-    text = "the leader has no input beyond its trim, so there is nothing to tell"
-    if loop.moving:
-        text = "the leader's input reaches every follower, which the paper's network does not give"
-        text = "each follower is told its parent's input" if loop.fed_by_parents else text
-    if not loop.matched:
-        text = "followers lag behind a moving leader; `feedforward: relay` removes it"
-    return Line("leader's motion is matched", _verdict(loop.matched), "proof", "", text)
-
-
-def _decay_line(loop: CheckedLoop) -> Line:
-    """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    certificate, followers = loop.certificate, len(loop.parts.graph.followers)
-    text = f"over {certificate.modes} eigenvalues of the graph"
-    if loop.fed_by_parents:
-        text = "over the edges' weights, as parents' inputs are fed forward"
-    elif certificate.modes < followers:
-        text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
-    if not loop.governed:
-        text = "the followers' law does not use the disagreement; use `consensus`"
-    elif not loop.every:
-        text += "; raise `coupling`, or use `riccati` or `inner-loop`"
-    verdict = _verdict(loop.every and loop.governed)
-    return Line("disagreement decays", verdict, _KIND, f"{certificate.abscissa:.3g} 1/s", text)
-
-
-def _step_line(loop: CheckedLoop) -> Line:
-    """Whether it still decays with the input held over the scenario's step."""
-    statement, dt = "step, input held", loop.settings.dt
-    if not loop.every:
-        return Line(statement, "not needed", _KIND, f"dt {dt:g} s", "there is nothing to lose")
-    radius = step_radius(loop, dt)
-    text = f"spectral radius {radius:.4g} a step, {loop.where}"
-    text += "" if radius < 1.0 else "; shorten `simulation.dt` or lower the gain"
-    return Line(statement, _verdict(radius < 1.0), _KIND, f"dt {dt:g} s", text)
-
-
-def margin_lines(loop: CheckedLoop) -> Iterator[Line]:
-    """Yield how far the loop is from losing what it promises."""
-    if not (loop.every and loop.governed):
-        yield Line("margins", "not needed", _KIND, "", "there is nothing to lose")
+def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
+    """Yield the margins of a loop that decays."""
+    loop = promise.loop
+    if promise.line("disagreement decays").fails:
+        text = "there is nothing to lose"
+        yield Statement("margins", Verdict.NOT_NEEDED, _KIND, text=text)
         return
-    factors, delay = margins.gain_margin(loop.closed), margins.delay_margin(loop.closed)
-    number = f"{factors.low:.3g} to {factors.high:.3g}"
-    yield Line("gain margin", "holds", _KIND, number, "factors on the coupling")
-    number = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
+    low, high = margins.gain_margin(loop.closed)
+    shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
+    yield Statement("gain margin", _HOLDS, _KIND, low, shown, text)
+    delay = margins.delay_margin(loop.closed)
+    shown = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
-    yield Line("delay margin", "holds", _KIND, number, text)
-    yield _scaling_line(loop)
-    # The bound of the network rests on a symmetric matrix, which parents' inputs take away.
-    yield from () if loop.fed_by_parents else _push_lines(loop)
-    yield from _string_line(loop)
+    yield Statement("delay margin", _HOLDS, _KIND, delay.delay, shown, text)
+    yield _scaling_line(parts.model, loop)
+    # The bound of the network rests on a symmetric matrix.
+    yield from _push_lines(parts.model, loop) if loop.symmetric else ()
+    yield from _string_line(parts, loop)
 
 
-def _scaling_line(loop: CheckedLoop) -> Line:
+def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
     # The trim input, and an inner loop's, weaken with the rest.
-    slopes = trim_slopes(loop.parts.model)
-    slopes = slopes - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
-    worst = margins.input_scaling(loop.closed, slopes=slopes)
-    text = "inputs 30 % weaker or stronger, as by a wrong mass or inertia"
-    text += "" if worst.abscissa < 0.0 else "; identify them better, or raise `coupling`"
-    number = f"{worst.abscissa:.3g} 1/s"
-    return Line("input scaling", _verdict(worst.abscissa < 0.0), _KIND, number, text)
+    slopes = trim_slopes(model) - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
+    worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
+    text, shown = (
+        "inputs 30 % weaker or stronger, as by a wrong mass or inertia",
+        f"{worst:.3g} 1/s",
+    )
+    remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
+    return Statement("input scaling", verdict_of(worst < 0.0), _KIND, worst, shown, text, remedy)
 
 
 class _Push(NamedTuple):
@@ -124,39 +71,35 @@ def _push(model: ControlAffine) -> _Push:
     return _Push(np.eye(n)[:, pushed], f"1{per} on {names}", model.position_indices() or pushed)
 
 
-def _push_lines(loop: CheckedLoop) -> Iterator[Line]:
-    model = loop.parts.model
+def _push_lines(model: ControlAffine, loop: Loop) -> Iterator[Statement]:
     E, where, watched = _push(model)
     units = {model.state_units[k] for k in watched}
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
-    def number(bounds: Array) -> str:
-        return ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
+    def line(name: str, bounds: Array, text: str) -> Statement:
+        shown = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
+        worst, text = float(bounds[list(watched)].max()), f"{unit}per {where}: {text}; {loop.where}"
+        return Statement(name, _HOLDS, _KIND, worst, shown, text)
 
-    text = f"{unit}per {where}: no push of that norm on all followers together takes any farther"
-    outer = invariant_ellipsoid(loop.closed, E)
-    yield Line("disturbance, network", "holds", _KIND, number(outer), f"{text}; {loop.where}")
-    text = f"{unit}per {where}: the exact peak, for a push shaped like the worst eigenvector"
-    exact = peak_gain(loop.closed, E)
-    yield Line("disturbance, one mode", "holds", _KIND, number(exact), f"{text}; {loop.where}")
+    text = "no push of that norm on all followers together takes any farther"
+    yield line("disturbance, network", invariant_ellipsoid(loop.closed, E), text)
+    text = "the exact peak, for a push shaped like the worst eigenvector"
+    yield line("disturbance, one mode", peak_gain(loop.closed, E), text)
 
 
-def _string_line(loop: CheckedLoop) -> Iterator[Line]:
+def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
     """On a tree with unit weights: what a chain of parents' inputs would amplify."""
-    graph = loop.parts.graph
+    graph = parts.graph
     tree = len(graph.edges) == graph.agents - 1 and len(graph.leaders) == 1
     if not tree or not (graph.weights == 1.0).all() or loop.closed.coupling < 0.5:
         return
     gain = margins.string_gain(loop.closed).gain
     hops = csgraph.dijkstra(graph.adjacency(), indices=graph.leaders[0], unweighted=True)
     depth = int(hops.max())
-    number = f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
-    used = loop.fed_by_parents
+    shown = f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
+    used = parts.drive.feedforward is Feedforward.PARENT
     text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
     if not used:
         text = "what feeding forward the parent's input would amplify; it is not used here"
-    yield Line("string gain", "holds" if used else "not needed", _KIND, number, text)
-
-
-def _verdict(holds: bool) -> str:
-    return "holds" if holds else "fails"
+    verdict = _HOLDS if used else Verdict.NOT_NEEDED
+    yield Statement("string gain", verdict, _KIND, gain**depth, shown, text)

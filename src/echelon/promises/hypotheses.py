@@ -1,0 +1,290 @@
+"""What a promise rests on, a line each: its verdict, its number, and what would be needed.
+
+A line whose `reason` is not empty stands against any promise where it fails; the others say what is
+left of one, or why.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.certificates.margins import detectability
+from echelon.core.numerics import precision
+from echelon.core.types import Array, States
+from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.engine.drive import Drive
+from echelon.engine.laws import Laws
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.laws.law import Law
+from echelon.models.check import trim_shortfall
+from echelon.models.model import ControlAffine
+from echelon.promises.closed_loop import Loop
+from echelon.promises.leaders import Leaders, apart
+from echelon.promises.statement import Statement, verdict_of
+
+_LINEAR = Kind.LINEARIZATION
+
+
+class Case(NamedTuple):
+    """What runs, prepared, its loop near the trim and its leaders."""
+
+    parts: Parts
+    settings: Settings
+    loop: Loop
+    leaders: Leaders
+
+    @property
+    def governed(self) -> bool:
+        """Whether the followers run a law that a theorem speaks of, u = u_ff - c R^-1 g'P z."""
+        return self.parts.drive.metric(self.parts.model) is not None
+
+    @property
+    def fed_by_parents(self) -> bool:
+        """Whether each follower is sent the input of its parent."""
+        return self.parts.drive.feedforward is Feedforward.PARENT
+
+    @property
+    def matched(self) -> bool:
+        """Whether the followers are sent an input, or the leader has none beyond the trim."""
+        sent = self.parts.drive.feedforward is not Feedforward.NONE
+        return sent or self.leaders.rest or self.leaders.alike
+
+    @property
+    def disturbed(self) -> str:
+        """What acts that no promise covers, in words; empty without any."""
+        world = self.parts.world
+        found = {
+            "wind or noise acts on the agents": world.disturbance,
+            "the agents differ from the model": world.plant,
+        }
+        return " and ".join(text for text, what in found.items() if what is not None)
+
+
+def hypotheses(case: Case) -> Iterator[Statement]:
+    """Yield what any promise of the loop near the trim rests on."""
+    yield _trim_applied(case)
+    yield _trim_held(case)
+    yield _exact(case)
+    yield _agreement(case)
+    yield _symmetric(case)
+    yield _detectable(case)
+    yield _matched(case)
+    yield _coupled(case)
+    yield _decaying(case)
+    yield _held(case)
+
+
+# ---- the agents and their leaders ---------------------------------------------------------------
+
+
+def _trim_applied(case: Case) -> Statement:
+    """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
+    parts, name = case.parts, "Definition 1, f(0) = 0"
+    there = np.zeros_like(parts.formation.offsets)
+    size = float(np.abs(goal_drifts(parts.model, there, parts.drive)).max())
+    applied = parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float))
+    text, remedy, reason = "about the trim, whose input the law applies", "", ""
+    if not applied:
+        text, remedy = "the law leaves out the trim input", "set `follower.trim: true`"
+        reason = "the law leaves out the trim input"
+    verdict, shown = verdict_of(applied), f"|f + g u*| {size:.2g}"
+    return Statement(name, verdict, Kind.PROOF, size, shown, text, remedy, reason)
+
+
+def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:
+    """Return the drift at the goals about the trim, (N, n), with the law's inner loop if any."""
+    with precision("float64"):
+        goals = jnp.asarray(np.asarray(model.trim[0], float) + offsets)
+        return np.asarray(_drifts(model, law, goals), np.float64)
+
+
+@eqx.filter_jit
+def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
+    if law is None:
+        return jax.vmap(model.normalized_drift)(states)
+    return jax.vmap(lambda x: law.drift(model, x))(states)
+
+
+def _trim_held(case: Case) -> Statement:
+    """Within limits an agent holds its trim only if its actuators deliver that input."""
+    model, plant, name = case.parts.model, case.parts.world.plant, "trim within the limits"
+    moved = case.parts.world.moved(model)
+    if not case.settings.limits or moved.input_limits is None:
+        text = "no limit acts on the inputs"
+        return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
+    short = trim_shortfall(moved, np.asarray(model.trim[1], float))
+    if plant is not None:
+        # A heavier plant needs more than the model's trim to stay where it is.
+        short |= trim_shortfall(plant)
+    if not short:
+        text = "the actuators deliver the input that it takes"
+        return Statement(name, Verdict.HOLDS, Kind.PROOF, text=text)
+    units = dict(zip(model.input_names, model.input_units, strict=True))
+    cut = [f"{got:.4g} of {asked:.4g} {units[i]}".rstrip() for i, (got, asked) in short.items()]
+    text = "the actuators deliver " + ", ".join(f"`{i}` {part}" for i, part in zip(short, cut))
+    worst = min(got / asked if asked else 0.0 for got, asked in short.values())
+    remedy = "lighten the agents or strengthen their actuators"
+    reason = f"{text}, and cannot hold the trim"
+    shown = f"{100.0 * worst:.3g} %"
+    return Statement(name, Verdict.FAILS, Kind.PROOF, worst, shown, text, remedy, reason)
+
+
+def _exact(case: Case) -> Statement:
+    """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
+    text = "states are known exactly, and nothing disturbs the agents"
+    if case.disturbed:
+        text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
+    verdict = verdict_of(not case.disturbed)
+    return Statement("Assumption 3, exact states", verdict, Kind.PROOF, text=text)
+
+
+def _agreement(case: Case) -> Statement:
+    """Several leaders are one if they start alike and do the same; else nobody can follow all."""
+    name, leaders = "leaders agree", case.leaders
+    if len(leaders.starts) == 1:
+        return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text="there is one")
+    if leaders.agree:
+        text = "they start alike and obey one law"
+        return Statement(name, Verdict.HOLDS, Kind.PROOF, 0.0, "0 apart", text)
+    if leaders.meet:
+        slow = case.loop.slowest if leaders.slowest is None else leaders.slowest
+        text = "they start apart, and their own law brings them together"
+        return Statement(name, Verdict.HOLDS, _LINEAR, slow, f"{slow:.3g} 1/s", text)
+    if leaders.answer:
+        text = "leaders that answer to their neighbours are pushed apart by them"
+        remedy = "set `leader.reacts: false`"
+        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
+    return _drifting(case, name)
+
+
+def _drifting(case: Case, name: str) -> Statement:
+    """Say by how much free leaders drift apart, and what is left: containment.
+
+    Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
+    the disagreement; the rows of -L_g^-1 L_FL are weights that add to one.
+    """
+    away = apart(case.parts, case.settings, case.leaders.starts)
+    first, unit = case.parts.graph.leaders[0], "m " if case.parts.model.position else ""
+    text = (
+        f"leader {away.leader} starts {away.start:.3g} {unit}off the place that leader {first} "
+        f"gives it, is {away.end:.3g} {unit}off at {case.settings.horizon:g} s and "
+        f"{away.most:.3g} {unit}at most"
+    )
+    remedy = "start the leaders alike, or give them a reference to follow"
+    reason = f"{text}; followers of linear agents then end in the leaders' convex hull"
+    shown = f"{away.most:.3g} {unit}apart"
+    return Statement(name, Verdict.FAILS, Kind.SAMPLES, away.most, shown, text, remedy, reason)
+
+
+def _symmetric(case: Case) -> Statement:
+    broken = case.parts.formation.broken_symmetries(case.parts.model)
+    text, remedy, reason = "f and g do not notice them", "", ""
+    if broken:
+        agent, why = next(iter(broken.items()))
+        text, remedy = f"agent {agent}: {why}", "offset only states that f and g ignore"
+        reason = "an offset is no symmetry of the dynamics"
+    verdict, count = verdict_of(not broken), len(broken)
+    name, shown = "offsets are symmetries", f"{count} broken"
+    return Statement(name, verdict, Kind.SAMPLES, count, shown, text, remedy, reason)
+
+
+# ---- the law near the trim ----------------------------------------------------------------------
+
+
+def _detectable(case: Case) -> Statement:
+    model, loop, name = case.parts.model, case.loop, "detectability of (A, g'P)"
+    if not case.governed:
+        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, text="there is no P")
+    rank, n = loop.certificate.observable, len(model.state_names)
+    hidden = detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
+    names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
+    along = ", ".join(f"`{model.state_names[k]}`" for k in names)
+    text, remedy = "z = 0 is reached", ""
+    if hidden:
+        text = f"{n - rank} directions of disagreement never enter any input, and along {along} "
+        text, remedy = f"{text}it does not decay by itself", "choose another P"
+    verdict = verdict_of(not hidden)
+    return Statement(name, verdict, _LINEAR, rank, f"rank {rank} of {n}", text, remedy)
+
+
+def _matched(case: Case) -> Statement:
+    name, leaders, reason = "leader's motion is matched", case.leaders, ""
+    text, remedy = "the leader has no input beyond its trim, so there is nothing to send", ""
+    if leaders.alike:
+        text = "the leaders obey the followers' law, so there is nothing to send"
+    elif not leaders.rest:
+        text = "the leader's input reaches every follower, which the paper's network does not give"
+        text = "each follower is sent its parent's input" if case.fed_by_parents else text
+    if not case.matched:
+        text = "followers lag behind a moving leader"
+        remedy = "`feedforward: relay` removes the lag, and asks for the leader's input at every "
+        remedy += "follower"
+        if leaders.answer and case.governed:
+            text = reason = "the leader answers to followers that do not know its input, and "
+            text = reason = f"{text}nothing is known of that loop"
+    verdict = verdict_of(case.matched)
+    return Statement(name, verdict, Kind.PROOF, None, "", text, remedy, reason)
+
+
+def _coupled(case: Case) -> Statement:
+    edge, c = case.loop.certificate.edge, case.loop.closed.coupling
+    if edge is None:
+        text = "no edge known"
+        return Statement("coupling", Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
+    fine, shown = c >= edge, f"c {c:.4g}, edge {edge:.4g}"
+    text, remedy = (
+        "from the edge on every mode decays: near the trim, of linear agents anywhere",
+        "",
+    )
+    if not fine:
+        text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
+        remedy = f"raise `coupling` to {edge:.4g} or more"
+    return Statement("coupling", verdict_of(fine), Kind.PROOF, c, shown, text, remedy)
+
+
+def _decaying(case: Case) -> Statement:
+    """Whether every mode of the network decays; `every` covers what lies between extremes."""
+    name, loop, remedy, reason = "disagreement decays", case.loop, "", ""
+    if not case.governed:
+        law = isinstance(case.parts.drive, Laws)
+        text = "the followers' law does not act on the disagreement"
+        text = text if law else f"no theorem is known of `{type(case.parts.drive).__name__}`"
+        remedy = "use `consensus`" if law else ""
+        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
+    text = f"over {loop.certificate.modes} eigenvalues of the graph"
+    if case.fed_by_parents:
+        text = "over the edges' weights, as parents' inputs are fed forward"
+    elif len(loop.closed.eigenvalues) > loop.certificate.modes:
+        text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
+    if not loop.every:
+        remedy = "raise `coupling`, or use `riccati` or `inner-loop`"
+        reason = "the disagreement does not decay"
+    verdict, shown = verdict_of(loop.every), f"{loop.slowest:.3g} 1/s"
+    return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)
+
+
+def _held(case: Case) -> Statement:
+    """Whether it still decays in steps of the integrator that runs, with the input held."""
+    name, loop, settings = "step, input held", case.loop, case.settings
+    shown = f"dt {settings.dt:g} s"
+    if not (loop.every and case.governed):
+        text = "there is nothing to lose"
+        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, None, shown, text)
+    radius, printed = loop.radius(settings), settings.integrator == "printed"
+    text, remedy, reason = f"spectral radius {radius:.4g} a step, {loop.where}", "", ""
+    goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
+    if printed and goals.any():
+        radius, text = np.inf, "`printed` takes f + g u for the state, and so forgets the goals"
+    if not radius < 1.0:
+        remedy = "use `simulation.integrator: rk4`"
+        if not printed:
+            longest = loop.longest_step(settings)
+            remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
+        reason = "with the input held over the step `dt` it grows"
+    verdict = verdict_of(radius < 1.0)
+    return Statement(name, verdict, _LINEAR, float(radius), shown, text, remedy, reason)

@@ -1,0 +1,194 @@
+"""The one place that says what is promised of what runs, with each hypothesis and its number.
+
+Everything that tells of a promise reads it here: `check`, a run before it starts and its report,
+`design`, `compare` and `summary.json`. It is computed for the model, graph, coupling, step,
+integrator, feed-forward, limits and starts that run; what a gain says of itself is only compared.
+"""
+
+import dataclasses
+from typing import Any, final
+from weakref import WeakKeyDictionary
+
+from echelon.certificates.certificate import RegionCertificate
+from echelon.core.numerics import precision
+from echelon.core.words import Kind, Theorem
+from echelon.engine.parts import Parts
+from echelon.engine.prepare import Prepared, prepare
+from echelon.engine.settings import Settings
+from echelon.promises.certified_set import CertifiedSet, certified_set, set_lines
+from echelon.promises.claims import CLAIMS, claims_line
+from echelon.promises.closed_loop import Loop, loop_of
+from echelon.promises.hypotheses import Case, hypotheses
+from echelon.promises.leaders import leaders_of
+from echelon.promises.region import region_of
+from echelon.promises.statement import Statement
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Promise:
+    """What is promised of a closed loop, and what that rests on.
+
+    Attributes:
+        loop: near the trim; what margins are taken of.
+        region: what is promised on a domain; None without more than the linearization.
+        certified: the set of starts that the region certifies; None without one.
+        hypotheses: each with its verdict, its number and what would be needed.
+        domain: the region's domain in words; empty without one.
+        condition: on the leader, in words; empty where there is none.
+        without: what acts on the agents that is left out, in words; empty without any.
+        own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
+    """
+
+    loop: Loop
+    region: RegionCertificate | None
+    certified: CertifiedSet | None
+    hypotheses: tuple[Statement, ...]
+    domain: str
+    condition: str
+    without: str
+    own: float | None
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What stands against any promise; nothing where there is one."""
+        failed = (each for each in self.hypotheses if each.fails)
+        return tuple(dict.fromkeys(each.reason for each in failed if each.reason))
+
+    @property
+    def promised(self) -> bool:
+        """Whether anything is promised."""
+        return not self.reasons
+
+    @property
+    def theorem(self) -> Theorem | None:
+        """The theorem behind the promise; None where it is the linearization alone, or nothing."""
+        region = self.region if self.promised else None
+        return None if region is None else Theorem.named(region.theorem)
+
+    @property
+    def kind(self) -> Kind:
+        """The kind of argument behind the promise."""
+        region = self.region if self.promised else None
+        return Kind.LINEARIZATION if region is None else Kind.named(region.kind)
+
+    @property
+    def rate(self) -> float | None:
+        """At what rate errors shrink, 1/s; of the slowest mode near the trim without a theorem.
+
+        None where nothing is promised; 0 where V is promised not to rise, and no more.
+        """
+        if not self.promised:
+            return None
+        return -self.loop.slowest if self.region is None else self.region.rate
+
+    @property
+    def edge(self) -> float | None:
+        """The coupling from which on every mode is proved to decay; None where none is known."""
+        return self.loop.certificate.edge
+
+    def line(self, statement: str) -> Statement:
+        """Return the hypothesis of a name."""
+        return next(each for each in self.hypotheses if each.statement == statement)
+
+    def sentence(self) -> str:
+        """Return what is promised, in sentences, and no more than that."""
+        told = self._promised() if self.promised else None
+        told = told or f"Nothing is promised: {'; '.join(self.reasons)}."
+        claims = self.line(CLAIMS)
+        return f"{told} Note: {claims.explanation}." if claims.fails else told
+
+    def _promised(self) -> str:
+        local = (
+            "Promised, by linearization: followers that start near enough to their goals, with the "
+            f"leader near enough to the trim, converge to them{self.condition}"
+        )
+        text = f"{local}; no region is proved."
+        if self.region is not None:
+            text = f"{local}. {self._regional(self.region)}"
+        without = f" This is said without what the scenario adds: {self.without}."
+        return text + without if self.without else text
+
+    def _regional(self, region: RegionCertificate) -> str:
+        """Return what the region adds, as strong as its own argument and no stronger."""
+        found, condition, theorem = self.certified, self.condition, Theorem.named(region.theorem)
+        by, what = self.kind.value, f"errors shrink at {region.rate:.3g} 1/s or faster"
+        what = "V does not rise" if theorem is Theorem.A5 else what
+        if found is None:
+            text = f"small {what}{condition}, while the leader stays in {self.domain}"
+            return f"{by}: {text} ({theorem})."
+        if not found.radius:
+            text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
+            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}."
+        read = "" if found.kind is self.kind else ", the leader going as in a run of its own"
+        start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
+        start = "everywhere" if found.radius == float("inf") else start
+        return f"{by}: from {start}, {what}{condition}{read} ({theorem})."
+
+    def as_mapping(self) -> dict[str, Any]:
+        """Return the whole promise ready for JSON; what does not exist is None."""
+        certificate, found = self.loop.certificate, self.certified
+        theorem = self.theorem
+        return {
+            "promised": self.promised,
+            "sentence": self.sentence(),
+            "reasons": list(self.reasons),
+            "theorem": None if theorem is None else str(theorem),
+            "kind": str(self.kind),
+            "rate": self.rate,
+            "slowest_mode": self.loop.slowest,
+            "coupling": self.loop.closed.coupling,
+            "edge": certificate.edge,
+            "lambda_min": certificate.lambda_min,
+            "lambda_max": certificate.lambda_max,
+            "domain": self.domain or None,
+            "certified_set": None
+            if found is None
+            else {
+                "radius": found.radius if found.radius < float("inf") else None,
+                "kind": str(found.kind),
+                "why": found.why,
+            },
+            "hypotheses": [each.as_mapping() for each in self.hypotheses],
+        }
+
+
+_kept: WeakKeyDictionary[Parts, dict[Settings, Promise]] = WeakKeyDictionary()
+
+
+def promise(parts: Parts, settings: Settings) -> Promise:
+    """Return what is promised of parts under settings; computed once for as long as they live.
+
+    Where a theorem certifies a set behind a leader that moves, and where free leaders start apart,
+    the leaders are run by themselves.
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others.
+    """
+    known = _kept.setdefault(parts, {})
+    if settings not in known:
+        prepared = prepare(parts, settings)
+        with precision("float64"):
+            known[settings] = _compute(prepared, settings)
+        # A result holds the prepared parts, and asks again.
+        _kept.setdefault(prepared.parts, {})[settings] = known[settings]
+    return known[settings]
+
+
+def _compute(prepared: Prepared, settings: Settings) -> Promise:
+    parts, states = prepared.parts, prepared.problem.states
+    leaders, loop = leaders_of(parts, states), loop_of(parts)
+    case, region = Case(parts, settings, loop, leaders), region_of(parts, leaders)
+    certificate = region.certificate
+    found = certified_set(parts, settings, leaders, certificate)
+    lines = [*hypotheses(case), region.line, *set_lines(parts, states, certificate, found)]
+    return Promise(
+        loop=loop,
+        region=certificate,
+        certified=found,
+        hypotheses=(*lines, claims_line(parts, loop, region.relayed)),
+        domain="" if certificate is None else certificate.domain.in_words(parts.model),
+        condition="" if case.matched else ", once the leader's input rests at its trim",
+        without=case.disturbed,
+        own=None if leaders.rest else leaders.slowest,
+    )

@@ -1,0 +1,106 @@
+"""What the metric of a gain promises on its domain for the model, graph, coupling and law that run.
+
+A region that a gain carries is a claim of when it was made. Here it is computed again: the
+Jacobians are enclosed from the model that runs, the strength 2 c lambda_min is that of its coupling
+and graph, and a proof is proved anew. All of that is kept in a process, so it is not paid twice.
+"""
+
+from typing import NamedTuple
+
+from echelon.certificates.certificate import RegionCertificate
+from echelon.certificates.jacobians import jacobians
+from echelon.certificates.lmi import falls
+from echelon.certificates.region import contracting_region, drift_region, pairs_on
+from echelon.core.errors import GainError
+from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.engine.parts import Parts
+from echelon.gains.gain import Gain
+from echelon.models.linearization import linearize
+from echelon.promises.leaders import Leaders
+from echelon.promises.statement import Statement, verdict_of
+
+_NAME = "region of the gain"
+
+
+class Region(NamedTuple):
+    """What is promised on a domain, if anything, the line that says so, and the bare claim.
+
+    Attributes:
+        certificate: of the law that runs; None where nothing is promised.
+        relayed: what the metric promises where the leader's input is relayed; None for nothing.
+        line: what was found.
+    """
+
+    certificate: RegionCertificate | None
+    relayed: RegionCertificate | None
+    line: Statement
+
+
+def region_of(parts: Parts, leaders: Leaders) -> Region:
+    """Return what is promised on the domain that the gain of prepared parts was made for."""
+    gain = parts.drive.gain
+    if gain is None or gain.certificate.region is None:
+        text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
+        line = Statement(_NAME, Verdict.NOT_NEEDED, Kind.PROOF, shown="none", text=text)
+        return Region(None, None, line)
+    try:
+        found = _computed(parts, gain, gain.certificate.region)
+    except GainError as error:
+        return Region(None, None, _lost(str(error).rstrip("."), "make the gain again"))
+    if found is None:
+        strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
+        text = f"P contracts at no rate on the domain {strength}"
+        return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
+    text, remedy = _withheld(parts, leaders, gain, found)
+    if text:
+        return Region(None, found, _lost(text, remedy))
+    return Region(found, found, _line(parts, found))
+
+
+def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
+    """Return what the metric promises on the claim's domain behind a relayed input."""
+    model, graph, exact = parts.model, parts.graph, Kind.named(claim.kind) is Kind.PROOF
+    if Theorem.named(claim.theorem) is Theorem.A5:
+        found = jacobians(model, claim.domain)
+        monotone = falls(gain.P, found.matrices)
+        return drift_region(model, claim.domain, found, gain.P, graph) if monotone else None
+    found, *_ = pairs_on(model, claim.domain, gain.R)
+    B, strength = linearize(model).B, _strength(parts, gain)
+    return contracting_region(claim.domain, found, gain.P, B, gain.R, strength, exact)
+
+
+def _strength(parts: Parts, gain: Gain) -> float:
+    return 2.0 * gain.coupling * float(parts.graph.grounded_spectrum()[0])
+
+
+def _withheld(
+    parts: Parts, leaders: Leaders, gain: Gain, found: RegionCertificate
+) -> tuple[str, str]:
+    """Return why the law that runs does not keep what the metric could, and what would."""
+    feedforward, theorem = parts.drive.feedforward, found.theorem
+    if gain.inner is not None:
+        return "the hull is of the drift without the gain's inner loop", "leave the loop out"
+    if feedforward is Feedforward.PARENT:
+        text = "parents' inputs are fed forward, and the modes are no longer those of a symmetric "
+        return f"{text}matrix, which {theorem} rests on", "set `feedforward: relay`"
+    if feedforward is Feedforward.NONE and not leaders.rest:
+        text = f"{theorem} needs the leader's input at every follower, or at rest at its trim"
+        return text, "set `feedforward: relay`"
+    if feedforward is Feedforward.RELAY_VELOCITY and Theorem.named(theorem) is Theorem.T2:
+        text = "T2 is of the leader's raw input; what each agent makes of its velocity turns with g"
+        return f"{text}, and is not enclosed", "set `feedforward: relay`"
+    if not leaders.agree:
+        return f"{theorem} speaks of one leader, or of leaders that agree", "start them alike"
+    return "", ""
+
+
+def _lost(text: str, remedy: str) -> Statement:
+    return Statement(_NAME, Verdict.FAILS, Kind.PROOF, None, "none", text, remedy)
+
+
+def _line(parts: Parts, found: RegionCertificate) -> Statement:
+    theorem, kind = Theorem.named(found.theorem), Kind.named(found.kind)
+    text = f"{theorem}: {theorem.value} {found.domain.in_words(parts.model)}"
+    text += f"; no more than {kind}, since {found.why}" if found.why else ""
+    shown = f"{found.rate:.3g} 1/s"
+    return Statement(_NAME, verdict_of(True), kind, found.rate, shown, text)
