@@ -10,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from echelon.engine.simulate import Progress
+    from echelon.scenario.build import Built
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 ScenarioArgument = Annotated[str, typer.Argument(help="A bundled scenario's name, or a YAML file.")]
@@ -40,6 +41,17 @@ def show_progress(quiet: bool) -> "Iterator[Progress | None]":
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("simulating", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def foretell(built: "Built", quiet: bool) -> None:
+    """Say on standard error what is promised of a run, and always if nothing is."""
+    if quiet:
+        return
+    from echelon.promises.promise import promise
+    from echelon.studies.outlook import outlook
+
+    if sys.stderr.isatty() or not promise(*built).promised:
+        print(f"echelon: {outlook(*built)}", file=sys.stderr, flush=True)
 
 
 def announce(quiet: bool) -> "Callable[[str], None]":

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from echelon.cli import tables
-from echelon.cli.console import JsonOption, ScenarioArgument, show_progress, written
+from echelon.cli.console import JsonOption, ScenarioArgument, foretell, show_progress, written
 
 
 def run(
@@ -38,6 +38,7 @@ def run(
     built = build.build(checked)
     folder = files.claim_folder(checked.name, out, force)
     console = tables.console()
+    foretell(built, quiet=as_json)
     with show_progress(quiet=as_json) as progress:
         result = build.run(checked, progress, built)
     files.write_data(result, folder)

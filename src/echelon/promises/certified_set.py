@@ -11,7 +11,7 @@ from echelon.core.words import Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.promises.leaders import Leaders, excursion, own_paths
-from echelon.promises.statement import Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement, verdict_of
 
 
 class CertifiedSet(NamedTuple):
@@ -100,18 +100,19 @@ def set_lines(
     parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
 ) -> list[Statement]:
     """Return the set as a line, and whether the starts (N, n) lie in it."""
-    name, starts = "certified set", "starts in the certified set"
     if found is None:
         local = region is not None and Theorem.named(region.theorem) is Theorem.T2
         text = "T2 is local and certifies no set" if local else "needs a region"
-        return [Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)]
-    shown = f"radius {found.radius:.3g}" if found.radius else "empty"
-    verdict = verdict_of(found.radius > 0.0)
-    line = Statement(name, verdict, found.kind, found.radius, shown, found.why)
-    size = size_of(parts, states)
-    shown = f"{size:.3g} of {found.radius:.3g}"
-    text, remedy = "from there no follower leaves the domain", ""
-    if not size <= found.radius:
+        return [
+            Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
+            for name in (Hypothesis.SET, Hypothesis.STARTS)
+        ]
+    size, radius, text, remedy = size_of(parts, states), found.radius, "", ""
+    shown, holds = f"radius {radius:.3g}" if radius else "empty", verdict_of(radius > 0.0)
+    line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why)
+    text, holds = "from there no follower leaves the domain", verdict_of(size <= radius)
+    if not size <= radius:
         text, remedy = "what the set promises does not reach them", "start nearer to the goals"
-    verdict = verdict_of(size <= found.radius)
-    return [line, Statement(starts, verdict, found.kind, size, shown, text, remedy)]
+    shown = f"{size:.3g} of {radius:.3g}"
+    starts = Statement(Hypothesis.STARTS, holds, found.kind, size, shown, text, remedy)
+    return [line, starts]

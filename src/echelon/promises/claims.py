@@ -7,9 +7,8 @@ from echelon.core.words import Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.promises.closed_loop import Loop, grounded_slowest
-from echelon.promises.statement import Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement, verdict_of
 
-CLAIMS = "claims of the gain"
 _SAME = 1e-6
 """Relative; less than that is rounding, or another library's eigenvalues."""
 _ROUNDING = 1e-9  # of the fastest mode, in the slowest
@@ -26,11 +25,11 @@ def claims_line(parts: Parts, loop: Loop, found: RegionCertificate | None) -> St
     gain = parts.drive.gain
     if gain is None:
         text = "there is no gain"
-        return Statement(CLAIMS, Verdict.NOT_NEEDED, Kind.LINEARIZATION, text=text)
+        return Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, Kind.LINEARIZATION, text=text)
     text = _difference(parts, gain, loop, found)
     verdict, remedy = verdict_of(not text), "what is promised here is computed anew" if text else ""
     text = text or "they are of this model, graph and coupling"
-    return Statement(CLAIMS, verdict, Kind.LINEARIZATION, text=text, remedy=remedy)
+    return Statement(Hypothesis.CLAIMS, verdict, Kind.LINEARIZATION, text=text, remedy=remedy)
 
 
 def _difference(parts: Parts, gain: Gain, loop: Loop, found: RegionCertificate | None) -> str:

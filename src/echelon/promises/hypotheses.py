@@ -25,7 +25,7 @@ from echelon.models.check import trim_shortfall
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.leaders import Leaders, apart
-from echelon.promises.statement import Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement, verdict_of
 
 _LINEAR = Kind.LINEARIZATION
 
@@ -84,7 +84,7 @@ def hypotheses(case: Case) -> Iterator[Statement]:
 
 def _trim_applied(case: Case) -> Statement:
     """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
-    parts, name = case.parts, "Definition 1, f(0) = 0"
+    parts, name = case.parts, Hypothesis.TRIM_APPLIED
     there = np.zeros_like(parts.formation.offsets)
     size = float(np.abs(goal_drifts(parts.model, there, parts.drive)).max())
     applied = parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float))
@@ -112,7 +112,7 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 
 def _trim_held(case: Case) -> Statement:
     """Within limits an agent holds its trim only if its actuators deliver that input."""
-    model, plant, name = case.parts.model, case.parts.world.plant, "trim within the limits"
+    model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_HELD
     moved = case.parts.world.moved(model)
     if not case.settings.limits or moved.input_limits is None:
         text = "no limit acts on the inputs"
@@ -140,12 +140,12 @@ def _exact(case: Case) -> Statement:
     if case.disturbed:
         text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
     verdict = verdict_of(not case.disturbed)
-    return Statement("Assumption 3, exact states", verdict, Kind.PROOF, text=text)
+    return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text)
 
 
 def _agreement(case: Case) -> Statement:
     """Several leaders are one if they start alike and do the same; else nobody can follow all."""
-    name, leaders = "leaders agree", case.leaders
+    name, leaders = Hypothesis.AGREEMENT, case.leaders
     if len(leaders.starts) == 1:
         return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text="there is one")
     if leaders.agree:
@@ -162,7 +162,7 @@ def _agreement(case: Case) -> Statement:
     return _drifting(case, name)
 
 
-def _drifting(case: Case, name: str) -> Statement:
+def _drifting(case: Case, name: Hypothesis) -> Statement:
     """Say by how much free leaders drift apart, and what is left: containment.
 
     Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
@@ -176,7 +176,10 @@ def _drifting(case: Case, name: str) -> Statement:
         f"{away.most:.3g} {unit}at most"
     )
     remedy = "start the leaders alike, or give them a reference to follow"
-    reason = f"{text}; followers of linear agents then end in the leaders' convex hull"
+    reason = (
+        f"the leaders do not agree, but are {away.most:.3g} {unit}apart; followers of linear "
+        "agents then end in the leaders' convex hull"
+    )
     shown = f"{away.most:.3g} {unit}apart"
     return Statement(name, Verdict.FAILS, Kind.SAMPLES, away.most, shown, text, remedy, reason)
 
@@ -189,7 +192,7 @@ def _symmetric(case: Case) -> Statement:
         text, remedy = f"agent {agent}: {why}", "offset only states that f and g ignore"
         reason = "an offset is no symmetry of the dynamics"
     verdict, count = verdict_of(not broken), len(broken)
-    name, shown = "offsets are symmetries", f"{count} broken"
+    name, shown = Hypothesis.SYMMETRY, f"{count} broken"
     return Statement(name, verdict, Kind.SAMPLES, count, shown, text, remedy, reason)
 
 
@@ -197,7 +200,7 @@ def _symmetric(case: Case) -> Statement:
 
 
 def _detectable(case: Case) -> Statement:
-    model, loop, name = case.parts.model, case.loop, "detectability of (A, g'P)"
+    model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
     if not case.governed:
         return Statement(name, Verdict.NOT_NEEDED, _LINEAR, text="there is no P")
     rank, n = loop.certificate.observable, len(model.state_names)
@@ -206,14 +209,14 @@ def _detectable(case: Case) -> Statement:
     along = ", ".join(f"`{model.state_names[k]}`" for k in names)
     text, remedy = "z = 0 is reached", ""
     if hidden:
-        text = f"{n - rank} directions of disagreement never enter any input, and along {along} "
+        text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} "
         text, remedy = f"{text}it does not decay by itself", "choose another P"
     verdict = verdict_of(not hidden)
     return Statement(name, verdict, _LINEAR, rank, f"rank {rank} of {n}", text, remedy)
 
 
 def _matched(case: Case) -> Statement:
-    name, leaders, reason = "leader's motion is matched", case.leaders, ""
+    name, leaders, reason = Hypothesis.MATCHED, case.leaders, ""
     text, remedy = "the leader has no input beyond its trim, so there is nothing to send", ""
     if leaders.alike:
         text = "the leaders obey the followers' law, so there is nothing to send"
@@ -235,7 +238,7 @@ def _coupled(case: Case) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
         text = "no edge known"
-        return Statement("coupling", Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
+        return Statement(Hypothesis.COUPLED, Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
     fine, shown = c >= edge, f"c {c:.4g}, edge {edge:.4g}"
     text, remedy = (
         "from the edge on every mode decays: near the trim, of linear agents anywhere",
@@ -244,12 +247,12 @@ def _coupled(case: Case) -> Statement:
     if not fine:
         text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
         remedy = f"raise `coupling` to {edge:.4g} or more"
-    return Statement("coupling", verdict_of(fine), Kind.PROOF, c, shown, text, remedy)
+    return Statement(Hypothesis.COUPLED, verdict_of(fine), Kind.PROOF, c, shown, text, remedy)
 
 
 def _decaying(case: Case) -> Statement:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    name, loop, remedy, reason = "disagreement decays", case.loop, "", ""
+    name, loop, remedy, reason = Hypothesis.DECAYS, case.loop, "", ""
     if not case.governed:
         law = isinstance(case.parts.drive, Laws)
         text = "the followers' law does not act on the disagreement"
@@ -270,7 +273,7 @@ def _decaying(case: Case) -> Statement:
 
 def _held(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
-    name, loop, settings = "step, input held", case.loop, case.settings
+    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
     shown = f"dt {settings.dt:g} s"
     if not (loop.every and case.governed):
         text = "there is nothing to lose"
@@ -285,6 +288,7 @@ def _held(case: Case) -> Statement:
         if not printed:
             longest = loop.longest_step(settings)
             remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
+        text = f"the step `dt` = {settings.dt:g} s is too long for this gain: {text}"
         reason = "with the input held over the step `dt` it grows"
     verdict = verdict_of(radius < 1.0)
     return Statement(name, verdict, _LINEAR, float(radius), shown, text, remedy, reason)

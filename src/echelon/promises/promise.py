@@ -6,7 +6,8 @@ integrator, feed-forward, limits and starts that run; what a gain says of itself
 """
 
 import dataclasses
-from typing import Any, final
+from collections.abc import Mapping
+from typing import Any, cast, final
 from weakref import WeakKeyDictionary
 
 from echelon.certificates.certificate import RegionCertificate
@@ -16,12 +17,14 @@ from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.settings import Settings
 from echelon.promises.certified_set import CertifiedSet, certified_set, set_lines
-from echelon.promises.claims import CLAIMS, claims_line
+from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
 from echelon.promises.hypotheses import Case, hypotheses
 from echelon.promises.leaders import leaders_of
 from echelon.promises.region import region_of
-from echelon.promises.statement import Statement
+from echelon.promises.statement import Hypothesis, Statement
+
+_BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
 
 @final
@@ -43,7 +46,7 @@ class Promise:
     loop: Loop
     region: RegionCertificate | None
     certified: CertifiedSet | None
-    hypotheses: tuple[Statement, ...]
+    hypotheses: Mapping[Hypothesis, Statement]
     domain: str
     condition: str
     without: str
@@ -52,7 +55,7 @@ class Promise:
     @property
     def reasons(self) -> tuple[str, ...]:
         """What stands against any promise; nothing where there is one."""
-        failed = (each for each in self.hypotheses if each.fails)
+        failed = (each for each in self.hypotheses.values() if each.fails)
         return tuple(dict.fromkeys(each.reason for each in failed if each.reason))
 
     @property
@@ -87,15 +90,23 @@ class Promise:
         """The coupling from which on every mode is proved to decay; None where none is known."""
         return self.loop.certificate.edge
 
-    def line(self, statement: str) -> Statement:
-        """Return the hypothesis of a name."""
-        return next(each for each in self.hypotheses if each.statement == statement)
+    @property
+    def causes(self) -> tuple[Statement, ...]:
+        """The hypotheses whose failure explains why errors do not shrink.
+
+        A mode that does not decay is explained by what the law cannot feel, or a weak coupling.
+        """
+        failed = {name: each for name, each in self.hypotheses.items() if each.fails}
+        grows = Hypothesis.DECAYS in failed
+        why = tuple(failed[name] for name in _BEHIND_GROWTH if grows and name in failed)
+        rest = (each for name, each in failed.items() if each.reason and name not in _BEHIND_GROWTH)
+        return (*why, *(e for e in rest if not why or e.statement is not Hypothesis.DECAYS))
 
     def sentence(self) -> str:
         """Return what is promised, in sentences, and no more than that."""
         told = self._promised() if self.promised else None
         told = told or f"Nothing is promised: {'; '.join(self.reasons)}."
-        claims = self.line(CLAIMS)
+        claims = self.hypotheses[Hypothesis.CLAIMS]
         return f"{told} Note: {claims.explanation}." if claims.fails else told
 
     def _promised(self) -> str:
@@ -149,7 +160,7 @@ class Promise:
                 "kind": str(found.kind),
                 "why": found.why,
             },
-            "hypotheses": [each.as_mapping() for each in self.hypotheses],
+            "hypotheses": [each.as_mapping() for each in self.hypotheses.values()],
         }
 
 
@@ -182,11 +193,12 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
     certificate = region.certificate
     found = certified_set(parts, settings, leaders, certificate)
     lines = [*hypotheses(case), region.line, *set_lines(parts, states, certificate, found)]
+    lines.append(claims_line(parts, loop, region.relayed))
     return Promise(
         loop=loop,
         region=certificate,
         certified=found,
-        hypotheses=(*lines, claims_line(parts, loop, region.relayed)),
+        hypotheses={cast(Hypothesis, line.statement): line for line in lines},
         domain="" if certificate is None else certificate.domain.in_words(parts.model),
         condition="" if case.matched else ", once the leader's input rests at its trim",
         without=case.disturbed,

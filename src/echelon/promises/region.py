@@ -17,9 +17,9 @@ from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.promises.leaders import Leaders
-from echelon.promises.statement import Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement, verdict_of
 
-_NAME = "region of the gain"
+_NAME = Hypothesis.REGION
 
 
 class Region(NamedTuple):

@@ -2,7 +2,26 @@
 
 from typing import Any, NamedTuple
 
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind, Verdict, Word
+
+
+class Hypothesis(Word):
+    """What a promise rests on; the value is what tables call it."""
+
+    TRIM_APPLIED = "Definition 1, f(0) = 0"
+    TRIM_HELD = "trim within the limits"
+    EXACT = "Assumption 3, exact states"
+    AGREEMENT = "leaders agree"
+    SYMMETRY = "offsets are symmetries"
+    DETECTABLE = "detectability of (A, g'P)"
+    MATCHED = "leader's motion is matched"
+    COUPLED = "coupling"
+    DECAYS = "disagreement decays"
+    STEP = "step, input held"
+    REGION = "region of the gain"
+    SET = "certified set"
+    STARTS = "starts in the certified set"
+    CLAIMS = "claims of the gain"
 
 
 class Statement(NamedTuple):
@@ -19,7 +38,7 @@ class Statement(NamedTuple):
         reason: what the failure says against any promise; empty where it leaves one.
     """
 
-    statement: str
+    statement: Hypothesis | str
     verdict: Verdict
     kind: Kind
     number: float | None = None
@@ -27,6 +46,11 @@ class Statement(NamedTuple):
     text: str = ""
     remedy: str = ""
     reason: str = ""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        return self.statement.value if isinstance(self.statement, Hypothesis) else self.statement
 
     @property
     def fails(self) -> bool:
@@ -42,7 +66,7 @@ class Statement(NamedTuple):
         """Return it ready for JSON, where a number that is not finite is None."""
         finite = self.number is not None and abs(self.number) < float("inf")
         return {
-            "statement": self.statement,
+            "statement": self.name,
             "verdict": str(self.verdict),
             "kind": str(self.kind),
             "number": self.number if finite else None,

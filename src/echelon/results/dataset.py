@@ -3,12 +3,14 @@
 The dataset is one netCDF file, the summary is JSON.
 """
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from echelon.engine.result import Result
+from echelon.promises.promise import promise
 from echelon.results.lyapunov import lyapunov
 from echelon.results.metrics import Metrics, metrics
 
@@ -21,7 +23,8 @@ def dataset(result: Result) -> "xr.Dataset":
 
     Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
     `offset`, `reference`, `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`,
-    `edge_agents`, `edge_weight`.
+    `edge_agents`, `edge_weight`, and the gain's `P`, `R` and `coupling`. The attribute `promise` is
+    JSON.
     """
     import xarray as xr
 
@@ -45,6 +48,12 @@ def dataset(result: Result) -> "xr.Dataset":
     if v is not None:
         variables |= {"lyapunov": ("time", v.value), "lyapunov_rate": ("time", v.rate)}
         variables["lyapunov_drift"] = ("time", v.drift)
+    gain = result.drive.gain
+    if gain is not None:
+        # A dimension stands in a variable once, so that columns have one of their own.
+        variables["P"] = (("state", "state_column"), gain.P)
+        variables["R"] = (("input", "input_column"), gain.R)
+        variables["coupling"] = ((), gain.coupling)
     coordinates = {
         "time": ("time", result.times, {"units": "s"}),
         "agent": np.arange(result.graph.agents),
@@ -69,11 +78,11 @@ def _attributes(result: Result) -> dict[str, Any]:
         key: text for key, text in result.world.describe(result.model).items() if text is not None
     }
     told |= {"outcome": result.outcome.name.lower(), "message": result.message}
-    warnings = {"warnings": "\n".join(result.warnings)}
+    told |= {"warnings": "\n".join(result.warnings)}
+    told |= {"promise": json.dumps(promise(result.parts, result.settings).as_mapping())}
     return {
         **result.provenance,
         **told,
-        **warnings,
         **settings,
         **laws,
         "model": type(result.model).__name__,
@@ -112,6 +121,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
             "P": gain.P.tolist(),
             "R": gain.R.tolist(),
         },
+        "promise": promise(result.parts, result.settings).as_mapping(),
         "lambda_min": float(eigenvalues[0]),
         "lambda_max": float(eigenvalues[-1]),
         "minimum_distance": numbers.minimum_distance,

@@ -1,6 +1,6 @@
 """The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and why it falls or rises."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +19,8 @@ from echelon.world.disturbance import disturbed
 
 # Below this fraction of its largest value V is made of rounding and its rises mean nothing.
 _ROUNDING = 1e-20
+_ULPS = 8.0 * np.finfo(float).eps
+"""Of the largest states and offsets: what the differences between neighbours are off by."""
 
 
 class Lyapunov(NamedTuple):
@@ -26,28 +28,33 @@ class Lyapunov(NamedTuple):
 
     `rate` is exact along the closed loop at the frame, leader's motion included. `drift` is the sum
     over edges of A_ij (y_i - y_j)'P (f(x_i) - f(x_j)) about the trim: the paper's Assumption 5, as
-    met on this run, says that it is not positive.
+    met on this run, says that it is not positive. `after` and `drift_after` are V and that part one
+    step of the run later. Below `rounding` V is nothing but that.
     """
 
     value: Array
     rate: Array
     drift: Array
+    after: Array
+    drift_after: Array
+    rounding: float
 
     def rises(self) -> Array:
         """Return (T - 1,) booleans: where V rises to the next frame by more than rounding."""
-        return np.diff(self.value) > 1e-9 * self.value[:-1] + _ROUNDING * self.value.max(
-            initial=0.0
-        )
+        return np.diff(self.value) > 1e-9 * self.value[:-1] + self.rounding
 
     def forbidden(self) -> Array:
-        """Return (T - 1,) booleans: where V rises although theory says that it may not.
+        """Return (T,) booleans: where V rises over a step although theory says that it may not.
 
-        Where drift and input both push V down at two successive frames, a rise in between is the
-        work of the step, not of the law.
+        The law's own part of V' is a square with a minus. Where that and the drift's part push V
+        down as a step begins, the drift still does as it ends, and V is larger there, it is the
+        work of the held input, not of the law. Between frames that are stored less often, more may
+        happen than derivatives at both ends know.
         """
-        slack = 1e-9 * np.abs(self.rate).max(initial=0.0)
+        slack = 1e-9 * np.maximum(np.abs(self.rate), np.abs(self.drift))
         falls = (self.drift <= slack) & (self.rate - self.drift <= slack)
-        return self.rises() & falls[:-1] & falls[1:]
+        rises = self.after - self.value > 1e-9 * self.value + self.rounding
+        return falls & (self.drift_after <= slack) & rises
 
 
 def lyapunov(result: Result) -> Lyapunov | None:
@@ -55,23 +62,51 @@ def lyapunov(result: Result) -> Lyapunov | None:
 
     None where the followers' law has no P or nothing was stored.
     """
-    P = result.drive.metric(result.model)
+    P, graph, offsets = result.drive.metric(result.model), result.graph, result.formation.offsets
     if P is None or not len(result.times):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
         steps = jnp.asarray(np.rint(result.times / result.settings.dt).astype(np.int32))
         fields = _fields(result.drive, _motion(result), x, u, steps)
-        f, xdot = (np.asarray(part) for part in fields)
-        y = result.states - result.formation.offsets
-        z, zdot = (_disagreement(result.graph, part) for part in (y, xdot))
-        delta = _grounded_inverse(result.graph, z)
-        i, j = result.graph.edges.T
-        drift = np.einsum(
-            "e,tea,ab,teb->t", result.graph.weights, y[:, i] - y[:, j], P, f[:, i] - f[:, j]
+        f, xdot, following, f_after = (np.asarray(part) for part in fields)
+        y, later = result.states - offsets, following - offsets
+        z, delta = _deviations(graph, y)
+        z_later, delta_later = _deviations(graph, later)
+        value = 0.5 * _form(delta, P, z)
+        return Lyapunov(
+            value=value,
+            rate=_form(delta, P, _disagreement(graph, xdot)),
+            drift=_drift(graph, P, y, f),
+            after=0.5 * _form(delta_later, P, z_later),
+            drift_after=_drift(graph, P, later, f_after),
+            rounding=_rounding(result, P, value),
         )
-        value = 0.5 * np.einsum("tia,ab,tib->t", delta, P, z)
-        return Lyapunov(value, np.einsum("tia,ab,tib->t", delta, P, zdot), drift)
+
+
+def _form(a: Array, P: Array, b: Array) -> Array:
+    """Return sum_i a_i'P b_i for each frame, (T,), of a, b (T, N_f, n)."""
+    return np.einsum("tia,ab,tib->t", a, P, b)
+
+
+def _deviations(graph: Graph, y: Array) -> tuple[Array, Array]:
+    """Return z and delta, (T, N_f, n) each, of states less their offsets (T, N, n)."""
+    z = _disagreement(graph, y)
+    return z, _grounded_inverse(graph, z)
+
+
+def _drift(graph: Graph, P: Array, y: Array, f: Array) -> Array:
+    """Return the drift's part of V' at states less their offsets y with drifts f, (T, N, n)."""
+    i, j = graph.edges.T
+    return np.einsum("e,tea,ab,teb->t", graph.weights, y[:, i] - y[:, j], P, f[:, i] - f[:, j])
+
+
+def _rounding(result: Result, P: Array, value: Array) -> float:
+    """Return below what V is made of rounding: of its own sum, or of the states'."""
+    size = np.abs(result.states).max(axis=(0, 1)) + np.abs(result.formation.offsets).max(axis=0)
+    ulp = _ULPS * size
+    states = 0.5 * float(result.graph.weights.sum()) * float(ulp @ np.abs(P) @ ulp)
+    return max(_ROUNDING * float(value.max(initial=0.0)), states)
 
 
 def _motion(result: Result) -> Motion:
@@ -85,14 +120,19 @@ def _fields(
     x: jax.Array,
     u: jax.Array,
     steps: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the drift under the drive and xdot for x (T, N, n), u (T, N, m) at steps (T,)."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Return the drift under the drive, xdot, the states a step later, and the drift there.
 
-    def one(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> tuple[Any, Any]:
-        return drive.drift(motion.plant, x), disturbed(motion.plant, motion.wind, step, agent)(x, u)
+    Each is (T, N, n), of states x (T, N, n) under inputs u (T, N, m) at steps (T,).
+    """
 
-    over = jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
-    return over(x, u, jnp.arange(x.shape[1]), steps)
+    def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
+        return disturbed(motion.plant, motion.wind, step, agent)(x, u)
+
+    moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
+    drift = jax.vmap(jax.vmap(lambda x: drive.drift(motion.plant, x)))
+    later = jax.vmap(motion.advance)(x, u, steps)
+    return drift(x), moving(x, u, jnp.arange(x.shape[1]), steps), later, drift(later)
 
 
 def _disagreement(graph: Graph, values: Array) -> Array:

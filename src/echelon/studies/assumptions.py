@@ -13,7 +13,7 @@ from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
 from echelon.promises.hypotheses import goal_drifts
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement, verdict_of
 from echelon.studies.finite_condition import finite_condition
 
 ZERO = 1e-9
@@ -46,7 +46,7 @@ def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     yield _leader_line(promise)
     monotone = _monotone_line(parts, promise)
     yield monotone
-    both = not (promise.line("offsets are symmetries").fails or monotone.fails)
+    both = not (promise.hypotheses[Hypothesis.SYMMETRY].fails or monotone.fails)
     text = "needs Assumption 5 and symmetric offsets"
     yield Statement("Lemma 4, drift along z", verdict_of(both), Kind.LINEARIZATION, text=text)
     largest = _printed_lmi(parts, promise)

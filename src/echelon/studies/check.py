@@ -39,7 +39,7 @@ def check(parts: Parts, settings: Settings) -> Checked:
         lines = (
             *graph_lines(parts),
             *drift_lines(parts, found),
-            *found.hypotheses,
+            *found.hypotheses.values(),
             killing_line(parts, found),
             *margin_lines(parts, found),
         )

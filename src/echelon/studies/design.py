@@ -6,16 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.certificates import margins
-from echelon.certificates.certificate import Kind
 from echelon.core.errors import EchelonError
-from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
+from echelon.core.words import Theorem
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain, synthesize
 from echelon.laws.consensus import Consensus
-from echelon.promises.certified_set import CertifiedSet, certified_set
-from echelon.promises.closed_loop import CheckedLoop, checked_loop
+from echelon.promises.promise import Promise, promise
+from echelon.promises.statement import Hypothesis
 from echelon.scenario import registry
-from echelon.scenario.build import Built, resolve
+from echelon.scenario.build import Built, build, resolve
 from echelon.scenario.scenario import Scenario
 from echelon.studies.speedup import speedup
 
@@ -23,7 +24,6 @@ _NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
 _ADVISED = 100
 _RATE = 0.1
 """Rate that `contraction` is asked for where the scenario names none, 1/s."""
-_STRENGTH: dict[Kind, int] = {"proof": 3, "vertices": 2, "samples": 1, "linearization": 0}
 
 
 class Design(NamedTuple):
@@ -32,135 +32,188 @@ class Design(NamedTuple):
     Attributes:
         method: its name.
         gain: None where there is none, and then `reason` says why.
+        promise: of the scenario with that gain.
         reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest step (s) with inputs held with which every mode looked at decays.
         factors: the interval of factors on the coupling that it bears; None if unstable.
         delay: of all disagreements that it bears, s; None if unstable.
-        certified: the certified set, less the leader's excursion; None without one.
         advice: what else a user of the method should know.
         seconds: what the synthesis took.
     """
 
     method: str
     gain: Gain | None
+    promise: Promise | None = None
     reason: str = ""
     fastest: float | None = None
-    step: float | None = None
+    step: float = 0.0
     factors: margins.GainMargin | None = None
     delay: float | None = None
-    certified: CertifiedSet | None = None
     advice: str = ""
     seconds: float = 0.0
 
+    @property
+    def stable(self) -> bool:
+        """Whether every mode of the disagreement decays."""
+        found = self.promise
+        return found is not None and not found.hypotheses[Hypothesis.DECAYS].fails
 
-def designs(scenario: Scenario, built: Built, only: str | None = None) -> tuple[Design, ...]:
-    """Try the methods on a built scenario, or `only` one of them."""
-    names = [only] if only else [name for name in registry.METHODS if name != "given"]
-    return tuple(_design(name, scenario, built) for name in names)
+    def merit(self, dt: float) -> tuple[bool, int, int, float]:
+        """Return what stable designs are ranked by, the better the larger.
+
+        First that the step dt (s) is short enough, then the kind of argument, then its theorem,
+        then the rate: of the theorem, or of the slowest mode near the trim.
+        """
+        assert self.promise is not None
+        region, slowest = self.promise.region, self.promise.loop.slowest
+        if region is None:
+            return self.step > dt, 0, 0, -slowest
+        theorem = _RANK[Theorem.named(region.theorem)]
+        return self.step > dt, region.kind.strength, theorem, region.rate
+
+
+_RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
+"""Of errors of all sizes, of small ones, and of none that shrinks."""
+
+
+class Designs(NamedTuple):
+    """The methods that were tried, the one that is recommended if any, and why."""
+
+    designs: tuple[Design, ...]
+    recommended: Design | None
+    because: str
+
+
+def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
+    """Try the gain methods on a scenario, and recommend one.
+
+    Args:
+        scenario: a scenario, or its parts and settings. Of a scenario a method keeps the keys that
+            are its own, and its domain; of parts, the domain that their gain was made for.
+        method: the only one to try.
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others. A method that does not apply
+            is a design with its reason.
+    """
+    spec = scenario.follower.gain if isinstance(scenario, Scenario) else None
+    built = build(scenario) if isinstance(scenario, Scenario) else Built(*scenario)
+    names = [method] if method else [name for name in registry.METHODS if name != "given"]
+    tried = tuple(_tried(name, _options(name, spec, built.parts), built) for name in names)
+    best = recommended(tried, built.settings.dt)
+    why = "No method gives a stable loop here."
+    return Designs(tried, best, why if best is None else because(best, tried, built.settings.dt))
 
 
 def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
-    """Return the stable design with the strongest promise, the fastest decay deciding a tie.
-
-    One that needs a step speedup than `dt` comes after those that do not.
-    """
-    stable = [d for d in tried if d.gain is not None and d.gain.certificate.stable]
-    return max(stable, key=lambda d: _merit(d, dt)) if stable else None
+    """Return the best of the stable designs; None without any."""
+    return max((d for d in tried if d.stable), key=lambda d: d.merit(dt), default=None)
 
 
 def because(best: Design, tried: tuple[Design, ...], dt: float) -> str:
-    """Return why a design is recommended, in a sentence."""
-    assert best.gain is not None and best.step is not None
-    certificate, region = best.gain.certificate, best.gain.certificate.region
-    stable = sum(d.gain is not None and d.gain.certificate.stable for d in tried)
-    why = "it is the only one whose loop is stable"
-    if stable > 1 and _merit(best, dt)[1]:
-        assert region is not None
-        why = f"it promises most: {region.rate:.3g} 1/s on its domain ({region.kind}, "
-        why += f"{region.theorem})"
-    elif stable > 1:
-        why = f"of {stable} stable loops, none with more than a promise at the trim, its slowest "
-        why += f"mode is the fastest, {certificate.abscissa:.3g} 1/s"
+    """Return why a design is recommended, from the numbers by which it was chosen."""
+    assert best.promise is not None
+    others = [d for d in tried if d.stable and d is not best]
+    rivals = [d for d in others if (d.step > dt) == (best.step > dt)]
     step = f"the scenario's step of {dt:g} s is short enough for it"
     if best.step <= dt:
         step = f"it needs a step below {best.step:.3g} s, and the scenario's is {dt:g} s"
-    return f"Recommended: {best.method}, because {why}; {step}."
+    text = f"Recommended: {best.method}, because {_why(best, others, rivals, dt)}; {step}."
+    # The step has been spoken of.
+    against = [
+        each.reason
+        for each in best.promise.hypotheses.values()
+        if each.fails and each.reason and each.statement is not Hypothesis.STEP
+    ]
+    return f"{text} Nothing is promised with it: {'; '.join(against)}." if against else text
 
 
-def _merit(design: Design, dt: float) -> tuple[bool, int, float]:
-    assert design.gain is not None and design.step is not None
-    certificate = design.gain.certificate
-    region = certificate.region
-    strength = _STRENGTH[region.kind] if region is not None and region.rate > 0.0 else 0
-    return design.step > dt, strength, -certificate.abscissa
-
-
-def _design(name: str, scenario: Scenario, built: Built) -> Design:
-    """Try one method; an optional part that is missing is a reason like any other."""
-    options = _options(name, scenario)
-    if name in _NEEDS_DOMAIN and "domain" not in options:
-        return Design(name, None, "give `follower.gain.domain` to try it")
-    began = time.perf_counter()
-    try:
-        gain = synthesize(
-            built.parts.model, built.parts.graph, resolve(registry.METHODS[name])(**options)
+def _why(best: Design, others: list[Design], rivals: list[Design], dt: float) -> str:
+    """Return what sets a design apart from its rivals, those with which it shares the step."""
+    assert best.promise is not None
+    _, strength, theorem, rate = best.merit(dt)
+    if not others:
+        return "it is the only one whose loop is stable"
+    if not rivals:
+        return f"of {1 + len(others)} stable loops it alone holds the scenario's step"
+    among = f"of {1 + len(rivals)} stable loops"
+    if len(rivals) < len(others):
+        among += f" that {'hold' if best.step > dt else 'do not hold'} the scenario's step"
+    region = best.promise.region
+    if region is None:
+        return (
+            f"{among}, none with more than a promise at the trim, its slowest mode is the "
+            f"fastest, {-rate:.3g} 1/s"
         )
-    except EchelonError as error:
-        return Design(name, None, str(error), seconds=time.perf_counter() - began)
-    seconds = time.perf_counter() - began
-    with precision("float64"):
-        return _known(name, with_gain(built, gain))._replace(seconds=seconds)
-
-
-def with_gain(built: Built, gain: Gain) -> CheckedLoop:
-    """Return the closed loop of the scenario under another gain, the feed-forward kept."""
-    parts, settings = built
-    drive = parts.drive.with_follower(Consensus(gain, parts.drive.feedforward, parts.drive.trimmed))
-    with precision("float64"):
-        return checked_loop(parts.replace(drive=drive), settings)
-
-
-def _known(name: str, loop: CheckedLoop) -> Design:
-    """Return what is known of a gain."""
-    closed, (A, B) = loop.closed, loop.linear
-    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
-    found = Design(name, loop.gain, fastest=float(np.abs(poles).max()))
-    if not loop.every:
-        return found._replace(step=0.0)
-    ends = closed.strengths[[0, -1]]
-    gains = loop.inner + ends[:, None, None] * closed.K
-    return found._replace(
-        step=longest_step(A + B @ loop.inner, B, list(gains)),
-        factors=margins.gain_margin(closed),
-        delay=margins.delay_margin(closed).delay,
-        certified=certified_set(loop),
-        advice=_advice(name, loop),
+    told = f"{region.rate:.3g} 1/s on its domain ({region.kind}, {region.theorem})"
+    alike = [d for d in rivals if d.merit(dt)[1:3] == (strength, theorem)]
+    return f"{among} it promises most: {told}" + (
+        f", the fastest of {1 + len(alike)} by that argument" if alike else ""
     )
 
 
-def _advice(name: str, loop: CheckedLoop) -> str:
+def _tried(name: str, options: dict[str, Any], built: Built) -> Design:
+    """Try one method; an optional part that is missing is a reason like any other."""
+    if name in _NEEDS_DOMAIN and "domain" not in options:
+        return Design(name, None, reason="give `follower.gain.domain` to try it")
+    began, (parts, settings) = time.perf_counter(), built
+    try:
+        gain = synthesize(parts.model, parts.graph, resolve(registry.METHODS[name])(**options))
+    except EchelonError as error:
+        return Design(name, None, reason=str(error), seconds=time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    parts = with_gain(parts, gain)
+    found = promise(parts, settings)
+    with precision("float64"):
+        return _known(name, parts, settings, found)._replace(seconds=seconds)
+
+
+def with_gain(parts: Parts, gain: Gain) -> Parts:
+    """Return the parts under another gain, the feed-forward kept."""
+    law = Consensus(gain, parts.drive.feedforward, parts.drive.trimmed)
+    return parts.replace(drive=parts.drive.with_follower(law))
+
+
+def _known(name: str, parts: Parts, settings: Settings, found: Promise) -> Design:
+    """Return what is known of a gain."""
+    loop = found.loop
+    (A, B), closed = loop.linear, loop.closed
+    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
+    known = Design(name, parts.drive.gain, found, fastest=float(np.abs(poles).max()))
+    if not loop.every:
+        return known
+    return known._replace(
+        step=loop.longest_step(settings),
+        factors=margins.gain_margin(closed),
+        delay=margins.delay_margin(closed).delay,
+        advice=_advice(name, parts),
+    )
+
+
+def _advice(name: str, parts: Parts) -> str:
     """Return what else to know: for `inner-loop`, an edge or a leader that makes it faster.
 
     Any graph keeps it stable, and so the graph alone sets its rate. A swarm would take minutes.
     """
-    graph, gain = loop.parts.graph, loop.gain
+    graph, gain = parts.graph, parts.drive.gain
     followers, free = len(graph.followers), graph.agents * (graph.agents - 1) // 2
     if name != "inner-loop" or gain is None or followers > _ADVISED:
         return ""
     more = int(followers > 1), int(len(graph.edges) < free)
-    return speedup(loop.parts.model, graph, gain, *more).sentence()
+    return speedup(parts.model, graph, gain, *more).sentence()
 
 
-def _options(name: str, scenario: Scenario) -> dict[str, Any]:
+def _options(name: str, spec: Any, parts: Parts) -> dict[str, Any]:
     """Return what the scenario says of this method, and its domain for those that need one."""
-    spec = scenario.follower.gain
-    given: dict[str, Any] = {}
-    if spec.method == name and spec.file is None:
-        fields = spec.model_dump().items()
-        given = {key: value for key, value in fields if value is not None and key != "method"}
-    elif name in _NEEDS_DOMAIN and spec.domain is not None:
-        given["domain"] = spec.domain
+    gain = parts.drive.gain
+    claim = None if gain is None else gain.certificate.region
+    given = {} if spec is None else {k: v for k, v in spec.model_dump().items() if v is not None}
+    own = given.pop("method", None) == name and "file" not in given
+    domain = given.get("domain", None if claim is None else claim.domain)
+    given = given if own else {}
+    if name in _NEEDS_DOMAIN and domain is not None:
+        given["domain"] = domain
     if name == "contraction":
         given.setdefault("rate", _RATE)
     return given

@@ -15,7 +15,7 @@ from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement, verdict_of
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 
@@ -23,7 +23,7 @@ _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
-    if promise.line("disagreement decays").fails:
+    if promise.hypotheses[Hypothesis.DECAYS].fails:
         text = "there is nothing to lose"
         yield Statement("margins", Verdict.NOT_NEEDED, _KIND, text=text)
         return
