@@ -77,11 +77,12 @@ class Stepper(abc.ABC):
         """Return the moment at which the run begins."""
 
     @abc.abstractmethod
-    def advance(self, now: Moment, counts: Array) -> Chunk:
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store a frame and take counts[k] steps, for each k.
 
-        A chunk that meets a state that is not finite may end early, with that state in its last
-        frame.
+        `reference` (S, n) is what the leaders follow at this step and the next ones, which the
+        meter measures them against; None where they follow nothing. A chunk that meets a state
+        that is not finite may end early, with that state in its last frame.
         """
 
     @property

@@ -108,7 +108,7 @@ class _LawStepper(Stepper):
         """Return the moment at which the run begins."""
         return begin(self.loop, jnp.asarray(self.states))
 
-    def advance(self, now: Moment, counts: Array) -> Chunk:
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards.
 
         Raises:
@@ -116,7 +116,7 @@ class _LawStepper(Stepper):
                 precision.
         """
         try:
-            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts))
+            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
         except ValueError as error:
             if "Cannot lower jaxpr" not in str(error):
                 raise
