@@ -13,6 +13,7 @@ import sys
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -227,19 +228,34 @@ def test_every_public_name_is_there_and_listed():
 
 def test_every_dependency_is_pinned_and_no_index_is_named():
     text = (ROOT / "constraints.txt").read_text("utf-8")
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = project["optional-dependencies"].values()
-    asked = {plain(name) for name in itertools.chain(project["dependencies"], *extras)}
+    extras = project()["optional-dependencies"].values()
+    required = {plain(name) for name in itertools.chain(project()["dependencies"], *extras)}
     pinned = {plain(line) for line in text.splitlines() if "==" in line}
-    assert asked - pinned == {"echelon"}
+    assert required - pinned == {project()["name"]}
     assert "://" not in text and "\n-" not in text
 
 
+def test_every_advice_to_install_names_this_distribution():
+    """The import is `echelon`, but on the index that name is somebody else's."""
+    files = [*FILES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    advice = re.compile(r"pip install (?:-\S+ )*['\"]?([\w.-]+)(?:\[([\w,-]+)\])?")
+    named = {found for path in files for found in advice.findall(path.read_text("utf-8"))}
+    here = {(name, extra) for name, extra in named if name == "."}
+    extras = {extra for _, extra in named if extra}
+    assert {name for name, _ in named - here} == {project()["name"]}
+    assert extras and extras <= set(project()["optional-dependencies"])
+    assert f"{project()['name']}[certify,optimal,view]" in project()["optional-dependencies"]["all"]
+
+
 def test_the_version_is_the_same_wherever_it_stands():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    citation = (ROOT / "CITATION.cff").read_text("utf-8")
-    assert importlib.import_module("echelon").__version__ == project["version"]
-    assert f"\nversion: {project['version']}\n" in citation
+    version, citation = project()["version"], (ROOT / "CITATION.cff").read_text("utf-8")
+    assert importlib.import_module("echelon").__version__ == version
+    assert f"\nversion: {version}\n" in citation
+
+
+def project() -> dict[str, Any]:
+    """What pyproject.toml says of the distribution."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
 def plain(requirement: str) -> str:
