@@ -32,7 +32,7 @@ HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
   test    run the tests: pytest [ARGUMENT ...], on all cores
   lint    check style, layout and who imports whom: ruff, import-linter
   types   check types: pyright
-  docs    build the documentation into site/: mkdocs"""
+  docs    build the documentation into site/, with warnings as errors: zensical"""
 NO_PIP = (
     "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
     " 22.3 or later; install one of them (on Debian or Ubuntu: `apt install python3-venv`), or uv,"
@@ -92,7 +92,7 @@ VERBS = {
         [str(BIN / f"lint-imports{SUFFIX}")],
     ],
     "types": lambda rest: [tool("pyright", *rest)],
-    "docs": lambda rest: [tool("mkdocs", "build", "--strict", *rest)],
+    "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
 }
 
 
