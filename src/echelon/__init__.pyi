@@ -76,3 +76,5 @@ from .studies.speedup import speedup as speedup
 from .verifier.verify import verify as verify
 from .world.disturbance import Disturbance as Disturbance
 from .world.world import World as World
+
+__version__: str
