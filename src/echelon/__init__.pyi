@@ -21,6 +21,7 @@ from . import (
 from . import (
     references as references,
 )
+from .archive.run import save_run as save_run
 from .certificates.domain import Domain as Domain
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
