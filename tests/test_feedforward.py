@@ -339,7 +339,7 @@ def test_the_report_promises_the_modes_that_parents_leave():
 
 
 def test_a_scenario_may_ask_for_it_and_is_told_where_it_cannot():
-    parts = build(load_scenario("paper", ["follower.feedforward=parent"]))
+    parts, _ = build(load_scenario("paper", ["follower.feedforward=parent"]))
     assert parts.drive.follower.feedforward is Feedforward.PARENT
     asked = ["follower.feedforward=parent", "graph={name: ring, agents: 4}"]
     with pytest.raises(ScenarioError, match="follower: the graph is no tree: agent 2 has more"):

@@ -28,7 +28,7 @@ def double_integrators(leaders=(0,), **changes):
 
 def test_v_is_the_kronecker_form_of_the_paper():
     result = double_integrators()
-    P = result.follower.gain.P
+    P = result.drive.gain.P
     followers = list(result.graph.followers)
     M = result.graph.inverse_grounded()
     L = result.graph.laplacian().toarray()

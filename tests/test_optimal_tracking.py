@@ -109,7 +109,7 @@ simulation: {horizon: 1.0, dt: 0.005, store_every: 10}
     file = tmp_path / "mine.yaml"
     file.write_text(text)
     scenario = ech.load_scenario(file)
-    parts = ech.build(scenario)
+    parts, _ = ech.build(scenario)
     assert isinstance(parts.drive.leader, ech.optimal.OptimalTracking)
     assert parts.drive.leader.states == pytest.approx(LAW.states, abs=1e-5)
     result = ech.run(scenario)
@@ -126,7 +126,7 @@ def test_the_scenario_s_limits_are_those_of_the_plan(limits):
         "leader": {"law": "optimal-tracking", "start_error": {"x": -0.3}},
         "simulation": {"horizon": 0.5, "dt": 0.005, "limits": limits},
     }
-    law = ech.build(ech.scenario_from_mapping(mapping)).leader
+    law = ech.build(ech.scenario_from_mapping(mapping)).parts.drive.leader
     G, low, high = (np.array(part) for part in QUADROTOR.input_limits)
     thrusts = law.inputs @ G.T
     assert bool(((thrusts >= low - 1e-9) & (thrusts <= high + 1e-9)).all()) is limits

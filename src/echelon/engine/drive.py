@@ -5,7 +5,7 @@ another one here.
 """
 
 import abc
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -19,11 +19,13 @@ from echelon.engine.motion import Motion
 from echelon.engine.settings import Settings
 from echelon.engine.sums import Meter, Sums
 from echelon.engine.work import SolverStats
-from echelon.gains.gain import Gain
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
+
+if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+    from echelon.gains.gain import Gain
 
 Moment: TypeAlias = Any
 """All that changes during a run; each stepper has its own."""
@@ -77,11 +79,12 @@ class Stepper(abc.ABC):
         """Return the moment at which the run begins."""
 
     @abc.abstractmethod
-    def advance(self, now: Moment, counts: Array) -> Chunk:
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store a frame and take counts[k] steps, for each k.
 
-        A chunk that meets a state that is not finite may end early, with that state in its last
-        frame.
+        `reference` (S, n) is what the leaders follow at this step and the next ones, which the
+        meter measures them against; None where they follow nothing. A chunk that meets a state
+        that is not finite may end early, with that state in its last frame.
         """
 
     @property
@@ -114,7 +117,7 @@ class Drive(eqx.Module):
         """
 
     @property
-    def gain(self) -> Gain | None:
+    def gain(self) -> "Gain | None":
         """The gain that the followers run with; None where they have none."""
         return None
 

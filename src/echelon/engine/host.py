@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array, Inputs, States
-from echelon.engine.drive import Chunk, Drive, Problem, Stepper
+from echelon.engine.drive import Chunk, Problem, Stepper
 from echelon.engine.motion import Motion
-from echelon.engine.sums import Meter, Sums
+from echelon.engine.sums import Meter, Sums, follow
 from echelon.engine.work import SolverStats
 
 Pilot: TypeAlias = Callable[[int, Array], Array]
@@ -28,7 +28,6 @@ class HostStepper(Stepper):
 
     Args:
         problem: the agents and how they move.
-        drive: whose reference the leaders are measured against.
         pilot: gives the inputs.
         hold: steps for which they are held.
         work: tells what solving took so far.
@@ -37,14 +36,12 @@ class HostStepper(Stepper):
     def __init__(
         self,
         problem: Problem,
-        drive: Drive,
         pilot: Pilot,
         hold: int,
         work: Callable[[], SolverStats],
     ) -> None:
         """Keep what never changes."""
         self.problem, self.pilot, self.hold, self._work = problem, pilot, hold, work
-        self.flown = _Flown(problem.motion, problem.meter, drive)
 
     @property
     def work(self) -> SolverStats:
@@ -57,35 +54,44 @@ class HostStepper(Stepper):
         still = jnp.zeros((len(x), len(self.problem.model.input_names)), x.dtype)
         return _Held(0, x, still, jnp.zeros(len(x), bool))
 
-    def advance(self, now: "_Held", counts: Array) -> Chunk:
+    def advance(self, now: "_Held", counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps, until a pilot stops or a state is not finite."""
-        made = _Made(self.problem.meter.nothing())
+        made = _Made(self.problem.meter.nothing(), now.step, reference)
         try:
             for count in counts:
                 now = self._frame(now, int(count), made)
                 if not np.isfinite(made.states[-1]).all():
                     break
         except Stopped as reason:
-            return made.chunk(now, f"The run was stopped, since {reason}")
+            made.stopped = f"The run was stopped, since {reason}"
         except KeyboardInterrupt:
-            return made.chunk(now, "The run was interrupted")
+            made.stopped = "The run was interrupted"
         return made.chunk(now)
 
     def _frame(self, now: "_Held", count: int, made: "_Made") -> "_Held":
         """Store a frame and take `count` steps; ask the pilot wherever a hold begins."""
         end = now.step + count
-        now = self._asked(now) if count else now
-        made.states.append(np.asarray(now.states, np.float64))
-        made.inputs.append(np.asarray(now.inputs, np.float64))
+        try:
+            now = self._asked(now) if count else now
+        finally:
+            # Where the pilot stops right here, the frame is kept with the inputs that led to it.
+            if now.step or now.fresh:
+                made.store(now)
         while now.step < end:
             now = self._asked(now)
             steps = min(end, (now.step // self.hold + 1) * self.hold) - now.step
-            states, sums = _hold(self.flown, now, steps)
+            states, sums = self._hold(now, steps, made)
             made.sums = made.sums.plus(sums)
             now = now._replace(step=now.step + steps, states=states, fresh=False)
             if not np.isfinite(np.asarray(states)).all():
                 return now
         return now
+
+    def _hold(self, now: "_Held", steps: int, made: "_Made") -> tuple[States, Sums]:
+        """Return the states after `steps` steps under held inputs, and the sums over them."""
+        span = np.array([now.step, made.first, steps], np.int32)
+        problem, reference = self.problem, made.reference
+        return _held(problem.motion, problem.meter, now[1:4], jnp.asarray(span), reference)
 
     def _asked(self, now: "_Held") -> "_Held":
         """Return the moment with the pilot's inputs, where a hold begins and it was not asked."""
@@ -114,12 +120,18 @@ class _Held(NamedTuple):
 class _Made:
     """The frames and sums of a chunk while it is flown."""
 
-    def __init__(self, sums: Sums) -> None:
+    def __init__(self, sums: Sums, first: int, reference: Array | None) -> None:
         self.states: list[Array] = []
         self.inputs: list[Array] = []
-        self.sums = sums
+        self.sums, self.first, self.reference = sums, first, reference
+        self.stopped: str | None = None
 
-    def chunk(self, now: _Held, stopped: str | None = None) -> Chunk:
+    def store(self, now: _Held) -> None:
+        """Store a frame."""
+        self.states.append(np.asarray(now.states, np.float64))
+        self.inputs.append(np.asarray(now.inputs, np.float64))
+
+    def chunk(self, now: _Held) -> Chunk:
         """Return what was made."""
         shape = np.shape(now.states), np.shape(now.inputs)
         states, inputs = (
@@ -127,40 +139,27 @@ class _Made:
             for rows, each in zip((self.states, self.inputs), shape, strict=True)
         )
         sums = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), self.sums)
-        return Chunk(now, states, inputs, sums, stopped)
-
-
-@final
-class _Flown(eqx.Module):
-    """What a held step needs."""
-
-    motion: Motion
-    meter: Meter
-    drive: Drive
-
-
-def _hold(flown: _Flown, now: _Held, steps: int) -> tuple[States, Sums]:
-    """Return the states after `steps` steps under held inputs, and the sums over them."""
-    first = jnp.asarray(now.step, jnp.int32)
-    return _held(flown, now.states, now.inputs, now.limited, first, jnp.asarray(steps, jnp.int32))
+        return Chunk(now, states, inputs, sums, self.stopped)
 
 
 @eqx.filter_jit
 def _held(
-    flown: _Flown,
-    states: States,
-    inputs: Inputs,
-    limited: jax.Array,
-    first: jax.Array,
-    steps: jax.Array,
+    motion: Motion,
+    meter: Meter,
+    held: tuple[States, Inputs, jax.Array],
+    span: jax.Array,
+    reference: Array | None,
 ) -> tuple[States, Sums]:
-    def one(k: jax.Array, done: tuple[States, Sums]) -> tuple[States, Sums]:
-        x, sums = done
-        step = first + k
-        t = step.astype(x.dtype) * flown.motion.dt
-        reference = flown.drive.reference_states(flown.meter.model, t[None])
-        followed = None if reference is None else reference[0]
-        read = flown.meter.read(step, x, inputs, limited, followed)
-        return flown.motion.advance(x, inputs, step), sums.plus(read)
+    """Return the states after some steps under held inputs, and the sums over them.
 
-    return jax.lax.fori_loop(0, steps, one, (states, flown.meter.nothing()))
+    `held` are states, inputs and who is limited; `span` (3,) is the step, the first step that the
+    reference speaks of, and the number of steps.
+    """
+    states, inputs, limited = held
+
+    def one(step: jax.Array, done: tuple[States, Sums]) -> tuple[States, Sums]:
+        x, sums = done
+        read = meter.read(step, x, inputs, limited, follow(reference, step - span[1], x))
+        return motion.advance(x, inputs, step), sums.plus(read)
+
+    return jax.lax.fori_loop(span[0], span[0] + span[2], one, (states, meter.nothing()))

@@ -1,6 +1,6 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,12 @@ from echelon.core.words import Feedforward
 from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
 from echelon.engine.loop import Loop, Moment, advance, assemble, begin
 from echelon.engine.settings import Settings
-from echelon.gains.gain import Gain
 from echelon.laws.law import Law, gain_of
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+
+if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+    from echelon.gains.gain import Gain
 
 
 @final
@@ -41,7 +43,7 @@ class Laws(Drive):
         return Information(self.leader.information, self.follower.information)
 
     @property
-    def gain(self) -> Gain | None:
+    def gain(self) -> "Gain | None":
         """The gain of the followers' law, where it has one."""
         return gain_of(self.follower)
 
@@ -110,7 +112,7 @@ class _LawStepper(Stepper):
         """Return the moment at which the run begins."""
         return begin(self.loop, jnp.asarray(self.states))
 
-    def advance(self, now: Moment, counts: Array) -> Chunk:
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards.
 
         Raises:
@@ -118,7 +120,7 @@ class _LawStepper(Stepper):
                 precision.
         """
         try:
-            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts))
+            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
         except ValueError as error:
             if "Cannot lower jaxpr" not in str(error):
                 raise

@@ -15,7 +15,7 @@ from echelon.core.types import Array, Inputs, States
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Problem
 from echelon.engine.motion import Motion
-from echelon.engine.sums import Meter, Sums
+from echelon.engine.sums import Meter, Sums, follow
 from echelon.laws.law import Law, LocalView, Memory, without_certificates
 from echelon.models.model import ControlAffine
 from echelon.network.exchange import Exchange
@@ -188,28 +188,26 @@ def step(loop: Loop, now: Moment, acted: Control) -> Moment:
     return Moment(now.step + 1, states, acted.leader_memory, acted.follower_memory)
 
 
-def measure(loop: Loop, now: Moment, acted: Control) -> Sums:
-    """Return what is measured at the beginning of a step."""
-    t = now.step.astype(now.states.dtype) * loop.motion.dt
-    reference = loop.leader.reference_states(loop.model, t[None])
-    followed = None if reference is None else reference[0]
-    return loop.meter.read(now.step, now.states, acted.inputs, acted.limited, followed)
-
-
 # ---- many steps ----------------------------------------------------------------------------------
 
 
 @eqx.filter_jit
-def advance(loop: Loop, now: Moment, counts: jax.Array) -> tuple[Moment, tuple[Any, Any], Sums]:
+def advance(
+    loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
+) -> tuple[Moment, tuple[Any, Any], Sums]:
     """Store a frame and take counts[k] steps, for each k.
 
-    Return the last moment, the stored states and inputs, and the sums over the steps.
+    Return the last moment, the stored states and inputs, and the sums over the steps. `reference`
+    (S, n) is what the leaders follow from this step on.
     """
+    first = now.step
 
     def one(_: jax.Array, done: tuple[Moment, Sums]) -> tuple[Moment, Sums]:
         now, sums = done
         acted = control(loop, now)
-        return step(loop, now, acted), sums.plus(measure(loop, now, acted))
+        followed = follow(reference, now.step - first, now.states)
+        read = loop.meter.read(now.step, now.states, acted.inputs, acted.limited, followed)
+        return step(loop, now, acted), sums.plus(read)
 
     def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:
         stored = (done[0].states, control(loop, done[0]).inputs)

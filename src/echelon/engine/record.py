@@ -26,6 +26,7 @@ class Record(NamedTuple):
         times: (T,) s.
         states: (T, N, n).
         inputs: (T, N, m).
+        reference: (T, n) what the leaders follow; None where they follow nothing.
         sums: over all steps.
         outcome: how it ended.
         message: the same with time and agent.
@@ -34,6 +35,7 @@ class Record(NamedTuple):
     times: Array
     states: Array
     inputs: Array
+    reference: Array | None
     sums: Sums
     outcome: Outcome
     message: str
@@ -47,10 +49,16 @@ class Recorder:
         """Begin with nothing."""
         self.problem = problem
         self.chunks: list[Chunk] = []
+        self.followed: list[Array] = []
 
-    def keep(self, chunk: Chunk) -> bool:
-        """Keep a chunk, and tell whether the run can go on."""
+    def keep(self, chunk: Chunk, counts: Array, reference: Array | None) -> bool:
+        """Keep a chunk and what was followed at its frames; tell whether the run can go on.
+
+        `counts` are the steps after each of its frames, `reference` (S, n) is for each step.
+        """
         self.chunks.append(chunk)
+        if reference is not None:
+            self.followed.append(reference[np.cumsum(counts) - counts][: len(chunk.states)])
         finite = np.isfinite(chunk.states).all() and np.isfinite(chunk.inputs).all()
         return chunk.stopped is None and bool(finite)
 
@@ -70,10 +78,17 @@ class Recorder:
             sums = sums.plus(chunk.sums)
         lost = np.argwhere(~(np.isfinite(states).all(axis=2) & np.isfinite(inputs).all(axis=2)))
         cut = int(lost[0, 0]) if len(lost) else len(times)
-        outcome, message = self._verdict(times, lost, len(states) == len(counts))
-        return Record(times[:cut], states[:cut], inputs[:cut], sums, outcome, message)
+        reached = float(times[-1]) if len(times) else 0.0
+        if self.chunks and self.chunks[-1].stopped:
+            reached = float(sums.steps[0]) * settings.dt
+        complete = len(states) == len(counts)
+        outcome, message = self._verdict(times, lost, complete, reached)
+        followed = np.concatenate(self.followed)[:cut] if self.followed else None
+        return Record(times[:cut], states[:cut], inputs[:cut], followed, sums, outcome, message)
 
-    def _verdict(self, times: Array, lost: Array, complete: bool) -> tuple[Outcome, str]:
+    def _verdict(
+        self, times: Array, lost: Array, complete: bool, reached: float
+    ) -> tuple[Outcome, str]:
         """Return how the run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
@@ -85,7 +100,6 @@ class Recorder:
         stopped = self.chunks[-1].stopped if self.chunks else None
         if complete and stopped is None:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
-        reached = times[-1] if len(times) else 0.0
         return (
             Outcome.INTERRUPTED,
             f"{stopped or _INTERRUPTED} at t = {reached:.6g} s; what was computed is kept.",

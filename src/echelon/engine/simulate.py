@@ -10,14 +10,13 @@ import numpy as np
 
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.engine.drive import Drive, Stepper
+from echelon.engine.drive import Stepper
 from echelon.engine.laws import on_host
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.record import Recorder, frame_counts
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
-from echelon.models.model import ControlAffine
 
 Progress: TypeAlias = Callable[[int, int], None]
 """Called now and then with the steps done and the steps in all."""
@@ -49,7 +48,7 @@ def simulate(parts: Parts, settings: Settings, progress: Progress | None = None)
         times=record.times,
         states=record.states,
         inputs=record.inputs,
-        reference=_reference(prepared.parts.drive, parts.model, record.times),
+        reference=record.reference,
         sums=record.sums,
         outcome=record.outcome,
         message=record.message,
@@ -68,14 +67,16 @@ def _run(stepper: Stepper, prepared: Prepared, progress: Progress | None) -> Rec
     size = math.ceil(len(counts) / _CHUNKS)
     # Chunks of one length compile once; the padding stores the last frame again, and is cut off.
     padded = np.concatenate([counts, np.zeros(-len(counts) % size, np.int32)])
-    recorder = Recorder(problem)
-    done = 0
+    chunks = padded.reshape(-1, size)
+    longest = int(chunks.sum(axis=1).max())
+    recorder, done = Recorder(problem), 0
     try:
         now = stepper.start()
-        for chunk in padded.reshape(-1, size):
-            made = stepper.advance(now, chunk)
+        for chunk in chunks:
+            reference = _followed(prepared, done, longest + 1)
+            made = stepper.advance(now, chunk, reference)
             now, done = made.now, done + int(chunk.sum())
-            if not recorder.keep(made):
+            if not recorder.keep(made, chunk, reference):
                 break
             if progress is not None:
                 progress(done, int(counts.sum()))
@@ -84,10 +85,9 @@ def _run(stepper: Stepper, prepared: Prepared, progress: Progress | None) -> Rec
     return recorder
 
 
-def _reference(drive: Drive, model: ControlAffine, times: Array) -> Array | None:
-    """Return what the leaders follow at the stored times, (T, n)."""
-    if not len(times):
-        return None
+def _followed(prepared: Prepared, first: int, steps: int) -> Array | None:
+    """Return what the leaders follow from a step on, (steps, n) in float64."""
     with precision("float64"):
-        reference = drive.reference_states(model, jnp.asarray(times))
+        times = prepared.problem.settings.dt * jnp.arange(first, first + steps)
+        reference = prepared.parts.drive.reference_states(prepared.parts.model, times)
         return None if reference is None else np.asarray(reference, np.float64)

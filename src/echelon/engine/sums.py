@@ -173,6 +173,11 @@ class Meter(eqx.Module):
         return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
 
 
+def follow(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
+    """Return row k of a reference (S, n) in the precision of the states; None without one."""
+    return None if reference is None else jnp.asarray(reference, states.dtype)[k]
+
+
 def measured_states(model: ControlAffine) -> tuple[int, ...]:
     """Return the indices of the states that errors are measured on: the position, else all."""
     return model.position_indices() or tuple(range(len(model.state_names)))

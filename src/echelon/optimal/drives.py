@@ -107,7 +107,7 @@ class Plans(_Optimized):
         work = made.seconds, made.iterations, made.failures, made.setup_seconds
         stats = solver_stats("optimization", self.options.solver, *work)
         return HostStepper(
-            problem, self, lambda step, _: inputs[step // times.hold], times.hold, lambda: stats
+            problem, lambda step, _: inputs[step // times.hold], times.hold, lambda: stats
         )
 
 
@@ -140,7 +140,7 @@ class RecedingHorizon(_Optimized):
         """
         hold = max(1, round(self.mpc.period / problem.settings.dt))
         pilots = _Pilots(problem, self.reference, self.mpc, hold)
-        return HostStepper(problem, self, pilots, hold, pilots.work)
+        return HostStepper(problem, pilots, hold, pilots.work)
 
 
 @final
