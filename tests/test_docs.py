@@ -13,7 +13,7 @@ import matplotlib
 import pytest
 
 import echelon as ech
-from echelon import cli
+from echelon.cli.app import main
 from echelon.reports.printed import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -126,7 +126,7 @@ class Reader:
         out = io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
             with pytest.raises(SystemExit) as left:
-                cli.main()
+                main()
         self.code = left.value.code or 0
         return out.getvalue()
 
