@@ -13,6 +13,7 @@ from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError, OutputError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike
+from echelon.core.words import Kind, Theorem
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
@@ -46,7 +47,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
             "agents": graph.agents,
             "leaders": list(graph.leaders),
             "edges": _edges(graph),
-            "spectrum": graph.grounded_spectrum().tolist(),
+            "spectrum": graph.spectrum().eigenvalues.tolist(),
         },
         "certificate": _certificate_as_mapping(gain.certificate),
     }
@@ -88,7 +89,7 @@ def _edges(graph: Graph) -> list[list[float]] | None:
 def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
     region = certificate.region
     return {
-        "kind": certificate.kind,
+        "kind": str(certificate.kind),
         "lambda_min": certificate.lambda_min,
         "lambda_max": certificate.lambda_max,
         "abscissa": certificate.abscissa,
@@ -102,8 +103,8 @@ def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
 def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
     domain = region.domain
     return {
-        "kind": region.kind,
-        "theorem": region.theorem,
+        "kind": str(region.kind),
+        "theorem": str(region.theorem),
         "rate": region.rate,
         "radius": region.radius,
         "strength": region.strength,
@@ -180,8 +181,9 @@ def _read(path: PathLike) -> Mapping[str, Any]:
 
 
 def _gain(told: Mapping[str, Any]) -> Gain:
-    inner, region = told["inner"], told["certificate"]["region"]
-    parts = {**told["certificate"], "region": None if region is None else _region(region)}
+    inner, certificate = told["inner"], told["certificate"]
+    region = None if certificate["region"] is None else _region(certificate["region"])
+    parts = {**certificate, "kind": Kind.named(certificate["kind"]), "region": region}
     return Gain(
         np.array(told["P"], float),
         np.array(told["R"], float),
@@ -197,9 +199,9 @@ def _region(told: Mapping[str, Any]) -> RegionCertificate:
         [end if x is None else x for x in told["domain"][name]] for name, end in _ENDS.items()
     ]
     return RegionCertificate(
-        kind=told["kind"],
+        kind=Kind.named(told["kind"]),
         rate=told["rate"],
-        theorem=told["theorem"],
+        theorem=Theorem.named(told["theorem"]),
         domain=Domain(*(np.array(some, float) for some in bounds)),
         radius=told["radius"],
         strength=told["strength"],
@@ -237,9 +239,9 @@ def _check_model(path: PathLike, told: Mapping[str, Any], model: ControlAffine) 
 
 def _check_graph(path: PathLike, told: Mapping[str, Any], graph: Graph) -> None:
     """Check that the spectrum is the one that the coupling was chosen for."""
-    eigenvalues = graph.grounded_spectrum()
-    for what, end in (("lambda_min", 0), ("lambda_max", -1)):
-        theirs, ours = told["spectrum"][end], eigenvalues[end]
+    stored, spectrum = told["spectrum"], graph.spectrum()
+    ends = {"lambda_min": (stored[0], spectrum.low), "lambda_max": (stored[-1], spectrum.high)}
+    for what, (theirs, ours) in ends.items():
         if not abs(theirs - ours) <= _SAME * ours:
             raise GainError(
                 f"the gain in `{path}` was made for a graph of {told['agents']} agents with "

@@ -4,15 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echelon.certificates.certificate import Certificate, certify, parent_modes
+from echelon.certificates.certificate import Certificate, certify
 from echelon.core.errors import Outcome
 from echelon.core.linear import held_radius
 from echelon.core.numerics import precision
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, Theorem
 from echelon.engine.result import Result, imperfections
 from echelon.gains.gain import Gain
 from echelon.laws.law import gain_of
-from echelon.models.linearization import Linearization, linearize
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.results.lyapunov import Lyapunov, lyapunov
 from echelon.results.metrics import Metrics, formation_errors
@@ -158,12 +158,11 @@ def _with_parents(result: Result, gain: Gain) -> tuple[float, float | None]:
     The modes are then those of the edges' weights (theory page, T4).
     """
     with precision("float64"):
-        A, B = linearize(result.model)
-    A = A if gain.inner is None else A - B @ gain.inner
-    edge, weights = gain.certificate.edge, parent_modes(result.graph)
-    linear, given = Linearization(A, B), (gain.P, gain.R, gain.coupling)
-    found = certify(linear, result.graph, *given, edge, modes=weights)
-    return found.abscissa, None if edge is None else edge * found.lambda_min / weights[0]
+        closed = linearize(result.model).closed(gain.inner)
+    low, weights = result.graph.spectrum().low, result.graph.parent_spectrum()
+    edge = gain.certificate.edge
+    edge = None if edge is None else edge * low / weights.low
+    return certify(closed, weights, gain.P, gain.R, gain.coupling, edge).abscissa, edge
 
 
 def _region(certificate: Certificate, model: ControlAffine) -> str:
@@ -172,9 +171,9 @@ def _region(certificate: Certificate, model: ControlAffine) -> str:
     if region is None:
         return "no region is proved"
     where = region.domain.in_words(model)
-    if region.theorem == "A5":
+    if region.theorem is Theorem.A5:
         return f"the drift does not expand P for {where} ({region.kind})"
-    scope = "everywhere there" if region.theorem == "T1" else "near the leader's path there"
+    scope = "everywhere there" if region.theorem is Theorem.T1 else "near the leader's path there"
     return (
         f"for {where} it contracts at {region.rate:.3g} 1/s {scope} "
         f"({region.kind}, {region.theorem})"

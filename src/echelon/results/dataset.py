@@ -88,7 +88,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
     """Return the run's summary, ready for JSON; what does not exist is None."""
     numbers = metrics(result) if numbers is None else numbers
     gain = gain_of(result.follower)
-    eigenvalues = result.graph.grounded_spectrum()
+    spectrum = result.graph.spectrum()
     return {
         "scenario": result.provenance.get("scenario", ""),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
@@ -111,8 +111,8 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
             "P": gain.P.tolist(),
             "R": gain.R.tolist(),
         },
-        "lambda_min": float(eigenvalues[0]),
-        "lambda_max": float(eigenvalues[-1]),
+        "lambda_min": spectrum.low,
+        "lambda_max": spectrum.high,
         "minimum_distance": numbers.minimum_distance,
         "saturation_fraction": numbers.saturation_fraction,
         "steady_window_s": numbers.steady_window,
