@@ -67,7 +67,7 @@ def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians
     try:
         hull = jacobian_hull(function, *_boxes(model, domain), names)
     except GainError:
-        samples = _sampled(function, model, domain)
+        samples = _sample(function, model, domain)
         return Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES)
     _check_bounded(model, domain, hull)
     return Jacobians(hull.vertices, hull.error, Kind.VERTICES)
@@ -110,7 +110,7 @@ def _unbounded(model: ControlAffine, name: str) -> GainError:
     )
 
 
-def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
+def _sample(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
     """Return the matrices inside the domain and at its corners, all of them where they are few.
 
     Raises:

@@ -105,7 +105,7 @@ class Method(eqx.Module):
     """What scenarios, tables and files call it; every method must say it."""
 
     needs: ClassVar[tuple[str, ...]] = ()
-    """Arguments that a scenario must give, since what stands for them in Python is no choice."""
+    """Arguments that a scenario must give, though Python may have a default for them."""
 
     usual: ClassVar[Mapping[str, Any]] = {}
     """What `design` gives of these where the scenario does not."""
