@@ -3,6 +3,7 @@
 import networkx as nx
 import numpy as np
 import pytest
+from runs import simulate
 
 from echelon.core.errors import (
     EchelonError,
@@ -14,7 +15,6 @@ from echelon.core.errors import (
     ReferenceError,
     SimulationError,
 )
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput
@@ -447,7 +447,7 @@ SIMULATIONS = {
     ),
     "unknown precision": (
         lambda: run(precision="float16"),
-        "`precision` is `float16`, allowed are `float64` and `float32`.",
+        "`precision` is `float16`, allowed are `float64`, `float32`.",
     ),
     "a formation of others": (
         lambda: run(formation=Formation(np.zeros((3, 1)))),

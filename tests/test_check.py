@@ -77,11 +77,11 @@ def lines_of(parts):
 
 def with_region(parts, **changes):
     """Parts whose gain carries another region."""
-    gain = parts.follower.gain
+    gain = parts.drive.follower.gain
     region = dataclasses.replace(gain.certificate.region, **changes)
     certificate = dataclasses.replace(gain.certificate, region=region)
     other = ech.Gain(gain.P, gain.R, gain.coupling, gain.method, certificate)
-    return parts._replace(follower=dataclasses.replace(parts.follower, gain=other))
+    return parts._replace(follower=dataclasses.replace(parts.drive.follower, gain=other))
 
 
 def number(line):

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
+from runs import simulate
 
 import echelon as ech
 
@@ -108,7 +109,7 @@ def test_a_users_own_agent_runs_as_from_python(here, echelon):
     assert told["minimum_distance"] is None
     agent = ech.models.Pendulum(damping=0.5)
     graph = ech.Graph.path(4)
-    result = ech.simulate(
+    result = simulate(
         agent,
         graph,
         ech.Formation.from_offsets(agent, graph, {}),

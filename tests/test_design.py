@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from runs import simulate
 
 import echelon as ech
 from echelon.plots.design import save_design_figures
@@ -163,14 +164,14 @@ def test_a_slice_stays_inside_the_chart():
 
 def test_a_slice_runs_the_loop_that_simulate_runs():
     parts = parts_of("planar-quadrotor")
-    gain, model = parts.follower.gain, parts.model
+    gain, model = parts.drive.follower.gain, parts.model
     run = trial(model, parts.graph, gain, 0.005, True)
     pair = chosen_slice(model, gain, "y,roll")
     for start in ([0.5, 0.2], [25.0, 1.0]):
         states = np.zeros((parts.graph.agents, len(model.state_names))) + np.array(model.trim[0])
         for follower in parts.graph.followers:
             states[follower, pair] += start
-        result = ech.simulate(
+        result = simulate(
             model,
             parts.graph,
             ech.Formation.from_offsets(model, parts.graph, {}),
@@ -261,5 +262,5 @@ def test_one_state_has_modes_and_no_slice(tmp_path):
         }
     )
     parts = ech.build(scenario)
-    paths, radii = save_design_figures(with_gain(parts, parts.follower.gain), tmp_path)
+    paths, radii = save_design_figures(with_gain(parts, parts.drive.follower.gain), tmp_path)
     assert [path.name for path in paths] == ["modes.png", "modes.pdf"] and radii is None

@@ -8,9 +8,9 @@ import pytest
 import scipy.linalg
 import scipy.stats
 from oracles import laplacian
+from runs import simulate
 
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Consensus, Tracking, TrimInput
@@ -255,7 +255,7 @@ def test_a_plant_like_the_model_changes_no_bit(model):
         )
 
     plain, same = fly(), fly(plant=varied(model, {}, {}))
-    assert plain.plant is None and same.plant is not model
+    assert plain.world.plant is None and same.world.plant is not model
     assert np.array_equal(plain.states, same.states)
     assert np.array_equal(plain.inputs, same.inputs)
 
@@ -371,7 +371,8 @@ def test_the_rate_of_v_is_its_derivative_in_wind_and_with_another_plant():
     # Inputs are held, so V is smooth within a step and its difference is the rate half a step on.
     ahead = np.diff(v.value) / 0.0005
     assert ahead == pytest.approx(v.rate[:-1], abs=2e-2 * np.abs(v.rate).max())
-    calm = lyapunov(dataclasses.replace(run, disturbance=None))
+    still = run.parts.replace(world=dataclasses.replace(run.world, disturbance=None))
+    calm = lyapunov(dataclasses.replace(run, parts=still))
     assert np.abs(calm.rate - v.rate).max() > 0.1 * np.abs(v.rate).max()
 
 
@@ -396,8 +397,8 @@ def test_a_scenario_says_plant_and_disturbance_and_every_report_repeats_them():
 
     result = run(imperfect())
     assert result.outcome is Outcome.COMPLETED
-    assert result.plant.mass == pytest.approx(0.0294) and result.model.mass == 0.028
-    assert result.disturbance == Disturbance({"vy": 0.5}, {"velocity": 1.0}, hold=0.2)
+    assert result.world.plant.mass == pytest.approx(0.0294) and result.model.mass == 0.028
+    assert result.world.disturbance == Disturbance({"vy": 0.5}, {"velocity": 1.0}, hold=0.2)
     plant = "`mass` 0.0294 for 0.028"
     wind = "constant `vy` 0.5; rms `velocity` 1; drawn every 0.2 s"
     text = " ".join(report(result).split())
@@ -414,10 +415,10 @@ def test_a_scenario_says_plant_and_disturbance_and_every_report_repeats_them():
 
 def test_a_plant_s_parameter_may_be_given_or_scaled():
     given = build(imperfect(plant={"parameters": {"mass": 0.03}, "scale": {"inertia": 2}}))
-    plant = given.settings["plant"]
+    plant = given.parts.world.plant
     assert (plant.mass, plant.inertia) == (0.03, pytest.approx(2 * 16.571710e-6))
     named = load_scenario("paper", ["plant={scale: {inertia: 2.0}}"])
-    doubled = build(named).settings["plant"]
+    doubled = build(named).parts.world.plant
     assert np.asarray(doubled.inertia) == pytest.approx(2.0 * np.asarray(Quadrotor().inertia))
 
 

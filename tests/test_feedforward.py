@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 from oracles import laplacian
+from runs import simulate
 
 from echelon.core.errors import EchelonError, ScenarioError
 from echelon.core.words import Feedforward
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Consensus, Law, Tracking, TrimInput
@@ -339,13 +339,13 @@ def test_the_report_promises_the_modes_that_parents_leave():
 
 
 def test_a_scenario_may_ask_for_it_and_is_told_where_it_cannot():
-    parts = build(load_scenario("paper", ["follower.feedforward=parent"]))
-    assert parts.follower.feedforward is Feedforward.PARENT
+    parts, _ = build(load_scenario("paper", ["follower.feedforward=parent"]))
+    assert parts.drive.follower.feedforward is Feedforward.PARENT
     asked = ["follower.feedforward=parent", "graph={name: ring, agents: 4}"]
     with pytest.raises(ScenarioError, match="follower: the graph is no tree: agent 2 has more"):
         build(load_scenario("paper", asked))
     with pytest.raises(EchelonError) as caught:
-        Consensus(parts.follower.gain, feedforward="parents")
+        Consensus(parts.drive.follower.gain, feedforward="parents")
     assert str(caught.value) == (
         "`feedforward` is `parents`, allowed are `none`, `relay`, `relay-velocity`, `parent` "
         "(did you mean `parent`?)."

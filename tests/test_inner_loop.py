@@ -5,6 +5,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
+from runs import simulate
 
 import echelon as ech
 from echelon.core.numerics import precision
@@ -62,7 +63,7 @@ def test_every_coupling_and_every_connected_graph_is_stable(gains, name, edges, 
 
 def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
     model, graph = AGENTS["quadrotor"], ech.Graph.path(4)
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         ech.Formation.line(model, graph, 0.5),
@@ -75,7 +76,7 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
     )
     errors = formation_errors(result)
     assert errors[-1].max() < 1e-9 and errors[0].max() > 0.5
-    started = ech.simulate(
+    started = simulate(
         model,
         graph,
         ech.Formation.line(model, graph, 0.5),
@@ -90,7 +91,7 @@ def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
 
 def test_v_never_rises_where_the_drift_is_linear():
     model, graph = ech.models.DoubleIntegrator(2), ech.Graph.ring(5)
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         ech.Formation.circle(model, graph),

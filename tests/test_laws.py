@@ -7,9 +7,9 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map
+from runs import simulate
 
 from echelon.core import numerics
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, LocalView, Tracking, TrimInput

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from runs import simulate
 
 import echelon as ech
 from echelon.results.lyapunov import lyapunov
@@ -13,7 +14,7 @@ def double_integrators(leaders=(0,), **changes):
     model, graph = ech.models.DoubleIntegrator(2, drag=DRAG), ech.Graph.ring(5, leaders=leaders)
     formation = ech.Formation.circle(model, graph)
     settings = dict(initial={"position": 1.0, "velocity": 1.0}, horizon=4.0, dt=0.005, seed=3)
-    return ech.simulate(
+    return simulate(
         model,
         graph,
         formation,
@@ -27,7 +28,7 @@ def double_integrators(leaders=(0,), **changes):
 
 def test_v_is_the_kronecker_form_of_the_paper():
     result = double_integrators()
-    P = result.follower.gain.P
+    P = result.drive.gain.P
     followers = list(result.graph.followers)
     M = result.graph.inverse_grounded()
     L = result.graph.laplacian().toarray()
@@ -63,7 +64,7 @@ def monotone(**changes):
     model, graph = ech.models.Linear([[-1.0]], [[1.0]]), ech.Graph.path(4)
     gain = ech.synthesize(model, graph, ech.gains.FixedGain("identity"))
     settings = dict(initial={"x1": 1.0}, horizon=10.0, dt=0.01)
-    return ech.simulate(
+    return simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {}),
@@ -88,7 +89,7 @@ def test_the_printed_algorithm_is_caught_where_v_rises_against_theory():
 
 def test_laws_without_a_metric_have_no_v():
     model, graph = ech.models.VanDerPol(), ech.Graph.path(3)
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {}),

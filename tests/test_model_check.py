@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from runs import simulate
 from test_models import FAMILY
 
 from echelon.core import numerics
 from echelon.core.errors import EchelonError, ModelError
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain
 from echelon.gains.gain import synthesize
 from echelon.laws import TrimInput

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import scipy.linalg
+from runs import simulate, simulate_mpc, simulate_plans
 
 import echelon as ech
 from echelon.core.errors import MissingExtraError, PlanError
@@ -22,13 +23,13 @@ BRIEF = {"horizon": 0.2, "dt": 0.01, "reference": LOOP, "initial": {"position": 
 
 
 def cart_run(mpc, states, horizon=2.0, **more):
-    return ech.optimal.simulate_mpc(
+    return simulate_mpc(
         CART, PAIR, APART, mpc=mpc, initial=np.array(states), horizon=horizon, dt=0.05, **more
     )
 
 
 def swarm(**more):
-    return ech.optimal.simulate_mpc(QUADROTOR, TREE, DRAWN, **{**BRIEF, **more})
+    return simulate_mpc(QUADROTOR, TREE, DRAWN, **{**BRIEF, **more})
 
 
 def regulator(Q, R, dt):
@@ -92,7 +93,7 @@ def test_quadrotors_close_up_within_their_motors_limits():
     G, low, high = (np.array(part) for part in QUADROTOR.input_limits)
     thrusts = result.inputs @ G.T
     assert (thrusts >= low - 1e-7).all() and (thrusts <= high + 1e-7).all()
-    figures = ech.optimal.solver_stats(result)
+    figures = result.work
     assert figures.failures == 0 and figures.solves == 4 * 80
 
 
@@ -100,7 +101,7 @@ def test_wind_does_not_add_up_as_it_does_open_loop():
     wind = ech.Disturbance(constant={"vx": 1.0})
     given = {"horizon": 0.6, "initial": None, "disturbance": wind, "store_every": 10}
     closed = swarm(**given)
-    replayed = ech.optimal.simulate_plans(QUADROTOR, TREE, DRAWN, **{**BRIEF, **given})
+    replayed = simulate_plans(QUADROTOR, TREE, DRAWN, **{**BRIEF, **given})
     off, lost = (np.abs(r.states[-1, 0, 0] - r.reference[-1, 0]) for r in (closed, replayed))
     # 1 m/s^2 over 0.6 s is 0.18 m.
     assert lost == pytest.approx(0.18, abs=0.01) and off < 0.1
@@ -116,9 +117,7 @@ def test_agents_renamed_fly_the_same():
     again = np.zeros_like(states)
     again[order] = states
     one = swarm(initial=states)
-    other = ech.optimal.simulate_mpc(
-        QUADROTOR, renamed, ech.Formation(rows), **{**BRIEF, "initial": again}
-    )
+    other = simulate_mpc(QUADROTOR, renamed, ech.Formation(rows), **{**BRIEF, "initial": again})
     assert other.states[:, order] == pytest.approx(one.states, abs=1e-9)
 
 
@@ -171,7 +170,7 @@ def test_after_a_failure_the_last_plan_goes_on_shifted(monkeypatch):
     calls = failing(monkeypatch, lambda number: number in (10, 12))
     mpc = ech.optimal.MPC(period=0.1, horizon=1.0)
     result = cart_run(mpc, [[0.0, 0.0], [0.5, -0.3]], store_every=2)
-    figures = ech.optimal.solver_stats(result)
+    figures = result.work
     assert figures.failures == 2 and result.outcome is ech.Outcome.COMPLETED
     assert figures.solves == 2 * 20 and len(calls) == 2 * 20 + 1
     plan = calls[8].course.inputs
@@ -194,7 +193,7 @@ def test_a_failure_can_end_the_run_and_keeps_what_was_flown(monkeypatch):
 
 def test_a_real_failure_is_counted_and_survived():
     result = swarm(mpc=ech.optimal.MPC(options={"piqp": {"max_iter": 1}}), horizon=0.1)
-    figures = ech.optimal.solver_stats(result)
+    figures = result.work
     assert figures.failures == figures.solves == 20
     assert result.outcome is ech.Outcome.COMPLETED
 
@@ -211,11 +210,11 @@ def test_a_run_that_diverges_says_so():
 
 def test_the_figures_are_kept_with_the_result():
     result = swarm(horizon=0.1)
-    figures = ech.optimal.solver_stats(result)
+    figures = result.work
     assert json.loads(result.provenance["solver"]) == figures._asdict()
     assert figures.method == "mpc" and figures.solver == "piqp" and figures.solves == 4 * 5
     assert 0.0 < figures.median_ms <= figures.p99_ms <= figures.worst_ms
-    law = ech.simulate(
+    law = simulate(
         CART,
         PAIR,
         APART,
@@ -224,14 +223,14 @@ def test_the_figures_are_kept_with_the_result():
         horizon=0.1,
         dt=0.05,
     )
-    assert ech.optimal.solver_stats(law) is None
+    assert law.work is None
 
 
 def test_a_result_s_law_cannot_be_run_by_itself():
     result = swarm(horizon=0.1)
     assert result.leader.information == ("the reference",)
     with pytest.raises(ech.EchelonError, match="use `simulate_plans` or `simulate_mpc`"):
-        ech.simulate(
+        simulate(
             QUADROTOR, TREE, DRAWN, leader=result.leader, follower=result.follower,
             horizon=0.1, dt=0.01,
         )  # fmt: skip
@@ -278,7 +277,7 @@ def test_what_does_not_fit_the_model_is_refused(how, sentence):
 def test_a_state_that_nothing_brings_back_is_told():
     still = ech.models.Linear([[0.0]], [[0.0]])
     with pytest.raises(PlanError, match="the cost from the horizon's end on does not exist"):
-        ech.optimal.simulate_mpc(
+        simulate_mpc(
             still, PAIR, ech.Formation([[0.0], [1.0]]), horizon=1.0, dt=0.1,
         )  # fmt: skip
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from runs import simulate
 from scipy.integrate import solve_bvp
 
 import echelon as ech
@@ -129,7 +130,7 @@ def test_a_plan_is_flown_by_the_simulation_as_planned():
     )
     found = ech.optimal.solve(problem, start)
     assert found.solved
-    flown = ech.simulate(
+    flown = simulate(
         model,
         ech.Graph.path(2),
         ech.Formation(np.zeros((2, 12))),

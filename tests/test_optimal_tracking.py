@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from runs import simulate
 
 import echelon as ech
 from echelon.core.errors import LawError, PlanError
@@ -21,7 +22,7 @@ def led(leader, **more):
     given = {"horizon": 1.0, "dt": 0.005, "start_error": ERROR, "store_every": 10, **more}
     formation = given.pop("formation", DRAWN)
     follower = ech.laws.Consensus(GAIN, feedforward="relay")
-    return ech.simulate(QUADROTOR, TREE, formation, leader=leader, follower=follower, **given)
+    return simulate(QUADROTOR, TREE, formation, leader=leader, follower=follower, **given)
 
 
 def prepared(**how):
@@ -108,9 +109,9 @@ simulation: {horizon: 1.0, dt: 0.005, store_every: 10}
     file = tmp_path / "mine.yaml"
     file.write_text(text)
     scenario = ech.load_scenario(file)
-    parts = ech.build(scenario)
-    assert isinstance(parts.leader, ech.optimal.OptimalTracking)
-    assert parts.leader.states == pytest.approx(LAW.states, abs=1e-5)
+    parts, _ = ech.build(scenario)
+    assert isinstance(parts.drive.leader, ech.optimal.OptimalTracking)
+    assert parts.drive.leader.states == pytest.approx(LAW.states, abs=1e-5)
     result = ech.run(scenario)
     assert rmse(result) == pytest.approx(rmse(led(LAW)), abs=1e-6)
 
@@ -125,7 +126,7 @@ def test_the_scenario_s_limits_are_those_of_the_plan(limits):
         "leader": {"law": "optimal-tracking", "start_error": {"x": -0.3}},
         "simulation": {"horizon": 0.5, "dt": 0.005, "limits": limits},
     }
-    law = ech.build(ech.scenario_from_mapping(mapping)).leader
+    law = ech.build(ech.scenario_from_mapping(mapping)).parts.drive.leader
     G, low, high = (np.array(part) for part in QUADROTOR.input_limits)
     thrusts = law.inputs @ G.T
     assert bool(((thrusts >= low - 1e-9) & (thrusts <= high + 1e-9)).all()) is limits

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import laplacian, skew
+from runs import simulate
 
 from echelon.core import numerics
 from echelon.core.errors import ModelError, Outcome
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import GRAVITY
+from runs import simulate_plans
 
 import echelon as ech
 from echelon.core.errors import MissingExtraError, PlanError
@@ -230,7 +231,7 @@ def test_followers_arrive_at_their_offsets_or_at_their_distances():
 def test_the_replay_of_plans_is_the_plans():
     states = starts(a1=(-0.193, 0, 0))
     made = planned(states, limits=False)
-    result = ech.optimal.simulate_plans(
+    result = simulate_plans(
         QUADROTOR,
         TREE,
         DRAWN,
@@ -250,17 +251,17 @@ def test_the_replay_of_plans_is_the_plans():
 def test_a_replay_is_a_result_like_any_other(tmp_path):
     states = starts(a1=(-0.193, 0, 0))
     fast = ech.references.FigureEight(amplitude=(1.0, 0.5), rate=6.0)
-    result = ech.optimal.simulate_plans(
+    result = simulate_plans(
         QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, store_every=10, **SHORT
     )
     assert result.outcome is ech.Outcome.COMPLETED and len(result.times) == 11
     assert ech.metrics(result).leader.rmse < 0.36
     assert "Each follower is told" in ech.report(result)
     ech.save_dataset(result, tmp_path / "run.nc")
-    figures = ech.optimal.solver_stats(result)
+    figures = result.work
     assert figures.method == "optimization" and figures.solves == 4 and figures.failures == 0
     assert figures.seconds > 0.0 and figures.worst_ms >= figures.median_ms > 0.0
-    warned = ech.optimal.simulate_plans(
+    warned = simulate_plans(
         QUADROTOR, TREE, DRAWN, reference=fast, horizon=0.2, dt=0.01, start_error={}
     )
     assert [w for w in warned.warnings if "times what the actuators leave" in w]
@@ -269,9 +270,7 @@ def test_a_replay_is_a_result_like_any_other(tmp_path):
 def test_open_loop_a_wrong_mass_and_wind_add_up():
     states = starts()
     still, heavy, windy = (
-        ech.optimal.simulate_plans(
-            QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, **SHORT, **more
-        )
+        simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, initial=states, **SHORT, **more)
         for more in (
             {},
             {"plant": dataclasses.replace(QUADROTOR, mass=0.0294)},
@@ -335,7 +334,7 @@ class Corridor(ech.ControlAffine):
 def test_a_problem_without_a_solution_says_which_constraint_and_by_how_much():
     # From 0.5 at a speed of 2 the brakes stop it at 2.5, and the plan's corridor ends at 0.9.
     with pytest.raises(PlanError, match=r"^there is no plan for agent 1: .*`[\w ]+` by [\d.]+ at"):
-        ech.optimal.simulate_plans(
+        simulate_plans(
             Corridor(),
             ech.Graph.path(2),
             ech.Formation(np.zeros((2, 2))),
@@ -348,20 +347,20 @@ def test_a_problem_without_a_solution_says_which_constraint_and_by_how_much():
 def test_a_model_without_a_flatness_map_is_led_along_no_reference():
     graph, model = ech.Graph.path(2), ech.models.VanDerPol()
     with pytest.raises(PlanError, match="`VanDerPol` cannot be led along a reference"):
-        ech.optimal.simulate_plans(
+        simulate_plans(
             model, graph, ech.Formation(np.zeros((2, 2))), reference=LOOP, horizon=1.0, dt=0.1
         )
 
 
 def test_what_is_no_reference_is_refused():
     with pytest.raises(ech.EchelonError, match="`reference` is a `float`, and must be"):
-        ech.optimal.simulate_plans(QUADROTOR, TREE, DRAWN, reference=1.0, **SHORT)
+        simulate_plans(QUADROTOR, TREE, DRAWN, reference=1.0, **SHORT)
 
 
 def test_a_distance_needs_a_position():
     graph, model = ech.Graph.path(2), ech.models.VanDerPol()
     with pytest.raises(PlanError, match="`VanDerPol` has no position"):
-        ech.optimal.simulate_plans(
+        simulate_plans(
             model,
             graph,
             ech.Formation(np.zeros((2, 2))),
@@ -374,4 +373,4 @@ def test_a_distance_needs_a_position():
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'echelon\[optimal\]'"):
-        ech.optimal.simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, **SHORT)
+        simulate_plans(QUADROTOR, TREE, DRAWN, reference=LOOP, **SHORT)

@@ -9,9 +9,9 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from runs import simulate
 
 from echelon.core.errors import Outcome
-from echelon.engine.simulate import simulate
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Consensus, Tracking, TrimInput
@@ -392,7 +392,7 @@ assert "matplotlib" not in sys.modules
 model, graph = ech.models.SingleIntegrator(dimension=3), ech.Graph.path(3)
 parts = model, graph, ech.Formation.line(model, graph)
 law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
-result = ech.simulate(*parts, leader=ech.laws.TrimInput(), follower=law, horizon=0.1, dt=0.05)
+result = simulate(*parts, leader=ech.laws.TrimInput(), follower=law, horizon=0.1, dt=0.05)
 assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 6
 assert "matplotlib.pyplot" not in sys.modules
 """

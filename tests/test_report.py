@@ -1,6 +1,7 @@
 """The report: its table, and the sentences that say what happened and why."""
 
 import pytest
+from runs import simulate
 
 import echelon as ech
 
@@ -43,7 +44,7 @@ def test_the_lag_without_feed_forward_is_told():
 
 def test_a_broken_symmetry_warns_and_names_the_agent():
     model, graph = ech.models.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
@@ -61,7 +62,7 @@ def test_a_broken_symmetry_warns_and_names_the_agent():
 
 def test_coincident_goals_warn():
     model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         ech.Formation.from_offsets(model, graph, {1: (1.0, 0.0), 2: (1.0, 0.0)}),
@@ -84,7 +85,7 @@ def test_a_weak_coupling_is_named_as_the_cause_of_growth():
 
 def test_a_swarm_shows_best_median_and_worst():
     model, graph = ech.models.SingleIntegrator(2), ech.Graph.star(30)
-    result = ech.simulate(
+    result = simulate(
         model,
         graph,
         ech.Formation.grid(model, graph),

@@ -17,11 +17,12 @@ from oracles import (
     newton_euler,
     quadrotor_input_map,
 )
+from runs import simulate
 from scipy.integrate import solve_ivp
 
 from echelon.core.errors import EchelonError, Outcome
-from echelon.engine import simulate as _simulate
-from echelon.engine.simulate import simulate
+from echelon.engine import laws as engine_laws
+from echelon.engine.settings import Settings
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput
@@ -399,7 +400,7 @@ def test_the_last_state_is_stored_whatever_divides(horizon, dt, every, frames, l
 
 def test_a_run_says_what_ran_and_holds_float64():
     run = carts(horizon=0.1, seed=3)
-    assert run.settings == (0.1, 0.01, "rk4", True, 1, "float64", 3)
+    assert run.settings == Settings(0.1, 0.01, seed=3)
     assert run.graph is TREE and run.wall_time > 0.0 and run.warnings == ()
     assert run.message == "The run reached its horizon."
     arrays = [run.times, run.states, run.inputs, run.reference, run.saturated, run.errors]
@@ -545,10 +546,7 @@ FRESH = """
 import json, sys
 import jax
 import numpy as np
-from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.engine.simulate import simulate
-from echelon.gains.synthesize import synthesize
+from echelon import Formation, Graph, Laws, Parts, Settings, simulate, synthesize
 from echelon.gains import Riccati
 from echelon.laws import Consensus, Tracking
 from echelon.models import DoubleIntegrator
@@ -558,10 +556,9 @@ before = jax.config.jax_enable_x64
 model, graph = DoubleIntegrator(2, drag=0.2), Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 gain = synthesize(model, graph, Riccati())
 formation = Formation.from_offsets(model, graph, {1: (1, 0), 2: (1, 0.8), 3: (1, -0.8)})
-run = simulate(
-    model, graph, formation, leader=Tracking(Circle((0, 0, 0), 2.0, 0.4)),
-    follower=Consensus(gain, feedforward="relay"), initial={"position": 1.0}, horizon=3.0, dt=0.01,
-)
+drive = Laws(Tracking(Circle((0, 0, 0), 2.0, 0.4)), Consensus(gain, feedforward="relay"))
+parts = Parts(model, graph, formation, drive, initial={"position": 1.0})
+run = simulate(parts, Settings(horizon=3.0, dt=0.01))
 after = jax.config.jax_enable_x64
 print(json.dumps({
     "flags": [bool(before), bool(after)],
@@ -596,7 +593,7 @@ def test_everything_is_float64_whatever_the_flags_of_the_process():
     for other in told:
         assert np.abs(np.array(other["states"]) - here.states).max() <= 1e-13
         assert np.abs(np.array(other["inputs"]) - here.inputs).max() <= 1e-13
-        assert np.array(other["P"]) == pytest.approx(here.follower.gain.P, abs=1e-13)
+        assert np.array(other["P"]) == pytest.approx(here.drive.gain.P, abs=1e-13)
     assert unset["states"] == wide["states"]
 
 
@@ -637,7 +634,7 @@ def test_an_interrupt_before_the_first_frame_leaves_an_empty_run(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_simulate, "advance", stop)
+    monkeypatch.setattr(engine_laws, "advance", stop)
     run = carts()
     assert run.outcome is Outcome.INTERRUPTED
     assert run.states.shape == (0, 4, 4) == run.errors.shape and run.inputs.shape == (0, 4, 2)

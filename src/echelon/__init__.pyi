@@ -25,7 +25,10 @@ from .certificates.domain import Domain as Domain
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome
+from .engine.laws import Laws as Laws
+from .engine.parts import Parts as Parts
 from .engine.result import Result as Result
+from .engine.settings import Settings as Settings
 from .engine.simulate import simulate as simulate
 from .gains.file import load_gain as load_gain
 from .gains.file import save_gain as save_gain
@@ -72,3 +75,4 @@ from .studies.finite_condition import finite_condition as finite_condition
 from .studies.speedup import speedup as speedup
 from .verifier.verify import verify as verify
 from .world.disturbance import Disturbance as Disturbance
+from .world.world import World as World

@@ -24,7 +24,7 @@ def check(
     from echelon.scenario.build import build
     from echelon.studies.check import check as examine
 
-    found = examine(build(checked))
+    found = examine(*build(checked))
     if as_json:
         lines = [dict(zip(line._fields, map(str, line), strict=True)) for line in found.lines]
         print(

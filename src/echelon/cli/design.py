@@ -10,8 +10,8 @@ from echelon.cli import tables
 from echelon.cli.console import JsonOption, ScenarioArgument
 
 if TYPE_CHECKING:
-    from echelon.engine.parts import Parts
     from echelon.gains.gain import Gain
+    from echelon.scenario.build import Built
 
 
 def design(
@@ -39,9 +39,10 @@ def design(
     from echelon.studies.design import because, designs, recommended
 
     _known_method(method)
-    parts = build(checked)
+    built = build(checked)
+    parts = built.parts
     dt = checked.simulation.dt
-    tried = designs(checked, parts, method)
+    tried = designs(checked, built, method)
     best = recommended(tried, dt)
     sentence = "No method gives a stable loop here."
     told: dict[str, Any] = {"recommended": None}
@@ -51,7 +52,7 @@ def design(
         if out is not None:
             save_gain(best.gain, parts.model, parts.graph, out)
         if figures is not None:
-            radii = _design_figures(parts, best.gain, figures, slice_)
+            radii = _design_figures(built, best.gain, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             told["radii"] = radii
     told["methods"] = [tables.design_row(each) for each in tried]
@@ -62,14 +63,14 @@ def design(
     raise typer.Exit(0 if best is not None else 1)
 
 
-def _design_figures(parts: "Parts", gain: "Gain", folder: Path, asked: str | None) -> str | None:
+def _design_figures(built: "Built", gain: "Gain", folder: Path, asked: str | None) -> str | None:
     """Draw a design's figures, and return a sentence on its radii if it has any."""
     from echelon.core.errors import OutputError
     from echelon.plots.design import save_design_figures
     from echelon.studies.design import with_gain
 
     try:
-        _, radii = save_design_figures(with_gain(parts, gain), folder, asked)
+        _, radii = save_design_figures(with_gain(built, gain), folder, asked)
     except OSError as error:
         raise OutputError(f"`{folder}` cannot be written: {error.strerror or error}.") from error
     return None if radii is None else radii.sentence()

@@ -35,14 +35,14 @@ def run(
     from echelon.scenario import build
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
-    parts = build.build(checked)
+    built = build.build(checked)
     folder = files.claim_folder(checked.name, out, force)
     console = tables.console()
     with show_progress(quiet=as_json) as progress:
-        result = build.run(checked, progress, parts)
+        result = build.run(checked, progress, built)
     files.write_data(result, folder)
-    numbers = metrics(result, checked.report.steady_window)
-    text = report(result, checked.report.steady_window)
+    numbers = metrics(result)
+    text = report(result)
     told = files.write_run(result, numbers, text, folder, figures)
     if as_json:
         print(json.dumps(told, indent=2))

@@ -90,3 +90,15 @@ def did_you_mean(got: object, allowed: Iterable[str]) -> str:
 def listing(names: Iterable[str]) -> str:
     """Return names in back-ticks, separated by commas, for use inside a message."""
     return ", ".join(f"`{name}`" for name in names)
+
+
+def check_kind(place: str, part: object, kind: type) -> None:
+    """Check that a part is an instance of a class.
+
+    Raises:
+        SimulationError: it is not.
+    """
+    if isinstance(part, kind):
+        return
+    got = f"the class `{part.__name__}`" if isinstance(part, type) else f"a `{type(part).__name__}`"
+    raise SimulationError(f"`{place}` is {got}, and must be a `{kind.__name__}`.")

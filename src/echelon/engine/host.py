@@ -1,224 +1,156 @@
-"""Runs whose inputs come from the host: the plant of `simulate`, period by period."""
+"""Agents whose inputs come from the host: a pilot is asked every few steps, the plant moves on."""
 
-import time
-from collections.abc import Callable, Mapping
-from typing import NamedTuple, TypeAlias, cast
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import Outcome, SimulationError
-from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array, Inputs, States
-from echelon.engine.initial import Initial, initial_states
-from echelon.engine.loop import Loop, advance_plant, assemble, delivered
-from echelon.engine.prepare import check_parts, check_settings, formation_warnings
-from echelon.engine.result import Result, Settings
-from echelon.laws.trim_input import TrimInput
-from echelon.models.check import check_model
-from echelon.models.model import ControlAffine
-from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.optimal.optimized import Optimized
-from echelon.references.flatness import reference_warnings
-from echelon.references.reference import Reference
-from echelon.world.disturbance import Disturbance
-from echelon.world.plant import check_plant
+from echelon.engine.drive import Chunk, Problem, Stepper
+from echelon.engine.motion import Motion
+from echelon.engine.sums import Meter, Sums, follow
+from echelon.engine.work import SolverStats
 
-Progress: TypeAlias = Callable[[int, int], None]
+Pilot: TypeAlias = Callable[[int, Array], Array]
+"""(step, states (N, n)) -> wanted physical inputs (N, m) from that step on."""
 
 
 class Stopped(Exception):
     """Raised by a pilot that gives no further inputs, with the reason in words."""
 
 
-class Flight(NamedTuple):
-    """The parts of a run on the host, checked and ready."""
+@final
+class HostStepper(Stepper):
+    """The plant under the inputs of a pilot, which is asked every `hold` steps.
 
-    model: ControlAffine
-    graph: Graph
-    formation: Formation
-    reference: Reference | None
-    plant: ControlAffine | None
-    disturbance: Disturbance | None
-    settings: Settings
-    loop: Loop
-    states: Array
-    warnings: tuple[str, ...]
-    began: float
+    Args:
+        problem: the agents and how they move.
+        pilot: gives the inputs.
+        hold: steps for which they are held.
+        work: tells what solving took so far.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        pilot: Pilot,
+        hold: int,
+        work: Callable[[], SolverStats],
+    ) -> None:
+        """Keep what never changes."""
+        self.problem, self.pilot, self.hold, self._work = problem, pilot, hold, work
 
     @property
-    def steps(self) -> int:
-        """Steps of the simulation."""
-        return max(1, round(self.settings.horizon / self.settings.dt))
+    def work(self) -> SolverStats:
+        """What solving took so far."""
+        return self._work()
+
+    def start(self) -> "_Held":
+        """Return the moment at which the run begins, before the pilot is asked."""
+        x = jnp.asarray(self.problem.states)
+        still = jnp.zeros((len(x), len(self.problem.model.input_names)), x.dtype)
+        return _Held(0, x, still, jnp.zeros(len(x), bool))
+
+    def advance(self, now: "_Held", counts: Array, reference: Array | None) -> Chunk:
+        """Store frames and take steps, until a pilot stops or a state is not finite."""
+        made = _Made(self.problem.meter.nothing(), now.step, reference)
+        try:
+            for count in counts:
+                now = self._frame(now, int(count), made)
+                if not np.isfinite(made.states[-1]).all():
+                    break
+        except Stopped as reason:
+            return made.chunk(now, f"The run was stopped, since {reason}")
+        except KeyboardInterrupt:
+            return made.chunk(now, "The run was interrupted")
+        return made.chunk(now)
+
+    def _frame(self, now: "_Held", count: int, made: "_Made") -> "_Held":
+        """Store a frame and take `count` steps; ask the pilot wherever a hold begins."""
+        end = now.step + count
+        now = self._asked(now) if count else now
+        made.states.append(np.asarray(now.states, np.float64))
+        made.inputs.append(np.asarray(now.inputs, np.float64))
+        while now.step < end:
+            now = self._asked(now)
+            steps = min(end, (now.step // self.hold + 1) * self.hold) - now.step
+            states, sums = self._hold(now, steps, made)
+            made.sums = made.sums.plus(sums)
+            now = now._replace(step=now.step + steps, states=states, fresh=False)
+            if not np.isfinite(np.asarray(states)).all():
+                return now
+        return now
+
+    def _hold(self, now: "_Held", steps: int, made: "_Made") -> tuple[States, Sums]:
+        """Return the states after `steps` steps under held inputs, and the sums over them."""
+        span = np.array([now.step, made.first, steps], np.int32)
+        problem, reference = self.problem, made.reference
+        return _held(problem.motion, problem.meter, now[1:4], jnp.asarray(span), reference)
+
+    def _asked(self, now: "_Held") -> "_Held":
+        """Return the moment with the pilot's inputs, where a hold begins and it was not asked."""
+        if now.fresh or now.step % self.hold:
+            return now
+        wanted = jnp.asarray(self.pilot(now.step, np.asarray(now.states, np.float64)))
+        inputs = self.problem.motion.deliver(wanted.astype(now.states.dtype))
+        limited = jnp.any(inputs != wanted, axis=1)
+        return now._replace(inputs=inputs, limited=limited, fresh=True)
 
 
-Pilot: TypeAlias = Callable[[int, Array], Array]
-"""(step, states (N, n)) -> wanted physical inputs (N, m) from that step on."""
+class _Held(NamedTuple):
+    """A moment: the step, the states (N, n), the inputs (N, m) that are held and who is limited.
 
-
-def take_off(
-    model: ControlAffine,
-    graph: Graph,
-    formation: Formation,
-    *,
-    reference: Reference | None,
-    initial: Initial,
-    start_error: Mapping[str, float] | None,
-    plant: ControlAffine | None,
-    disturbance: Disturbance | None,
-    settings: Settings,
-) -> Flight:
-    """Check the parts as `simulate` does, and return them with the starts.
-
-    Raises:
-        EchelonError: a part is malformed or does not fit the others.
+    `fresh` tells that the pilot has been asked at this very step.
     """
-    began = time.perf_counter()
-    check_settings(settings)
-    if reference is not None and not isinstance(reference, Reference):
-        raise SimulationError(
-            f"`reference` is a `{type(reference).__name__}`, and must be a `Reference`."
+
+    step: int
+    states: States
+    inputs: Inputs
+    limited: jax.Array
+    fresh: bool = False
+
+
+@final
+class _Made:
+    """The frames and sums of a chunk while it is flown."""
+
+    def __init__(self, sums: Sums, first: int, reference: Array | None) -> None:
+        self.states: list[Array] = []
+        self.inputs: list[Array] = []
+        self.sums, self.first, self.reference = sums, first, reference
+
+    def chunk(self, now: _Held, stopped: str | None = None) -> Chunk:
+        """Return what was made."""
+        shape = np.shape(now.states), np.shape(now.inputs)
+        states, inputs = (
+            np.array(rows).reshape(len(rows), *each)
+            for rows, each in zip((self.states, self.inputs), shape, strict=True)
         )
-    marker = Optimized((), reference)
-    check_parts(graph, formation, marker, marker, disturbance)
-    with precision("float64"):
-        warnings = check_model(model)
-        if plant is not None:
-            warnings = tuple(dict.fromkeys((*warnings, *check_model(plant))))
-            check_plant(model, plant)
-        idle = TrimInput()
-        loop = assemble(model, graph, formation, idle, idle, settings, plant, disturbance)
-        states = initial_states(
-            model, graph, formation, marker, initial, start_error or {}, settings.seed
-        )
-    warnings += formation_warnings(model, formation)
-    if reference is not None and settings.limits:
-        warnings += reference_warnings(model, reference, settings.horizon)
-    parts = (model, graph, formation, reference, plant, disturbance, settings)
-    return Flight(*parts, loop, states, warnings, began)
-
-
-class _Track(NamedTuple):
-    """States (T + 1, N, n), delivered inputs (T, N, m), saturated steps (N,), and why it ended."""
-
-    states: Array
-    inputs: Array
-    saturated: Array
-    stopped: str | None
-
-
-def fly(
-    flight: Flight,
-    pilot: Pilot,
-    hold: int,
-    *,
-    told: tuple[str, ...],
-    progress: Progress | None,
-) -> Result:
-    """Run a flight whose pilot is asked every `hold` steps.
-
-    `told` is what the followers know of others, in words.
-    """
-    with precision(cast(Precision, flight.settings.precision)):
-        track = _fly(flight, pilot, hold, progress)
-    return _result(flight, track, told)
-
-
-def _fly(flight: Flight, pilot: Pilot, hold: int, progress: Progress | None) -> _Track:
-    total, states = flight.steps, jnp.asarray(flight.states)
-    passed, inputs, stopped = [], [], None
-    saturated = np.zeros(len(states))
-    try:
-        for first in range(0, total, hold):
-            count = min(hold, total - first)
-            wanted = jnp.asarray(pilot(first, np.asarray(states, np.float64)))
-            states, each, u = _held(
-                flight.loop, states, wanted, jnp.asarray(first, jnp.int32), count
-            )
-            passed.append(np.asarray(each, np.float64))
-            inputs += [np.asarray(u, np.float64)[None]] * count
-            saturated += count * np.asarray(u != wanted).any(axis=1)
-            if progress is not None:
-                progress(first + count, total)
-            if not np.isfinite(passed[-1]).all() or not np.isfinite(inputs[-1]).all():
-                break
-    except KeyboardInterrupt:
-        stopped = "The run was interrupted"
-    except Stopped as reason:
-        stopped = f"The run was stopped, since {reason}"
-    every = np.concatenate(
-        [np.zeros((0, *states.shape)), *passed, np.asarray(states, np.float64)[None]]
-    )
-    none = np.zeros((0, len(states), len(flight.model.input_names)))
-    return _Track(every, np.concatenate([none, *inputs]), saturated, stopped)
+        sums = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), self.sums)
+        return Chunk(now, states, inputs, sums, stopped)
 
 
 @eqx.filter_jit
 def _held(
-    loop: Loop, states: States, wanted: Inputs, first: jax.Array, count: int
-) -> tuple[States, jax.Array, Inputs]:
-    """Return the states after `count` steps, those before each step, and the delivered inputs."""
-    u = delivered(loop, wanted)
+    motion: Motion,
+    meter: Meter,
+    held: tuple[States, Inputs, jax.Array],
+    span: jax.Array,
+    reference: Array | None,
+) -> tuple[States, Sums]:
+    """Return the states after some steps under held inputs, and the sums over them.
 
-    def one(x: States, step: jax.Array) -> tuple[States, States]:
-        return advance_plant(loop, x, u, step), x
+    `held` are states, inputs and who is limited; `span` (3,) is the step, the first step that the
+    reference speaks of, and the number of steps.
+    """
+    states, inputs, limited = held
 
-    last, passed = jax.lax.scan(one, states, first + jnp.arange(count, dtype=jnp.int32))
-    return last, passed, u
+    def one(step: jax.Array, done: tuple[States, Sums]) -> tuple[States, Sums]:
+        x, sums = done
+        read = meter.read(step, x, inputs, limited, follow(reference, step - span[1], x))
+        return motion.advance(x, inputs, step), sums.plus(read)
 
-
-def _result(flight: Flight, track: _Track, told: tuple[str, ...]) -> Result:
-    settings, total = flight.settings, flight.steps
-    flown = len(track.inputs)
-    lost = np.array(~np.isfinite(track.states).all(axis=2))
-    cut = int(np.argwhere(lost)[0, 0]) if lost.any() else flown + 1
-    outcome, message = _verdict(flight, track, cut, lost)
-    kept = np.arange(0, min(cut, flown + 1), settings.store_every)
-    if outcome is Outcome.COMPLETED and kept[-1] != total:
-        kept = np.append(kept, total)
-    # The last frame has no input of its own, since nothing is asked after the end.
-    inputs = track.inputs[np.minimum(kept, flown - 1)] if flown else track.inputs
-    kept = kept[: len(inputs)]
-    times = settings.dt * kept
-    leader = Optimized(("the reference",) if flight.reference is not None else (), flight.reference)
-    with precision("float64"):
-        followed = leader.reference_states(flight.model, jnp.asarray(times)) if len(kept) else None
-    return Result(
-        times=times,
-        states=track.states[kept],
-        inputs=inputs,
-        reference=None if followed is None else np.asarray(followed, np.float64),
-        saturated=track.saturated / max(1, flown),
-        outcome=outcome,
-        message=message,
-        warnings=flight.warnings,
-        model=flight.model,
-        graph=flight.graph,
-        formation=flight.formation,
-        leader=leader,
-        follower=Optimized(told),
-        settings=settings,
-        plant=flight.plant,
-        disturbance=flight.disturbance,
-        wall_time=time.perf_counter() - flight.began,
-    )
-
-
-def _verdict(flight: Flight, track: _Track, cut: int, lost: Array) -> tuple[Outcome, str]:
-    dt = flight.settings.dt
-    if lost.any():
-        agent = int(np.argwhere(lost)[0, 1])
-        role = "leader" if agent in flight.graph.leaders else "follower"
-        return (
-            Outcome.DIVERGED,
-            f"The state of {role} {agent} stopped being finite by t = {cut * dt:.6g} s.",
-        )
-    if track.stopped is None:
-        return Outcome.COMPLETED, Outcome.COMPLETED.value
-    return (
-        Outcome.INTERRUPTED,
-        f"{track.stopped} at t = {len(track.inputs) * dt:.6g} s; what was computed is kept.",
-    )
+    return jax.lax.fori_loop(span[0], span[0] + span[2], one, (states, meter.nothing()))

@@ -1,41 +1,30 @@
 """Where the agents start: leaders on their reference, followers about their goals."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from echelon.core.errors import SimulationError
-from echelon.laws.law import Law
+from echelon.engine.parts import Parts
 from echelon.models.model import ControlAffine
-from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 
-Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
-"""Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
 
-
-def initial_states(
-    model: ControlAffine,
-    graph: Graph,
-    formation: Formation,
-    leader: Law,
-    initial: Initial,
-    start_error: Mapping[str, float],
-    seed: int,
-) -> np.ndarray:
+def initial_states(parts: Parts, seed: int) -> np.ndarray:
     """Return the states (N, n) at time zero.
 
-    A leader starts where its law says, or in its given state, plus its offset and `start_error`. A
-    follower starts at its goal relative to the leader, plus a uniform random deviation within +-
+    A leader starts where its drive says, or in its given state, plus its offset and `start_error`.
+    A follower starts at its goal relative to the leader, plus a uniform random deviation within +-
     the spread of each state. The same seed draws the same deviations whatever the spreads are.
 
     Raises:
         SimulationError: given states have a wrong shape or are not finite; a spread is negative.
         ModelError: a spread or error names no state or group.
     """
+    model, graph, initial = parts.model, parts.graph, parts.initial
     shape = (graph.agents, len(model.state_names))
-    error = _per_state(model, start_error, "start error")
+    error = _per_state(model, parts.start_error, "start error")
     if initial is not None and not isinstance(initial, Mapping):
         states = _checked(initial, shape, "initial states have", "(agents, states)")
         states[list(graph.leaders)] += error
@@ -48,10 +37,10 @@ def initial_states(
     )
     if (spread < 0.0).any():
         raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
-    leaders = np.asarray(leader.start(model), np.float64) + error
+    leaders = np.asarray(parts.drive.start(model), np.float64) + error
     deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
     deviations[list(graph.leaders)] = 0.0
-    states = leaders + formation.offsets + deviations
+    states = leaders + parts.formation.offsets + deviations
     _place(states, {key: value for key, value in named.items() if not isinstance(key, str)}, graph)
     states[[agent for agent in graph.leaders if agent in named]] += error
     return states

@@ -1,64 +1,62 @@
-"""What `simulate` asks of its arguments, before anything is computed."""
+"""What is checked and made ready before a run, whatever drives it."""
 
-import math
+from typing import NamedTuple
 
-from echelon.core.errors import SimulationError, did_you_mean, listing
-from echelon.core.numerics import INTEGRATORS
-from echelon.engine.result import Settings
-from echelon.laws.law import Law
+from echelon.core.errors import SimulationError, check_kind
+from echelon.core.numerics import precision
+from echelon.engine.drive import Problem
+from echelon.engine.initial import initial_states
+from echelon.engine.motion import Motion
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.engine.sums import Meter
+from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.world.disturbance import Disturbance
 
 
-def check_parts(
-    graph: object, formation: object, leader: object, follower: object, disturbance: object
-) -> None:
-    """Check that each part is what its place asks for."""
-    wanted = {"graph": (graph, Graph), "formation": (formation, Formation)}
-    wanted |= {"leader": (leader, Law), "follower": (follower, Law)}
-    if disturbance is not None:
-        wanted["disturbance"] = disturbance, Disturbance
-    for place, (part, kind) in wanted.items():
-        if not isinstance(part, kind):
-            got = (
-                f"the class `{part.__name__}`"
-                if isinstance(part, type)
-                else f"a `{type(part).__name__}`"
-            )
-            raise SimulationError(f"`{place}` is {got}, and must be a `{kind.__name__}`.")
+class Prepared(NamedTuple):
+    """Parts that are checked, with their drive completed; the problem; the warnings of all."""
+
+    parts: Parts
+    problem: Problem
+    warnings: tuple[str, ...]
 
 
-def check_settings(settings: Settings) -> None:
-    """Check the numbers of a simulation.
+def prepare(parts: Parts, settings: Settings) -> Prepared:
+    """Check all parts and complete those that depend on others, in float64.
 
     Raises:
-        SimulationError: one is out of range.
+        EchelonError: a part is malformed or does not fit the others.
     """
-    horizon, dt = settings.horizon, settings.dt
-    for name, value in (("horizon", horizon), ("dt", dt)):
-        if not 0.0 < value < math.inf:
-            raise SimulationError(
-                f"`{name}` is {value}, and must be a positive finite number of seconds."
-            )
-    if horizon < dt:
-        raise SimulationError(
-            f"`horizon` is {horizon} s, and must be at least one step `dt` = {dt} s."
+    check_kind("parts", parts, Parts)
+    check_kind("settings", settings, Settings)
+    settings.check()
+    model, graph, formation = parts.model, parts.graph, parts.formation
+    with precision("float64"):
+        warnings = check_model(model) + parts.world.check(model)
+        _check_offsets(model, parts)
+        parts = parts.replace(drive=parts.drive.prepare(model, graph))
+        problem = Problem(
+            model,
+            graph,
+            formation,
+            Motion.of(model, parts.world, settings),
+            Meter.of(model, graph, formation, settings),
+            settings,
+            initial_states(parts, settings.seed),
         )
-    if settings.integrator not in INTEGRATORS:
-        known = INTEGRATORS
+        warnings += parts.drive.warnings(model, graph, settings)
+    warnings += formation_warnings(model, formation)
+    return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
+
+
+def _check_offsets(model: ControlAffine, parts: Parts) -> None:
+    shape = (parts.graph.agents, len(model.state_names))
+    if parts.formation.offsets.shape != shape:
         raise SimulationError(
-            f"`integrator` is `{settings.integrator}`, allowed are {listing(known)}"
-            f"{did_you_mean(settings.integrator, known)}."
-        )
-    if settings.seed != int(settings.seed) or settings.seed < 0:
-        raise SimulationError(f"`seed` is {settings.seed}, and must be a whole number from 0 on.")
-    if settings.store_every != int(settings.store_every) or settings.store_every < 1:
-        raise SimulationError(f"`store_every` is {settings.store_every}, and must be at least 1.")
-    if settings.precision not in ("float64", "float32"):
-        raise SimulationError(
-            f"`precision` is `{settings.precision}`, allowed are `float64` and `float32`."
+            f"the formation has offsets {parts.formation.offsets.shape}, and {shape[0]} agents "
+            f"with {shape[1]} states need {shape}."
         )
 
 

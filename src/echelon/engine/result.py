@@ -2,33 +2,25 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, final
 
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array
-from echelon.laws.law import Law
+from echelon.engine.drive import Drive
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.engine.sums import Sums, measured_states
+from echelon.engine.work import SolverStats
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
-from echelon.world.disturbance import Disturbance
-from echelon.world.plant import differences
+from echelon.world.world import World
 
 
-class Settings(NamedTuple):
-    """How a run was computed: horizon and dt in s; see `simulate` for the rest."""
-
-    horizon: float
-    dt: float
-    integrator: str
-    limits: bool
-    store_every: int
-    precision: str
-    seed: int
-
-
-@dataclasses.dataclass(frozen=True)
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
 class Result:
     """A run: T stored frames of N agents with n states and m inputs.
 
@@ -37,13 +29,13 @@ class Result:
         states: (T, N, n).
         inputs: (T, N, m), physical, as delivered by the actuators from each frame on.
         reference: (T, n), the leader's reference state, or None where it follows nothing.
-        saturated: (N,) the fraction of steps in which an actuator limit changed the agent's input.
+        sums: over all steps, of which means are made.
         outcome: how the run ended; `message` says it with time and agent.
         warnings: what is allowed but probably not meant, one sentence each.
-        model, graph, formation, leader, follower, settings: the parts that ran.
-        plant: the agents as they were, or None where that is `model`.
-        disturbance: the wind and noise that acted, or None.
+        parts: what ran, with its drive completed.
+        settings: how it was computed.
         wall_time: seconds of computing, compilation included.
+        work: what solving took; None where laws gave the inputs.
         provenance: scenario text, versions and the like, as text.
     """
 
@@ -51,20 +43,45 @@ class Result:
     states: Array
     inputs: Array
     reference: Array | None
-    saturated: Array
+    sums: Sums
     outcome: Outcome
     message: str
     warnings: tuple[str, ...]
-    model: ControlAffine
-    graph: Graph
-    formation: Formation
-    leader: Law
-    follower: Law
+    parts: Parts
     settings: Settings
     wall_time: float
-    plant: ControlAffine | None = None
-    disturbance: Disturbance | None = None
+    work: SolverStats | None = None
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def model(self) -> ControlAffine:
+        """What the laws know of an agent."""
+        return self.parts.model
+
+    @property
+    def graph(self) -> Graph:
+        """Who hears whom."""
+        return self.parts.graph
+
+    @property
+    def formation(self) -> Formation:
+        """Where each belongs."""
+        return self.parts.formation
+
+    @property
+    def drive(self) -> Drive:
+        """What drove the agents."""
+        return self.parts.drive
+
+    @property
+    def world(self) -> World:
+        """What the laws did not know."""
+        return self.parts.world
+
+    @property
+    def saturated(self) -> Array:
+        """The fraction of steps (N,) in which an actuator limit changed the agent's input."""
+        return self.sums.limited / max(1.0, float(self.sums.steps[0]))
 
     @property
     def errors(self) -> Array:
@@ -76,14 +93,9 @@ class Result:
         return y - y[:, list(self.graph.nearest_leader())]
 
     @property
-    def moved(self) -> ControlAffine:
-        """What moved: the plant, or the model where no other was given."""
-        return self.model if self.plant is None else self.plant
-
-    @property
     def measured(self) -> tuple[int, ...]:
         """Indices of the states that errors are measured on: the position if any, else all."""
-        return self.model.position_indices() or tuple(range(len(self.model.state_names)))
+        return measured_states(self.model)
 
     @property
     def unit(self) -> str:
@@ -98,12 +110,3 @@ class Result:
 def finite_or_none(value: Any) -> float | None:
     """Return a number as a float, or None where it does not exist or is not finite."""
     return float(value) if value is not None and np.isfinite(value) else None
-
-
-def imperfections(result: Result) -> dict[str, str | None]:
-    """Return in words how the plant differs from the model, and what disturbed it; else None."""
-    plant, disturbance = result.plant, result.disturbance
-    return {
-        "plant": None if plant is None else differences(result.model, plant),
-        "disturbance": None if disturbance is None else str(disturbance),
-    }

@@ -1,23 +1,18 @@
 """What solving took in a run whose inputs an optimization gave."""
 
-import json
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-from echelon.engine.result import Result
-
-_KEY = "solver"
 
 
 class SolverStats(NamedTuple):
     """The work of the solvers of all agents together.
 
     Attributes:
-        method: `optimization`, planned once, or `mpc`, over a receding horizon.
+        method: what was solved: `optimization`, planned once, or `mpc`, over a receding horizon.
         solver: by CasADi's name.
-        solves: how many plans were asked for.
+        solves: how many plans were wanted.
         failures: how often a solver ended without a solution; the run went on with another attempt
             or with the last plan.
         seconds: of all solving.
@@ -27,7 +22,7 @@ class SolverStats(NamedTuple):
         setup_seconds: of making the solvers ready, once.
     """
 
-    method: Literal["optimization", "mpc"]
+    method: str
     solver: str
     solves: int
     failures: int
@@ -40,8 +35,8 @@ class SolverStats(NamedTuple):
     setup_seconds: float
 
 
-def stats_of(
-    method: Literal["optimization", "mpc"],
+def solver_stats(
+    method: str,
     solver: str,
     seconds: Sequence[float],
     iterations: Sequence[int],
@@ -64,14 +59,3 @@ def stats_of(
         int(counts.max()),
         setup_seconds,
     )
-
-
-def with_stats(result: Result, figures: SolverStats) -> Result:
-    """Return the result with the figures in its provenance, which files keep."""
-    return result.with_provenance(**{_KEY: json.dumps(figures._asdict())})
-
-
-def solver_stats(result: Result) -> SolverStats | None:
-    """Return what solving took, or None where the inputs came from laws."""
-    text = result.provenance.get(_KEY)
-    return None if text is None else SolverStats(**json.loads(text))

@@ -1,10 +1,10 @@
 """Agents that solve optimization problems: plans, receding horizons, and a leader with a plan."""
 
-from echelon.engine.work import SolverStats, solver_stats
+from echelon.engine.work import SolverStats
+from echelon.optimal.drives import Plans, RecedingHorizon
 from echelon.optimal.horizon import MPC
 from echelon.optimal.leader import OptimalTracking
 from echelon.optimal.objectives import TrackingOptions
-from echelon.optimal.pilots import simulate_mpc, simulate_plans
 from echelon.optimal.planar_baseline import PlanarBaseline
 from echelon.optimal.problem import Constraint, OptimalControl
 from echelon.optimal.solver import Solver, Trajectory, solve
@@ -15,12 +15,11 @@ __all__ = [
     "OptimalControl",
     "OptimalTracking",
     "PlanarBaseline",
+    "Plans",
+    "RecedingHorizon",
     "Solver",
     "SolverStats",
     "TrackingOptions",
     "Trajectory",
-    "simulate_mpc",
-    "simulate_plans",
     "solve",
-    "solver_stats",
 ]

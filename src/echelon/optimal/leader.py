@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import LawError
-from echelon.core.numerics import precision, rk4
+from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
@@ -22,7 +22,7 @@ from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import reference_targets, reference_warnings
+from echelon.references.flatness import flat_states, reference_targets, reference_warnings
 from echelon.references.reference import Reference
 
 _STEP = 0.005
@@ -137,8 +137,7 @@ class OptimalTracking(Law):
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return the reference's states (T, n), which the plan comes close to."""
-        with precision("float64"):
-            return jnp.asarray(reference_targets(model, self.reference, np.asarray(times)).states)
+        return flat_states(model, self.reference, times)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""

@@ -130,7 +130,7 @@ def _certified_set(
     from matplotlib.figure import Figure
 
     parts = loop.parts
-    run, plane = prepare_trial(parts, gain, states)
+    run, plane = prepare_trial(parts, loop.settings, gain, states)
     certified, observed = certified_at_rest(loop), observed_radius(run, plane)
     named = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(named, certified, observed, plane.largest, run.horizon)

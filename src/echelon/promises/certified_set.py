@@ -14,6 +14,7 @@ from echelon.core.errors import Outcome
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Theorem
 from echelon.engine.initial import initial_states
+from echelon.engine.parts import Parts
 from echelon.engine.simulate import simulate
 from echelon.laws.trim_input import TrimInput
 from echelon.models.model import ControlAffine
@@ -99,7 +100,7 @@ def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Array | None, str]:
     A leader that starts and stays at the trim goes nowhere, which needs no run.
     """
     model = loop.parts.model
-    if getattr(loop.parts.leader, "reaction", None) is not None:
+    if loop.parts.drive.reacts:
         return None, None, "the leader reacts, so its excursion is not its own; `reacts: false`"
     trim = np.asarray(model.trim[0], float)
     if not loop.moving and (_leader_starts(loop) == trim).all():
@@ -113,28 +114,20 @@ def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Array | None, str]:
 
 def _leader_starts(loop: CheckedLoop) -> Array:
     """Return the states (L, n) in which the leaders start, less their offsets."""
-    parts, keys = loop.parts, ("initial", "start_error", "seed")
-    given = (parts.settings[key] for key in keys)
-    states = initial_states(parts.model, parts.graph, parts.formation, parts.leader, *given)
+    parts = loop.parts
+    states = initial_states(parts, loop.settings.seed)
     return (states - parts.formation.offsets)[list(parts.graph.leaders)]
 
 
 def _leader_paths(loop: CheckedLoop) -> Array | None:
     """Return the states (K, n) of the leaders in a run of their own, or None if it diverges."""
-    starts, settings = _leader_starts(loop), loop.parts.settings
+    parts, starts = loop.parts, _leader_starts(loop)
     count = len(starts)
     graph = Graph([(k, count) for k in range(count)], leaders=range(count))
-    states = np.concatenate([starts, np.asarray(loop.parts.model.trim[0], float)[None]])
-    keys = ("horizon", "dt", "integrator", "limits")
-    result = simulate(
-        loop.parts.model,
-        graph,
-        Formation(np.zeros_like(states)),
-        leader=loop.parts.leader,
-        follower=TrimInput(),
-        initial=states,
-        **{key: settings[key] for key in keys},
-    )
+    states = np.concatenate([starts, np.asarray(parts.model.trim[0], float)[None]])
+    goals = Formation(np.zeros_like(states))
+    alone = Parts(parts.model, graph, goals, parts.drive.with_follower(TrimInput()), initial=states)
+    result = simulate(alone, loop.settings._replace(store_every=1, seed=0, precision="float64"))
     if result.outcome is not Outcome.COMPLETED:
         return None
     return result.states[:, :count].reshape(-1, states.shape[1])

@@ -15,6 +15,7 @@ from echelon.core.linear import held_radius
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
 from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
 from echelon.network.spectrum import Spectrum
@@ -27,7 +28,8 @@ class CheckedLoop(NamedTuple):
     """What every line reads: the parts, and their closed loop near the trim.
 
     Attributes:
-        parts: of the scenario.
+        parts: what runs.
+        settings: how it is computed.
         linear: A (with the inner loop closed) and B at the trim.
         closed: the modes that margins are taken of.
         where: which eigenvalues of the graph those are, in words.
@@ -37,6 +39,7 @@ class CheckedLoop(NamedTuple):
     """
 
     parts: Parts
+    settings: Settings
     linear: Linearization
     closed: ClosedLoop
     where: str
@@ -47,8 +50,7 @@ class CheckedLoop(NamedTuple):
     @property
     def gain(self) -> Gain | None:
         """The followers' gain, where their law has one."""
-        gain = getattr(self.parts.follower, "gain", None)
-        return gain if isinstance(gain, Gain) else None
+        return self.parts.drive.gain
 
     @property
     def region(self) -> RegionCertificate | None:
@@ -63,7 +65,7 @@ class CheckedLoop(NamedTuple):
     @property
     def fed_by_parents(self) -> bool:
         """Whether each follower is told the input of its parent."""
-        return self.parts.follower.feedforward is Feedforward.PARENT
+        return self.parts.drive.feedforward is Feedforward.PARENT
 
     @property
     def inner(self) -> Array:
@@ -75,49 +77,48 @@ class CheckedLoop(NamedTuple):
     @property
     def governed(self) -> bool:
         """Whether the followers run a law that this page speaks of, u = u_ff - c R^-1 g'P z."""
-        return self.parts.follower.metric(self.parts.model) is not None
+        return self.parts.drive.metric(self.parts.model) is not None
 
     @property
     def trimmed(self) -> bool:
         """Whether the law applies the trim input, or there is none."""
         trim = np.asarray(self.parts.model.trim[1], float)
-        return getattr(self.parts.follower, "trim", True) or not trim.any()
+        return self.parts.drive.trimmed or not trim.any()
 
     @property
     def disturbed(self) -> str:
         """What the scenario adds that no promise covers, in words; empty without any."""
         told = []
-        if self.parts.settings.get("disturbance") is not None:
+        if self.parts.world.disturbance is not None:
             told.append("wind or noise acts on the agents")
-        if self.parts.settings.get("plant") is not None:
+        if self.parts.world.plant is not None:
             told.append("the agents differ from the model")
         return " and ".join(told)
 
     @property
     def moving(self) -> bool:
         """Whether the leader has a reference to follow."""
-        leader, model = self.parts.leader, self.parts.model
-        return leader.reference_states(model, jnp.zeros(1)) is not None
+        return self.parts.drive.reference_states(self.parts.model, jnp.zeros(1)) is not None
 
     @property
     def matched(self) -> bool:
         """Whether the followers are told an input, or the leader has none beyond the trim."""
-        return self.parts.follower.feedforward is not Feedforward.NONE or not self.moving
+        return self.parts.drive.feedforward is not Feedforward.NONE or not self.moving
 
 
-def checked_loop(parts: Parts) -> CheckedLoop:
+def checked_loop(parts: Parts, settings: Settings) -> CheckedLoop:
     """Return the closed loop of built parts, in float64."""
     model, graph = parts.model, parts.graph
-    gain = getattr(parts.follower, "gain", None)
+    gain = parts.drive.gain
     n, m = len(model.state_names), len(model.input_names)
     linear = linearize(model)
-    P, R, c, edge = parts.follower.metric(model), np.eye(m), 1.0, None
-    if isinstance(gain, Gain):
+    P, R, c, edge = parts.drive.metric(model), np.eye(m), 1.0, None
+    if gain is not None:
         R, c, edge = gain.R, gain.coupling, gain.certificate.edge
         linear = linear.closed(gain.inner)
     P = np.eye(n) if P is None else P
     spectrum, kind = graph.spectrum(), "eigenvalues"
-    if parts.follower.feedforward is Feedforward.PARENT:
+    if parts.drive.feedforward is Feedforward.PARENT:
         edge = None if edge is None else edge * spectrum.low
         spectrum, kind = graph.parent_spectrum(), "edges' weights"
         edge = None if edge is None else edge / spectrum.low
@@ -127,7 +128,7 @@ def checked_loop(parts: Parts) -> CheckedLoop:
     whole = certificate.modes == spectrum.total
     every = certificate.stable and (whole or decays_between(closed))
     broken = parts.formation.broken_symmetries(model)
-    return CheckedLoop(parts, linear, closed, where, every, certificate, broken)
+    return CheckedLoop(parts, settings, linear, closed, where, every, certificate, broken)
 
 
 def _looked_at(spectrum: Spectrum, kind: str) -> tuple[Array, str]:

@@ -143,6 +143,11 @@ def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
     return jax.vmap(model.output)(states)
 
 
+def flat_states(model: ControlAffine, reference: Reference, times: jax.Array) -> jax.Array:
+    """Return the states (T, n) that follow a reference exactly; times (T,) may be traced."""
+    return _flat(model, reference, times)[0]
+
+
 def check_flat(model: ControlAffine) -> None:
     """Check that a model has a flatness map, of outputs that a reference gives.
 

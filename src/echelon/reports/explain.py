@@ -9,9 +9,8 @@ from echelon.core.errors import Outcome
 from echelon.core.linear import held_radius
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward, Theorem
-from echelon.engine.result import Result, imperfections
+from echelon.engine.result import Result
 from echelon.gains.gain import Gain
-from echelon.laws.law import gain_of
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.results.lyapunov import Lyapunov, lyapunov
@@ -68,11 +67,11 @@ def _story(result: Result, numbers: Metrics) -> Iterator[str]:
 
 def _why_growth(result: Result) -> Iterator[str]:
     """Name the structural cause of growth where the linearization shows one."""
-    gain = gain_of(result.follower)
+    gain = result.drive.gain
     if gain is None:
         return
     yield from _unseen(result)
-    if not getattr(result.follower, "trim", True) and np.any(np.asarray(result.model.trim[1])):
+    if not result.drive.trimmed and np.any(np.asarray(result.model.trim[1])):
         yield "The law has no trim input either, so nothing holds the followers against gravity."
     if gain.certificate.edge is not None and gain.coupling < gain.certificate.edge:
         yield (
@@ -84,7 +83,7 @@ def _why_growth(result: Result) -> Iterator[str]:
 
 def _unseen(result: Result) -> Iterator[str]:
     """Tell of directions of disagreement that never enter an input."""
-    gain, n = gain_of(result.follower), len(result.model.state_names)
+    gain, n = result.drive.gain, len(result.model.state_names)
     if gain is not None and gain.certificate.observable < n:
         rank = gain.certificate.observable
         yield (
@@ -113,7 +112,7 @@ def _long_step(result: Result, gain: Gain) -> Iterator[str]:
 
 def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
     worst = numbers.worst_steady
-    if worst is None or worst <= _LAG or result.follower.feedforward is not Feedforward.NONE:
+    if worst is None or worst <= _LAG or result.drive.feedforward is not Feedforward.NONE:
         return
     if result.reference is not None and np.ptp(result.reference, axis=0).max() > 0.0:
         yield (
@@ -126,7 +125,7 @@ def _lag(result: Result, numbers: Metrics, unit: str) -> Iterator[str]:
 
 def _imperfections(result: Result) -> Iterator[str]:
     """Tell what the laws did not know."""
-    told = imperfections(result)
+    told = result.world.describe(result.model)
     if told["plant"]:
         yield f"Plant: {told['plant']}; laws and gains know the model alone."
     if told["disturbance"]:
@@ -135,11 +134,11 @@ def _imperfections(result: Result) -> Iterator[str]:
 
 def _promises(result: Result) -> Iterator[str]:
     """Say what the gain promises, and what the law needs to be told."""
-    gain = gain_of(result.follower)
+    gain = result.drive.gain
     if gain is not None:
         certificate = gain.certificate
         abscissa, from_on = certificate.abscissa, certificate.edge
-        if result.follower.feedforward is Feedforward.PARENT:
+        if result.drive.feedforward is Feedforward.PARENT:
             abscissa, from_on = _with_parents(result, gain)
         verdict = _verdict(abscissa)
         edge = "" if from_on is None else f" (guaranteed for linear agents from {from_on:.4g} on)"
@@ -148,7 +147,7 @@ def _promises(result: Result) -> Iterator[str]:
             f"slowest mode {abscissa:.3g} 1/s at coupling {gain.coupling:.4g}{edge}; "
             f"{_region(certificate, result.model)}."
         )
-    needs = ", ".join(result.follower.information) or "nothing from others"
+    needs = ", ".join(result.drive.information.follower) or "nothing from others"
     yield f"Each follower is told: {needs}."
 
 
@@ -193,14 +192,14 @@ def _lyapunov_story(result: Result) -> Iterator[str]:
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
     rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
-    if forbidden and result.disturbance is None:
+    if forbidden and result.world.disturbance is None:
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
             f"Warning: V rises at {forbidden} of {len(v.value) - 1} frames (first at {when:.4g} s) "
             "although V' <= 0 there; the step `dt` is too long for this gain."
         )
     elif rises:
-        excuse = _excuse(v) if result.disturbance is None else "the disturbance pushes it up"
+        excuse = _excuse(v) if result.world.disturbance is None else "the disturbance pushes it up"
         yield f"V rises at {rises} of {len(v.value) - 1} frames; {excuse}."
     else:
         yield f"V never rises: {v.value[0]:.3g} at the start, {v.value[-1]:.3g} at the end."

@@ -20,20 +20,14 @@ if TYPE_CHECKING:
 _MANY = 12
 
 
-def report(result: Result, steady_window: float | None = None) -> str:
-    """Return the report of a run as plain text.
-
-    Args:
-        result: the run.
-        steady_window: the last part of the run that counts as steady, s; a fifth of the horizon
-            when left out.
-    """
+def report(result: Result) -> str:
+    """Return the report of a run as plain text."""
     from rich.console import Console
 
     text = io.StringIO()
     # Called a terminal so that sentences wrap; without colours it is plain text all the same.
     console = Console(file=text, width=100, color_system=None, force_terminal=True)
-    print_report(console, result, metrics(result, steady_window))
+    print_report(console, result, metrics(result))
     return text.getvalue().rstrip("\n")
 
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from echelon.engine.result import Result, imperfections
-from echelon.laws.law import gain_of
+from echelon.engine.result import Result
 from echelon.results.lyapunov import lyapunov
 from echelon.results.metrics import Metrics, metrics
 
@@ -63,10 +62,12 @@ def _attributes(result: Result) -> dict[str, Any]:
         key: int(v) if isinstance(v, bool) else v for key, v in result.settings._asdict().items()
     }
     laws = {
-        f"{role}_needs": "; ".join(law.information) or "nothing"
-        for role, law in (("leader", result.leader), ("follower", result.follower))
+        f"{role}_needs": "; ".join(sent) or "nothing"
+        for role, sent in result.drive.information._asdict().items()
     }
-    told = {key: text for key, text in imperfections(result).items() if text is not None}
+    told = {
+        key: text for key, text in result.world.describe(result.model).items() if text is not None
+    }
     told |= {"outcome": result.outcome.name.lower(), "message": result.message}
     warnings = {"warnings": "\n".join(result.warnings)}
     return {
@@ -87,8 +88,7 @@ def save_dataset(result: Result, path: Path) -> None:
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
     """Return the run's summary, ready for JSON; what does not exist is None."""
     numbers = metrics(result) if numbers is None else numbers
-    gain = gain_of(result.follower)
-    spectrum = result.graph.spectrum()
+    gain, spectrum = result.drive.gain, result.graph.spectrum()
     return {
         "scenario": result.provenance.get("scenario", ""),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
@@ -97,7 +97,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         "horizon_s": result.settings.horizon,
         "dt_s": result.settings.dt,
         "seed": result.settings.seed,
-        **imperfections(result),
+        **result.world.describe(result.model),
         "leader": numbers.leader._asdict(),
         "followers": [_follower(each._asdict()) for each in numbers.followers],
         "edges": [

@@ -11,11 +11,11 @@ import scipy.sparse.linalg as spla
 
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.engine.drive import Drive
+from echelon.engine.motion import Motion
 from echelon.engine.result import Result
-from echelon.laws.law import Law
-from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-from echelon.world.disturbance import Wind, disturbed
+from echelon.world.disturbance import disturbed
 
 # Below this fraction of its largest value V is made of rounding and its rises mean nothing.
 _ROUNDING = 1e-20
@@ -55,13 +55,13 @@ def lyapunov(result: Result) -> Lyapunov | None:
 
     None where the followers' law has no P or nothing was stored.
     """
-    P = result.follower.metric(result.model)
+    P = result.drive.metric(result.model)
     if P is None or not len(result.times):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
         steps = jnp.asarray(np.rint(result.times / result.settings.dt).astype(np.int32))
-        fields = _fields(result.follower, result.moved, _wind(result), x, u, steps)
+        fields = _fields(result.drive, _motion(result), x, u, steps)
         f, xdot = (np.asarray(part) for part in fields)
         y = result.states - result.formation.offsets
         z, zdot = (_disagreement(result.graph, part) for part in (y, xdot))
@@ -74,25 +74,22 @@ def lyapunov(result: Result) -> Lyapunov | None:
         return Lyapunov(value, np.einsum("tia,ab,tib->t", delta, P, zdot), drift)
 
 
-def _wind(result: Result) -> Wind | None:
-    if result.disturbance is None:
-        return None
-    return result.disturbance.prepared(result.moved, result.settings.dt, result.settings.seed)
+def _motion(result: Result) -> Motion:
+    return Motion.of(result.model, result.world, result.settings)
 
 
 @eqx.filter_jit
 def _fields(
-    law: Law,
-    plant: ControlAffine,
-    wind: Wind | None,
+    drive: Drive,
+    motion: Motion,
     x: jax.Array,
     u: jax.Array,
     steps: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the law's drift and xdot for x (T, N, n), u (T, N, m) at steps (T,)."""
+    """Return the drift under the drive and xdot for x (T, N, n), u (T, N, m) at steps (T,)."""
 
     def one(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> tuple[Any, Any]:
-        return law.drift(plant, x), disturbed(plant, wind, step, agent)(x, u)
+        return drive.drift(motion.plant, x), disturbed(motion.plant, motion.wind, step, agent)(x, u)
 
     over = jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
     return over(x, u, jnp.arange(x.shape[1]), steps)

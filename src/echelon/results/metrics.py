@@ -1,7 +1,6 @@
 """The numbers of a run: the errors of the paper's Table II, and what else an engineer asks for."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,10 +11,8 @@ from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.engine.result import Result, finite_or_none
+from echelon.engine.sums import SETTLED, output_error
 from echelon.models.model import ControlAffine
-
-SETTLED = 0.01
-"""A follower has settled when its error stays below this: 1 cm for a position."""
 
 
 class LeaderMetrics(NamedTuple):
@@ -53,7 +50,7 @@ class Metrics(NamedTuple):
     """All numbers of a run; what does not exist is None, never NaN.
 
     Errors are of the position (m) where the model has one, else of the whole state. A run that
-    diverged has no errors.
+    diverged has no errors. The least distance is over the stored frames.
     """
 
     leader: LeaderMetrics
@@ -70,25 +67,17 @@ class Metrics(NamedTuple):
         return max(values) if values else None
 
 
-def metrics(result: Result, steady_window: float | None = None) -> Metrics:
-    """Return the numbers of a run.
-
-    Args:
-        result: the run.
-        steady_window: length of the last part of the run that counts as steady, s; a fifth of the
-            horizon when left out.
-    """
-    window = result.settings.horizon / 5.0 if steady_window is None else steady_window
-    exists = result.outcome is not Outcome.DIVERGED and len(result.times) > 0
-    steady = result.times >= result.times[-1] - window - 1e-9 if exists else np.zeros(0, bool)
+def metrics(result: Result) -> Metrics:
+    """Return the numbers of a run; means are over all its steps, whatever frames were stored."""
+    exists = result.outcome is not Outcome.DIVERGED and bool(result.sums.steps[0] > 0)
     with np.errstate(over="ignore", invalid="ignore"):
         return Metrics(
-            leader=_leader(result, steady, exists),
-            followers=_followers(result, steady, exists),
+            leader=_leader(result, exists),
+            followers=_followers(result, exists),
             edges=_edges(result, exists),
             minimum_distance=_minimum_distance(result),
             saturation_fraction=float(result.saturated.mean()),
-            steady_window=window,
+            steady_window=result.settings.window,
         )
 
 
@@ -111,70 +100,63 @@ def output_errors(result: Result) -> Array | None:
 
 @eqx.filter_jit
 def _output_errors(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
-    # The state's own difference, which may wind angles, decides how far apart the two outputs are.
-    def one(x: jax.Array, wanted: jax.Array) -> jax.Array:
-        return model.output(wanted + model.difference(x, wanted)) - model.output(wanted)
-
-    return jax.vmap(one)(x, wanted)
+    return jax.vmap(lambda x, wanted: output_error(model, x, wanted))(x, wanted)
 
 
-def _rms(values: Array) -> float | None:
-    """Return the root of the mean of squares over the first axis, summed over the others."""
-    if not len(values):
-        return None
-    squares = (values**2).reshape(len(values), -1).sum(axis=1)
-    return finite_or_none(np.sqrt(squares.mean()))
+def _root_mean(total: Any, steps: Any) -> float | None:
+    """Return the root of a mean of squares, from their sum; None where there is no mean."""
+    return finite_or_none(np.sqrt(total / steps)) if steps > 0 else None
 
 
-def _leader(result: Result, steady: Array, exists: bool) -> LeaderMetrics:
-    errors = output_errors(result) if exists else None
-    if errors is None or result.reference is None:
-        return LeaderMetrics(None, None, dict.fromkeys(result.model.output_names))
-    leader = result.graph.leaders[0]
-    wanted = result.reference + result.formation.offsets[leader]
-    off = (result.states[:, leader] - wanted)[:, list(result.measured)]
-    by_output = {name: _rms(errors[:, k]) for k, name in enumerate(result.model.output_names)}
-    return LeaderMetrics(_rms(off), _rms(off[steady]), by_output)
+def _leader(result: Result, exists: bool) -> LeaderMetrics:
+    """Return the numbers of the first leader."""
+    names, sums = result.model.output_names, result.sums
+    if not exists or result.reference is None:
+        return LeaderMetrics(None, None, dict.fromkeys(names))
+    whole, steady = (_root_mean(*pair) for pair in zip(sums.tracking[:, 0], sums.steps))
+    by_output = {
+        name: _root_mean(total, sums.steps[0])
+        for name, total in zip(names, sums.outputs[0], strict=True)
+    }
+    return LeaderMetrics(whole, steady, by_output)
 
 
-def _followers(result: Result, steady: Array, exists: bool) -> tuple[FollowerMetrics, ...]:
-    errors = formation_errors(result)
+def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
+    sums, saturated = result.sums, result.saturated
+    last = formation_errors(result)[-1] if exists and len(result.times) else None
+    nothing = FollowerMetrics(0, None, None, None, None, 0.0)
     return tuple(
-        FollowerMetrics(
+        nothing._replace(agent=agent, saturated=float(saturated[agent]))
+        if last is None
+        else FollowerMetrics(
             agent=agent,
-            rmse=_rms(errors[:, agent]) if exists else None,
-            steady_rmse=_rms(errors[steady, agent]) if exists else None,
-            settling_time=_settling_time(result.times, errors[:, agent]) if exists else None,
-            effort=_effort(result, agent) if exists else None,
-            saturated=float(result.saturated[agent]),
+            rmse=_root_mean(sums.errors[0, agent], sums.steps[0]),
+            steady_rmse=_root_mean(sums.errors[1, agent], sums.steps[1]),
+            settling_time=_settling_time(result, agent, float(last[agent])),
+            effort=_root_mean(sums.effort[agent], sums.steps[0]),
+            saturated=float(saturated[agent]),
         )
         for agent in result.graph.followers
     )
 
 
-def _settling_time(times: Array, error: Array) -> float | None:
-    """Return the first time from which on the error stays below 1 cm, or None."""
-    above = np.flatnonzero(~(error <= SETTLED))
-    if not len(above):
-        return 0.0
-    return None if above[-1] == len(times) - 1 else float(times[above[-1] + 1])
+def _settling_time(result: Result, agent: int, last: float) -> float | None:
+    """Return the first time from which on the error stays below 1 cm, to a step, or None.
 
-
-def _effort(result: Result, agent: int) -> float | None:
-    scale = np.asarray(result.model.input_scale, float)
-    deviation = result.inputs[:, agent] - np.asarray(result.model.trim[1], float)
-    return _rms(np.linalg.solve(scale, deviation.T).T)
+    `last` is the error in the last stored frame, after the last step that the sums know.
+    """
+    if not last <= SETTLED:
+        return None
+    return float((result.sums.unsettled[agent] + 1) * result.settings.dt)
 
 
 def _edges(result: Result, exists: bool) -> tuple[EdgeMetrics, ...]:
-    measured = list(result.measured)
-    p, goals = result.states[:, :, measured], result.formation.offsets[:, measured]
-
-    def deviation(i: int, j: int) -> Array:
-        return np.linalg.norm(p[:, i] - p[:, j], axis=1) - np.linalg.norm(goals[i] - goals[j])
-
-    pairs: Sequence[tuple[int, int]] = [(int(i), int(j)) for i, j in result.graph.edges]
-    return tuple(EdgeMetrics(pair, _rms(deviation(*pair)) if exists else None) for pair in pairs)
+    steps = result.sums.steps[0] if exists else 0.0
+    pairs = ((int(i), int(j)) for i, j in result.graph.edges)
+    return tuple(
+        EdgeMetrics(pair, _root_mean(total, steps))
+        for pair, total in zip(pairs, result.sums.spacing, strict=True)
+    )
 
 
 def _minimum_distance(result: Result) -> float | None:

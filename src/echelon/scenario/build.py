@@ -10,7 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from echelon.core.errors import (
     EchelonError,
@@ -22,8 +22,10 @@ from echelon.core.errors import (
 )
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
+from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.result import Result
+from echelon.engine.settings import Settings
 from echelon.engine.simulate import Progress, simulate
 from echelon.gains.file import load_gain
 from echelon.gains.gain import Gain, synthesize
@@ -37,6 +39,14 @@ from echelon.scenario.scenario import Fault, Scenario, by_line
 from echelon.scenario.sections import GainSpec
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import check_plant, varied
+from echelon.world.world import World
+
+
+class Built(NamedTuple):
+    """What `simulate` takes: the parts of a scenario, and how it is computed."""
+
+    parts: Parts
+    settings: Settings
 
 
 class _Faults:
@@ -64,8 +74,8 @@ class _Faults:
             raise ScenarioError("\n".join(str(fault) for fault in sorted(self.found, key=by_line)))
 
 
-def build(scenario: Scenario) -> Parts:
-    """Return the parts of a scenario.
+def build(scenario: Scenario) -> Built:
+    """Return the parts and the settings of a scenario.
 
     Raises:
         ScenarioError: one line for each part that cannot be made, with its place in the file.
@@ -89,8 +99,8 @@ def build(scenario: Scenario) -> Parts:
 
 def _with_laws(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Any
-) -> Parts:
-    """Return the parts that need a model and a graph, with these."""
+) -> Built:
+    """Return all parts, with those that need a model and a graph, with these."""
     formation = leader = follower = plant = None
     with faults.at("plant"):
         plant = _plant(scenario, model)
@@ -110,30 +120,25 @@ def _with_laws(
             with faults.at(*section, name):
                 model.states_called(name)
     faults.settle()
-    return Parts(
+    parts = Parts(
         model,
         graph,
         cast(Formation, formation),
-        cast(Law, leader),
-        cast(Law, follower),
-        {**_settings(scenario), "plant": plant, "disturbance": disturbance},
+        Laws(cast(Law, leader), cast(Law, follower)),
+        initial=scenario.initial.states or scenario.initial.spread or {},
+        start_error=scenario.leader.start_error,
+        world=World(plant, disturbance),
     )
+    return Built(parts, _settings(scenario))
 
 
-def run(scenario: Scenario, progress: Progress | None = None, parts: Parts | None = None) -> Result:
+def run(scenario: Scenario, progress: Progress | None = None, built: Built | None = None) -> Result:
     """Simulate a scenario, built unless its parts are given, and note where the result comes from.
 
     Raises:
         ScenarioError: a part cannot be made.
     """
-    parts = build(scenario) if parts is None else parts
-    result = simulate(
-        *parts[:3],
-        leader=parts.leader,
-        follower=parts.follower,
-        progress=progress,
-        **parts.settings,
-    )
+    result = simulate(*(build(scenario) if built is None else built), progress)
     told = {f"version_{name}": text for name, text in versions().items()}
     return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
 
@@ -338,10 +343,9 @@ def _leader(
     return cls(**_offered(cls, offers)).prepared(model, graph)
 
 
-def _settings(scenario: Scenario) -> dict[str, Any]:
-    return {
+def _settings(scenario: Scenario) -> Settings:
+    return Settings(
         **scenario.simulation.model_dump(),
-        "initial": scenario.initial.states or scenario.initial.spread or {},
-        "start_error": scenario.leader.start_error,
-        "seed": scenario.seed,
-    }
+        seed=scenario.seed,
+        steady_window=scenario.report.steady_window,
+    )

@@ -41,7 +41,7 @@ def graph_lines(loop: CheckedLoop) -> Iterator[Line]:
 def _trim_line(loop: CheckedLoop) -> Line:
     """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
     there = np.zeros_like(loop.parts.formation.offsets)
-    size = float(np.abs(goal_drifts(loop.parts.model, there, loop.parts.follower)).max())
+    size = float(np.abs(goal_drifts(loop.parts.model, there, loop.parts.drive)).max())
     number, text = f"|f + g u*| {size:.2g}", "about the trim, whose input the law applies"
     if not loop.trimmed:
         text = "the law leaves out the trim input; set `follower.trim: true`"
@@ -60,7 +60,8 @@ def _exact_line(loop: CheckedLoop) -> Line:
 
 def _leader_line(loop: CheckedLoop) -> Line:
     """Assumption 4: the leader tracks its reference, by linearization."""
-    statement, gain = "Assumption 4, leader tracks", getattr(loop.parts.leader, "gain", None)
+    statement = "Assumption 4, leader tracks"
+    gain = getattr(getattr(loop.parts.drive, "leader", None), "gain", None)
     if not isinstance(gain, Gain):
         return Line(statement, Verdict.NOT_NEEDED, Kind.PROOF, "", "it follows nothing")
     A, B = linearize(loop.parts.model)
@@ -115,7 +116,7 @@ def _printed_lmi(loop: CheckedLoop) -> float:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
     few = list(loop.parts.graph.followers[:4])
     goals = np.asarray(loop.parts.model.trim[0]) + loop.parts.formation.offsets[few]
-    drifts = goal_drifts(loop.parts.model, loop.parts.formation.offsets, loop.parts.follower)[few]
+    drifts = goal_drifts(loop.parts.model, loop.parts.formation.offsets, loop.parts.drive)[few]
     count, n = goals.shape
     values, vectors = np.linalg.eigh(loop.closed.P)
     X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)
@@ -133,7 +134,7 @@ def _finite_line(loop: CheckedLoop) -> Line:
     parts, P = loop.parts, loop.closed.P
     # Any multiple of P serves the law as well, with the coupling divided by it.
     P = P / float(np.linalg.eigvalsh(P)[0])
-    found = finite_condition(P, parts.model, parts.formation, parts.follower)
+    found = finite_condition(P, parts.model, parts.formation, parts.drive)
     statement = "finite condition on P"
     if found.verdict is Verdict.VACUOUS:
         text = "f is the same at all goals, so that every P passes: it says nothing"

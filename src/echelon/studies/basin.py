@@ -14,6 +14,7 @@ from echelon.core.errors import GainError, did_you_mean, listing
 from echelon.core.numerics import precision, rk4
 from echelon.core.types import Array, Input, State
 from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.laws.consensus import feedback
 from echelon.models.linearization import linearize
@@ -236,8 +237,9 @@ def _telling(model: ControlAffine, gain: Gain) -> tuple[int, int]:
     return (places[0], places[1]) if len(places) > 1 else (0, 1)
 
 
-def prepare_trial(parts: Parts, gain: Gain, states: tuple[int, int]) -> tuple[Trial, Slice]:
+def prepare_trial(
+    parts: Parts, settings: Settings, gain: Gain, states: tuple[int, int]
+) -> tuple[Trial, Slice]:
     """Return the loop that starts of a slice are run in, and the slice."""
-    settings = parts.settings
-    run = trial(parts.model, parts.graph, gain, float(settings["dt"]), bool(settings["limits"]))
+    run = trial(parts.model, parts.graph, gain, settings.dt, settings.limits)
     return run, slice_of(parts.model, gain, len(parts.graph.followers), states)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from echelon.core.numerics import precision
 from echelon.core.words import Theorem
 from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
 from echelon.promises.certified_set import CertifiedSet, certified_set
 from echelon.promises.closed_loop import CheckedLoop, checked_loop, step_radius
 from echelon.studies.assumptions import drift_lines, graph_lines
@@ -15,10 +16,10 @@ from echelon.studies.region import region_lines
 __all__ = ["Checked", "Line", "check"]
 
 
-def check(parts: Parts) -> Checked:
+def check(parts: Parts, settings: Settings) -> Checked:
     """Walk through the paper's statements on built parts, the region of the gain, and margins."""
     with precision("float64"):
-        loop = checked_loop(parts)
+        loop = checked_loop(parts, settings)
         found = certified_set(loop)
         lines = (
             *graph_lines(loop),
@@ -46,7 +47,7 @@ def _reasons(loop: CheckedLoop) -> Iterator[str]:
         yield "an offset is no symmetry of the dynamics"
     if not loop.every:
         yield "the disagreement does not decay"
-    elif step_radius(loop, float(loop.parts.settings["dt"])) >= 1.0:
+    elif step_radius(loop, loop.settings.dt) >= 1.0:
         yield "with the input held over the step `dt` it grows"
 
 

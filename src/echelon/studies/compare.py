@@ -2,26 +2,28 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
+from echelon.engine.drive import Drive
 from echelon.engine.initial import initial_states
 from echelon.engine.parts import Parts
-from echelon.engine.result import Result, imperfections
+from echelon.engine.result import Result
+from echelon.engine.settings import Settings
 from echelon.engine.simulate import simulate
-from echelon.engine.work import SolverStats, solver_stats
+from echelon.engine.work import SolverStats
 from echelon.gains.fixed import FixedGain
 from echelon.gains.gain import Gain, Method, synthesize
 from echelon.gains.inner_loop import InnerLoop
 from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import Consensus
-from echelon.optimal.pilots import simulate_mpc, simulate_plans
+from echelon.optimal.drives import Plans, RecedingHorizon
 from echelon.results.metrics import Metrics, metrics
-from echelon.scenario.build import build
+from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
 
 LABELS = ("literal", "riccati-relay", "riccati", "inner-loop", "optimization", "mpc")
@@ -104,7 +106,8 @@ class Comparison(NamedTuple):
     conditions: tuple[str, ...]
 
 
-Fly = Callable[[Parts], Flight]
+DriveOf = Callable[[Parts], Drive]
+"""What drives the agents of a scenario under a method."""
 
 
 def known_labels(asked: Sequence[str] | None) -> tuple[str, ...]:
@@ -124,7 +127,7 @@ def known_labels(asked: Sequence[str] | None) -> tuple[str, ...]:
 
 def compare(
     scenario: Scenario,
-    parts: Parts | None = None,
+    built: Built | None = None,
     only: tuple[str, ...] = LABELS,
     began: Callable[[str], None] = lambda label: None,
 ) -> Comparison:
@@ -132,7 +135,7 @@ def compare(
 
     Args:
         scenario: the agents, their graph, formation, starts and conditions; its horizon is flown.
-        parts: its parts, built unless given.
+        built: its parts and settings, built unless given.
         only: the labels of the methods to fly.
         began: called with each method's label before it flies.
 
@@ -142,63 +145,57 @@ def compare(
     Raises:
         ScenarioError: a part cannot be made.
     """
-    built = build(scenario) if parts is None else parts
-    scene, window = _with_starts(built), scenario.report.steady_window
-    flights = {label: _FLY[label] for label in only} | (_own(built) if only == LABELS else {})
+    parts, settings = build(scenario) if built is None else built
+    scene = _with_starts(parts, settings)
+    drives = {label: _DRIVES[label] for label in only} | (_own(parts) if only == LABELS else {})
     rows = []
-    for label, fly in flights.items():
+    for label, drive in drives.items():
         began(label)
-        rows.append(_row(label, fly, scene, window))
-    horizon = built.settings["horizon"]
-    return Comparison(scenario.name, tuple(rows), horizon, window, _conditions(rows))
+        rows.append(_row(label, drive, scene, settings))
+    return Comparison(
+        scenario.name, tuple(rows), settings.horizon, settings.window, _conditions(parts)
+    )
 
 
-def _row(label: str, fly: Fly, parts: Parts, window: float) -> Row:
+def _row(label: str, drive: DriveOf, parts: Parts, settings: Settings) -> Row:
     try:
-        flight = fly(parts)
+        flight = _fly(parts.replace(drive=drive(parts)), settings)
     except EchelonError as error:
         return Row(label, None, None, str(error))
-    return Row(label, flight, metrics(flight.result, window))
+    return Row(label, flight, metrics(flight.result))
 
 
-def _with_starts(parts: Parts) -> Parts:
+def _with_starts(parts: Parts, settings: Settings) -> Parts:
     """Return the parts with the starts drawn once, the leader's error included."""
-    given = parts.settings
     with precision("float64"):
-        leader = parts.leader.prepared(parts.model, parts.graph)
-        states = initial_states(
-            *parts[:3], leader, given["initial"], given["start_error"], given["seed"]
-        )
-    return parts._replace(settings={**given, "initial": states, "start_error": {}})
+        drive = parts.drive.prepare(parts.model, parts.graph)
+        states = initial_states(parts.replace(drive=drive), settings.seed)
+    return parts.replace(initial=states, start_error={})
 
 
-def _conditions(rows: list[Row]) -> tuple[str, ...]:
+def _conditions(parts: Parts) -> tuple[str, ...]:
     """Return what differs from the model in every run, in words."""
-    flown = [row.flight.result for row in rows if row.flight is not None]
-    told = imperfections(flown[0]) if flown else {}
-    return tuple(f"{name}: {text}" for name, text in told.items() if text)
+    described = parts.world.describe(parts.model)
+    return tuple(f"{name}: {text}" for name, text in described.items() if text)
+
+
+def _fly(parts: Parts, settings: Settings) -> Flight:
+    """Run a method, and take its time: of solving, or else of the compiled steps."""
+    watch = _Watch()
+    result = simulate(parts, settings, watch)
+    seconds = watch.seconds if result.work is None else result.work.seconds
+    computing = seconds / (parts.graph.agents * settings.horizon)
+    return Flight(result, result.drive.information.follower, computing, result.work)
 
 
 # ---- the methods --------------------------------------------------------------------------------
 
 
-def _consensus(gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True) -> Fly:
-    """Return the flight under the consensus law with a gain."""
-
-    def fly(parts: Parts) -> Flight:
-        law = Consensus(gain(parts), feedforward, trim)
-        watch = _Watch()
-        result = simulate(
-            *parts[:3], leader=parts.leader, follower=law, progress=watch, **parts.settings
-        )
-        return Flight(
-            result,
-            law.information,
-            watch.seconds / (parts.graph.agents * result.settings.horizon),
-            None,
-        )
-
-    return fly
+def _consensus(
+    gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
+) -> DriveOf:
+    """Return the drive under the consensus law with a gain, the scenario's leader kept."""
+    return lambda parts: parts.drive.with_follower(Consensus(gain(parts), feedforward, trim))
 
 
 class _Watch:
@@ -221,47 +218,33 @@ def _synthesized(method: Method) -> Callable[[Parts], Gain]:
     return lambda parts: synthesize(parts.model, parts.graph, method)
 
 
-def _own(parts: Parts) -> dict[str, Fly]:
-    """Return the flight under the scenario's own law, where no method is that one."""
-    law = parts.follower
-    gain = getattr(law, "gain", None)
-    if not isinstance(law, Consensus) or not isinstance(gain, Gain):
+def _own(parts: Parts) -> dict[str, DriveOf]:
+    """Return the scenario's own drive, where no method is that one."""
+    gain, feedforward = parts.drive.gain, parts.drive.feedforward
+    if gain is None or gain.method in ("riccati", "inner-loop", "given"):
         return {}
-    if gain.method in ("riccati", "inner-loop", "given"):
-        return {}
-    label = (
-        gain.method if law.feedforward is Feedforward.NONE else f"{gain.method}-{law.feedforward}"
-    )
-    return {label: _consensus(lambda parts: gain, law.feedforward, law.trim)}
+    label = gain.method if feedforward is Feedforward.NONE else f"{gain.method}-{feedforward}"
+    return {label: lambda parts: parts.drive}
 
 
 def _riccati(parts: Parts) -> Gain:
     """Return the scenario's own Riccati gain, or the model's default one."""
-    own = getattr(parts.follower, "gain", None)
-    if isinstance(own, Gain) and own.method == "riccati":
+    own = parts.drive.gain
+    if own is not None and own.method == "riccati":
         return own
     return synthesize(parts.model, parts.graph, Riccati())
 
 
-def _optimized(fly: Callable[..., Result]) -> Fly:
-    """Return the flight in which every agent, the leader too, minimizes a cost of its own."""
-
-    def flight(parts: Parts) -> Flight:
-        reference = getattr(parts.leader, "reference", None)
-        result = fly(*parts[:3], reference=reference, **parts.settings)
-        figures = solver_stats(result)
-        assert figures is not None
-        seconds = figures.seconds / (parts.graph.agents * result.settings.horizon)
-        return Flight(result, result.follower.information, seconds, figures)
-
-    return flight
+def _reference(parts: Parts) -> Any:
+    """Return what the scenario's leader follows, if anything."""
+    return getattr(getattr(parts.drive, "leader", None), "reference", None)
 
 
-_FLY: Mapping[str, Fly] = {
+_DRIVES: Mapping[str, DriveOf] = {
     "literal": _consensus(_synthesized(FixedGain()), Feedforward.NONE, trim=False),
     "riccati-relay": _consensus(_riccati, Feedforward.RELAY),
     "riccati": _consensus(_riccati, Feedforward.NONE),
     "inner-loop": _consensus(_synthesized(InnerLoop()), Feedforward.RELAY),
-    "optimization": _optimized(simulate_plans),
-    "mpc": _optimized(simulate_mpc),
+    "optimization": lambda parts: Plans(_reference(parts)),
+    "mpc": lambda parts: RecedingHorizon(_reference(parts)),
 }

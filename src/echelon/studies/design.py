@@ -9,13 +9,12 @@ from echelon.certificates import margins
 from echelon.core.errors import EchelonError
 from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
-from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain, Method, synthesize
 from echelon.laws.consensus import Consensus
 from echelon.promises.certified_set import CertifiedSet, certified_set
 from echelon.promises.closed_loop import CheckedLoop, checked_loop
 from echelon.scenario import registry
-from echelon.scenario.build import resolve
+from echelon.scenario.build import Built, resolve
 from echelon.scenario.scenario import Scenario
 from echelon.studies.speedup import speedup
 
@@ -51,10 +50,10 @@ class Design(NamedTuple):
     seconds: float = 0.0
 
 
-def designs(scenario: Scenario, parts: Parts, only: str | None = None) -> tuple[Design, ...]:
+def designs(scenario: Scenario, built: Built, only: str | None = None) -> tuple[Design, ...]:
     """Try the methods on a built scenario, or `only` one of them."""
     methods = [resolve(registry.METHODS[name]) for name in ([only] if only else registry.METHODS)]
-    return tuple(_design(each, scenario, parts) for each in methods if only or _chooses(each))
+    return tuple(_design(each, scenario, built) for each in methods if only or _chooses(each))
 
 
 def _chooses(method: type[Method]) -> bool:
@@ -98,7 +97,7 @@ def _merit(design: Design, dt: float) -> tuple[bool, int, float]:
     return design.step > dt, strength, -certificate.abscissa
 
 
-def _design(method: type[Method], scenario: Scenario, parts: Parts) -> Design:
+def _design(method: type[Method], scenario: Scenario, built: Built) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
     arguments = _arguments(method, scenario)
     missing = [f"`follower.gain.{key}`" for key in method.needs if key not in arguments]
@@ -106,21 +105,20 @@ def _design(method: type[Method], scenario: Scenario, parts: Parts) -> Design:
         return Design(method.name, None, f"give {' and '.join(missing)} to try it")
     began = time.perf_counter()
     try:
-        gain = synthesize(parts.model, parts.graph, method(**arguments))
+        gain = synthesize(built.parts.model, built.parts.graph, method(**arguments))
     except EchelonError as error:
         return Design(method.name, None, str(error), seconds=time.perf_counter() - began)
     seconds = time.perf_counter() - began
     with precision("float64"):
-        return _known(gain, with_gain(parts, gain))._replace(seconds=seconds)
+        return _known(gain, with_gain(built, gain))._replace(seconds=seconds)
 
 
-def with_gain(parts: Parts, gain: Gain) -> CheckedLoop:
+def with_gain(built: Built, gain: Gain) -> CheckedLoop:
     """Return the closed loop of the scenario under another gain, the feed-forward kept."""
-    asked = parts.follower.feedforward
-    trim = getattr(parts.follower, "trim", True)
-    law = Consensus(gain, feedforward=asked, trim=trim)
+    parts, settings = built
+    drive = parts.drive.with_follower(Consensus(gain, parts.drive.feedforward, parts.drive.trimmed))
     with precision("float64"):
-        return checked_loop(parts._replace(follower=law))
+        return checked_loop(parts.replace(drive=drive), settings)
 
 
 def _known(gain: Gain, loop: CheckedLoop) -> Design:
@@ -137,21 +135,21 @@ def _known(gain: Gain, loop: CheckedLoop) -> Design:
         factors=margins.gain_margin(closed),
         delay=margins.delay_margin(closed).delay,
         certified=certified_set(loop),
-        advice=_advice(gain, loop.parts),
+        advice=_advice(gain, loop),
     )
 
 
-def _advice(gain: Gain, parts: Parts) -> str:
+def _advice(gain: Gain, loop: CheckedLoop) -> str:
     """Return what else to know: of an inner loop, an edge or a leader that makes it faster.
 
     Any graph keeps it stable, and so the graph alone sets its rate.
     """
-    graph = parts.graph
+    graph = loop.parts.graph
     followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
     if gain.inner is None or followers > _ADVISED:
         return ""
     more = int(followers > 1), int(len(graph.edges) < pairs)
-    return speedup(parts.model, graph, gain, *more).sentence()
+    return speedup(loop.parts.model, graph, gain, *more).sentence()
 
 
 def _arguments(method: type[Method], scenario: Scenario) -> dict[str, Any]:

@@ -10,6 +10,9 @@ import numpy as np
 
 from echelon.core import numerics
 from echelon.core.provenance import versions
+from echelon.engine.laws import Laws
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
 from echelon.engine.simulate import simulate
 from echelon.gains.gain import synthesize
 from echelon.gains.riccati import Riccati
@@ -130,18 +133,16 @@ def _flatness() -> Check:
 def _closed_loop() -> Check:
     model, graph = Quadrotor.crazyflie(), Graph.path(3)
     formation = Formation.from_offsets(model, graph, {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)})
-    result = simulate(
+    follower = Consensus(synthesize(model, graph, Riccati()), feedforward="relay")
+    parts = Parts(
         model,
         graph,
         formation,
-        leader=Tracking(Lemniscate()),
-        follower=Consensus(synthesize(model, graph, Riccati()), feedforward="relay"),
+        Laws(Tracking(Lemniscate()), follower),
         initial={"position": 0.5, "attitude": 0.2},
-        horizon=30.0,
-        dt=0.01,
-        store_every=10,
     )
-    worst = metrics(result, 2.0).worst_steady or float("inf")
+    settings = Settings(horizon=30.0, dt=0.01, store_every=10, steady_window=2.0)
+    worst = metrics(simulate(parts, settings)).worst_steady or float("inf")
     return Check(
         "two followers join a flying leader", worst < 1e-6, f"{worst:.1g} m off after 30 s"
     )

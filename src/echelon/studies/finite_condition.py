@@ -16,6 +16,7 @@ from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
 from echelon.core.words import Verdict
+from echelon.engine.drive import Drive
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
@@ -44,7 +45,7 @@ class FiniteCondition(NamedTuple):
 
 
 def finite_condition(
-    P: Array, model: ControlAffine, formation: Formation, law: Law | None = None
+    P: Array, model: ControlAffine, formation: Formation, law: Law | Drive | None = None
 ) -> FiniteCondition:
     """Say whether P meets the finite condition at a formation's goals, the leaders' included.
 
@@ -55,7 +56,7 @@ def finite_condition(
         P: (n, n) symmetric.
         model: gives f, about the trim.
         formation: gives the goals.
-        law: the followers' law, whose inner loop (if it has one) belongs to the drift.
+        law: the followers' law, or what drives them; an inner loop belongs to the drift.
 
     Raises:
         GainError: P is not symmetric positive definite, or is made for another number of states.
@@ -78,7 +79,7 @@ def finite_condition(
     return FiniteCondition(Verdict.of(holds), largest, pair, least, len(some))
 
 
-def goal_drifts(model: ControlAffine, offsets: Array, law: Law | None = None) -> Array:
+def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:
     """Return the drift at the goals about the trim, (N, n), with the law's inner loop if any."""
     with precision("float64"):
         goals = jnp.asarray(np.asarray(model.trim[0], float) + offsets)
@@ -107,7 +108,7 @@ def _largest(P: Array, offsets: Array, drifts: Array) -> tuple[float, tuple[int,
 
 
 @eqx.filter_jit
-def _drifts(model: ControlAffine, law: Law | None, states: States) -> jax.Array:
+def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)
     return jax.vmap(lambda x: law.drift(model, x))(states)

@@ -69,7 +69,7 @@ def _decay_line(loop: CheckedLoop) -> Line:
 
 def _step_line(loop: CheckedLoop) -> Line:
     """Whether it still decays with the input held over the scenario's step."""
-    statement, dt = "step, input held", float(loop.parts.settings["dt"])
+    statement, dt = "step, input held", loop.settings.dt
     number = f"dt {dt:g} s"
     if not loop.every:
         return Line(statement, Verdict.NOT_NEEDED, _KIND, number, "there is nothing to lose")

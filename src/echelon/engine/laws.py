@@ -1,0 +1,133 @@
+"""Agents that are driven by laws: what each does is a function of what it knows."""
+
+from typing import Any, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.errors import ModelError, check_kind
+from echelon.core.types import Array, State
+from echelon.core.words import Feedforward
+from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
+from echelon.engine.loop import Loop, Moment, advance, assemble, begin
+from echelon.engine.settings import Settings
+from echelon.gains.gain import Gain
+from echelon.laws.law import Law, gain_of
+from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
+
+
+@final
+class Laws(Drive):
+    """One law for the leaders, and one for all others.
+
+    Args:
+        leader: law of the leaders.
+        follower: law of all others.
+    """
+
+    leader: Law
+    follower: Law
+
+    def __check_init__(self) -> None:
+        """Refuse what is no law."""
+        for place in ("leader", "follower"):
+            check_kind(place, getattr(self, place), Law)
+
+    @property
+    def information(self) -> Information:
+        """What the two laws must be sent by others."""
+        return Information(self.leader.information, self.follower.information)
+
+    @property
+    def gain(self) -> Gain | None:
+        """The gain of the followers' law, where it has one."""
+        return gain_of(self.follower)
+
+    @property
+    def feedforward(self) -> Feedforward:
+        """What the followers' law asks for."""
+        return self.follower.feedforward
+
+    @property
+    def reacts(self) -> bool:
+        """Whether the leaders' law is given a reaction."""
+        return getattr(self.leader, "reaction", None) is not None
+
+    @property
+    def trimmed(self) -> bool:
+        """Whether the followers' law applies the trim input."""
+        return getattr(self.follower, "trim", True)
+
+    def prepare(self, model: ControlAffine, graph: Graph) -> "Laws":
+        """Return both laws completed.
+
+        Raises:
+            LawError: one does not fit the model or the graph.
+        """
+        return Laws(self.leader.prepared(model, graph), self.follower.prepared(model, graph))
+
+    def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
+        """Return the warnings of both laws."""
+        return self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+
+    def start(self, model: ControlAffine) -> State:
+        """Return where the leaders' law begins."""
+        return self.leader.start(model)
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+        """Return what the leaders' law follows."""
+        return self.leader.reference_states(model, times)
+
+    def with_follower(self, law: Law) -> "Laws":
+        """Return the same law for the leaders, and another one for all others."""
+        return Laws(self.leader, law)
+
+    def metric(self, model: ControlAffine) -> Array | None:
+        """Return the metric of the followers' law."""
+        return self.follower.metric(model)
+
+    def drift(self, model: ControlAffine, x: State) -> State:
+        """Return the drift under the followers' law."""
+        return self.follower.drift(model, x)
+
+    def stepper(self, problem: Problem) -> Stepper:
+        """Return the stepper of the closed loop in JAX."""
+        return _LawStepper(assemble(problem, self.leader, self.follower), problem.states)
+
+
+@final
+class _LawStepper(Stepper):
+    """The closed loop of laws, traced by JAX: many steps a call."""
+
+    def __init__(self, loop: Loop, states: Array) -> None:
+        self.loop, self.states = loop, states
+
+    def start(self) -> Moment:
+        """Return the moment at which the run begins."""
+        return begin(self.loop, jnp.asarray(self.states))
+
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+        """Store frames and take steps; what happens on the way is seen afterwards.
+
+        Raises:
+            ModelError: a NumPy constant stands in the model or a law that JAX has seen in another
+                precision.
+        """
+        try:
+            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
+        except ValueError as error:
+            if "Cannot lower jaxpr" not in str(error):
+                raise
+            raise ModelError(
+                f"`{type(self.loop.model).__name__}` or a law uses a NumPy constant that JAX has "
+                "already seen in another precision; write it as Python numbers or as "
+                "`jnp.asarray(constant, x.dtype)`."
+            ) from error
+        return Chunk(now, *on_host((states, inputs, sums)))
+
+
+def on_host(tree: Any) -> Any:
+    """Return the same with every array in float64 NumPy."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)

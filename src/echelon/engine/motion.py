@@ -1,0 +1,56 @@
+"""How agents move: the plant under held inputs, its actuators, and what disturbs it."""
+
+from typing import Self, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from echelon.core.numerics import INTEGRATORS
+from echelon.core.types import Input, Inputs, State, States
+from echelon.engine.settings import Settings
+from echelon.models.model import ControlAffine
+from echelon.world.disturbance import Wind, disturbed
+from echelon.world.world import World
+
+
+@final
+class Motion(eqx.Module):
+    """The plant in its world, advanced a step at a time.
+
+    Attributes:
+        plant: what moves.
+        wind: what disturbs it, ready to be drawn; None where nothing does.
+        dt: step, s.
+        integrator: its name.
+        limits: whether the actuators' limits act.
+    """
+
+    plant: ControlAffine
+    wind: Wind | None
+    dt: float = eqx.field(static=True)
+    integrator: str = eqx.field(static=True)
+    limits: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, model: ControlAffine, world: World, settings: Settings) -> Self:
+        """Return the motion of agents in a world."""
+        plant, disturbance = world.moved(model), world.disturbance
+        wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
+        return cls(plant, wind, settings.dt, settings.integrator, settings.limits)
+
+    def deliver(self, inputs: Inputs) -> Inputs:
+        """Return what the actuators make of wanted physical inputs (N, m)."""
+        return jax.vmap(self.plant.limit)(inputs) if self.limits else inputs
+
+    def advance(self, states: States, inputs: Inputs, step: jax.Array) -> States:
+        """Return the states (N, n) one dt later.
+
+        The delivered inputs (N, m) are held over it, and so is the disturbance of this step.
+        """
+        integrate = INTEGRATORS[self.integrator]
+
+        def one(x: State, u: Input, agent: jax.Array) -> State:
+            return integrate(disturbed(self.plant, self.wind, step, agent), x, u, self.dt)
+
+        return jax.vmap(one)(states, inputs, jnp.arange(len(states)))

@@ -1,0 +1,84 @@
+"""How a run is computed."""
+
+import math
+from typing import NamedTuple
+
+from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.numerics import INTEGRATORS, Precision
+
+
+class Settings(NamedTuple):
+    """How a run is computed.
+
+    Attributes:
+        horizon: length of the run, s; rounded to whole steps.
+        dt: step, s.
+        integrator: `rk4`, `euler` or `printed`; the input is held over a step.
+        limits: whether the actuators' limits act.
+        store_every: steps between stored frames; the last state is always stored. Means are over
+            all steps, whatever is stored.
+        seed: of the random starts, and of the disturbance unless it has its own.
+        precision: `float64` or `float32`, whatever the flags of JAX are.
+        steady_window: the last part of the run that counts as steady, s; a fifth when left out.
+    """
+
+    horizon: float
+    dt: float
+    integrator: str = "rk4"
+    limits: bool = True
+    store_every: int = 1
+    seed: int = 0
+    precision: Precision = "float64"
+    steady_window: float | None = None
+
+    @property
+    def steps(self) -> int:
+        """The number of steps."""
+        return max(1, round(self.horizon / self.dt))
+
+    @property
+    def window(self) -> float:
+        """The last part of the run that counts as steady, s."""
+        return self.horizon / 5.0 if self.steady_window is None else self.steady_window
+
+    @property
+    def first_steady(self) -> int:
+        """The first step that begins in the steady window."""
+        # A step that rounding has left just before the window belongs to it.
+        return max(0, math.ceil(self.steps - self.window / self.dt - 1e-6))
+
+    def check(self) -> None:
+        """Check every number.
+
+        Raises:
+            SimulationError: one is out of range.
+        """
+        for name in ("horizon", "dt"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise SimulationError(
+                    f"`{name}` is {value}, and must be a positive finite number of seconds."
+                )
+        if self.horizon < self.dt:
+            raise SimulationError(
+                f"`horizon` is {self.horizon} s, and must be at least one step `dt` = {self.dt} s."
+            )
+        for name, allowed in (
+            ("integrator", tuple(INTEGRATORS)),
+            ("precision", ("float64", "float32")),
+        ):
+            _check_name(name, getattr(self, name), allowed)
+        for name, least, words in (
+            ("seed", 0, "a whole number from 0 on"),
+            ("store_every", 1, "at least 1"),
+        ):
+            value = getattr(self, name)
+            if value != int(value) or value < least:
+                raise SimulationError(f"`{name}` is {value}, and must be {words}.")
+
+
+def _check_name(what: str, name: str, allowed: tuple[str, ...]) -> None:
+    if name not in allowed:
+        raise SimulationError(
+            f"`{what}` is `{name}`, allowed are {listing(allowed)}{did_you_mean(name, allowed)}."
+        )

@@ -1,0 +1,191 @@
+"""What the means of a run are made of: sums over all its steps, whatever frames are stored.
+
+A mean over stored frames would depend on how many are stored, and its first frame would weigh as
+much as all the steps after it.
+"""
+
+from typing import Any, NamedTuple, TypeAlias, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.types import Array, Inputs, States
+from echelon.engine.settings import Settings
+from echelon.models.model import ControlAffine
+from echelon.network.formation import Formation
+from echelon.network.graph import Graph
+
+Total: TypeAlias = Any
+"""JAX within a chunk, float64 NumPy on the host: chunks of a float32 run are added without loss."""
+
+SETTLED = 0.01
+"""A follower has settled when its error stays below this: 1 cm for a position."""
+
+
+class Sums(NamedTuple):
+    """Sums over K steps, each of the moment at which a step begins.
+
+    Pairs are of all steps and of those in the steady window. N agents, L leaders, E edges, q
+    outputs.
+
+    Attributes:
+        steps: (2,) how many steps.
+        errors: (2, N) squared deviation from the goal relative to the leader.
+        tracking: (2, L) squared deviation of the leaders from their reference; 0 without one.
+        outputs: (L, q) the same for each output.
+        effort: (N,) squared normalized input about the trim.
+        spacing: (E,) squared error of the distance between neighbours.
+        limited: (N,) how many times a limit changed the input.
+        unsettled: (N,) the last step at which the error was not below `SETTLED`; -1 without any.
+    """
+
+    steps: Total
+    errors: Total
+    tracking: Total
+    outputs: Total
+    effort: Total
+    spacing: Total
+    limited: Total
+    unsettled: Total
+
+    def plus(self, more: "Sums") -> "Sums":
+        """Return the sums of two stretches of a run."""
+        total = Sums(*(a + b for a, b in zip(self, more, strict=True)))
+        # Both NumPy on the host and JAX within a chunk come here.
+        last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
+        return total._replace(unsettled=last)
+
+
+@final
+class Meter(eqx.Module):
+    """What is measured at the beginning of each step, on the model and never on the plant."""
+
+    model: ControlAffine
+    offsets: Array
+    nearest: Array
+    leaders: Array
+    edges: Array
+    spacings: Array
+    normalizer: Array
+    first_steady: Array
+    measured: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls, model: ControlAffine, graph: Graph, formation: Formation, settings: Settings
+    ) -> "Meter":
+        """Return the meter of a run."""
+        measured = measured_states(model)
+        i, j = graph.edges.T
+        goals = formation.offsets[:, list(measured)]
+        return cls(
+            model=model,
+            offsets=np.asarray(formation.offsets),
+            nearest=np.array(graph.nearest_leader()),
+            leaders=np.array(graph.leaders),
+            edges=graph.edges,
+            spacings=np.linalg.norm(goals[i] - goals[j], axis=1),
+            normalizer=np.linalg.inv(np.asarray(model.input_scale, float)),
+            first_steady=np.asarray(settings.first_steady, np.int32),
+            measured=measured,
+        )
+
+    def nothing(self) -> Sums:
+        """Return the sums of no step."""
+        dtype = jnp.zeros(()).dtype
+        agents, leaders, q = len(self.offsets), len(self.leaders), len(self.model.output_names)
+        return Sums(
+            steps=jnp.zeros(2, jnp.int32),
+            errors=jnp.zeros((2, agents), dtype),
+            tracking=jnp.zeros((2, leaders), dtype),
+            outputs=jnp.zeros((leaders, q), dtype),
+            effort=jnp.zeros(agents, dtype),
+            spacing=jnp.zeros(len(self.edges), dtype),
+            limited=jnp.zeros(agents, jnp.int32),
+            unsettled=jnp.full(agents, -1, jnp.int32),
+        )
+
+    def read(
+        self,
+        step: jax.Array,
+        states: States,
+        inputs: Inputs,
+        limited: jax.Array,
+        reference: jax.Array | None,
+    ) -> Sums:
+        """Return the sums of one step.
+
+        Args:
+            step: its number.
+            states: (N, n) at its beginning.
+            inputs: (N, m) delivered over it.
+            limited: (N,) whose inputs a limit changed.
+            reference: (n,) what the leaders follow at its beginning, or None.
+        """
+        twice = jnp.stack([jnp.asarray(True), step >= jnp.asarray(self.first_steady)])
+        y = states - jnp.asarray(self.offsets, states.dtype)
+        squares = self._lengths(y - y[self.nearest])
+        tracking, outputs = self._tracking(y[self.leaders], reference)
+        v = self.normalize(inputs)
+        last = jnp.where(jnp.sqrt(squares) <= SETTLED, -1, step)
+        return Sums(
+            steps=twice.astype(jnp.int32),
+            errors=jnp.where(twice[:, None], squares, 0.0),
+            tracking=jnp.where(twice[:, None], tracking, 0.0),
+            outputs=outputs,
+            effort=jnp.sum(v * v, axis=1),
+            spacing=self._spacing(states),
+            limited=limited.astype(jnp.int32),
+            unsettled=last.astype(jnp.int32),
+        )
+
+    def _lengths(self, deviations: jax.Array) -> jax.Array:
+        """Return squared lengths (K,) of the measured part of deviations (K, n)."""
+        part = deviations[:, np.array(self.measured)]
+        return jnp.sum(part * part, axis=1)
+
+    def _tracking(
+        self, states: jax.Array, reference: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the squared deviations of the leaders (L,), and of each of their outputs (L, q).
+
+        `states` (L, n) are without the leaders' offsets.
+        """
+        if reference is None:
+            q = len(self.model.output_names)
+            return jnp.zeros(len(states), states.dtype), jnp.zeros((len(states), q), states.dtype)
+        offsets = jnp.asarray(self.offsets, states.dtype)[self.leaders]
+        wanted = reference[None] + offsets
+        away = jax.vmap(lambda x, r: output_error(self.model, x, r))(states + offsets, wanted)
+        return self._lengths(states - reference[None]), away * away
+
+    def normalize(self, inputs: Inputs) -> jax.Array:
+        """Return the normalized inputs (K, m) of physical ones."""
+        trim = jnp.asarray(np.asarray(self.model.trim[1], float), inputs.dtype)
+        return (inputs - trim[None]) @ jnp.asarray(self.normalizer, inputs.dtype).T
+
+    def _spacing(self, states: States) -> jax.Array:
+        """Return the squared errors of the distances along the edges, (E,)."""
+        i, j = self.edges.T
+        distance = jnp.sqrt(self._lengths(states[i] - states[j]))
+        return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
+
+
+def follow(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
+    """Return row k of a reference (S, n) in the precision of the states; None without one."""
+    return None if reference is None else jnp.asarray(reference, states.dtype)[k]
+
+
+def measured_states(model: ControlAffine) -> tuple[int, ...]:
+    """Return the indices of the states that errors are measured on: the position, else all."""
+    return model.position_indices() or tuple(range(len(model.state_names)))
+
+
+def output_error(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
+    """Return h(x) - h(wanted), (q,), of two states (n,).
+
+    The state's own difference, which may wind angles, decides how far apart the two outputs are.
+    """
+    return model.output(wanted + model.difference(x, wanted)) - model.output(wanted)
