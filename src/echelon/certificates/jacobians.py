@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Kind
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError
 from echelon.core.kept import kept
 from echelon.core.types import Array
+from echelon.core.words import Kind
 from echelon.enclosure.hull import Box, Hull, jacobian_hull
 from echelon.models.model import ControlAffine
 
@@ -24,8 +24,8 @@ _OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 class Jacobians(NamedTuple):
     """Matrices A with xdot = A x near each state of a domain.
 
-    `kind` says what they stand for: `vertices` of a polytope that holds every Jacobian, up to
-    `error` (n, n) entry by entry, or `samples` taken at random in the domain and at its corners.
+    `kind` says what they stand for: vertices of a polytope that holds every Jacobian, up to
+    `error` (n, n) entry by entry, or samples taken at random in the domain and at its corners.
     `why` says what kept samples from being vertices.
     """
 
@@ -71,11 +71,11 @@ def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians
     names = [*model.state_names, *model.input_names]
     try:
         hull = jacobian_hull(function, *_boxes(model, domain), names)
-    except GainError as error:
-        samples, why = _sampled(function, model, domain), str(error).rstrip(".")
-        return Jacobians(samples, np.zeros(samples.shape[1:]), "samples", why)
+    except GainError:
+        samples = _sample(function, model, domain)
+        return Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES)
     _check_bounded(model, domain, hull)
-    return Jacobians(hull.vertices, hull.error, "vertices")
+    return Jacobians(hull.vertices, hull.error, Kind.VERTICES)
 
 
 @kept
@@ -116,7 +116,7 @@ def _unbounded(model: ControlAffine, name: str) -> GainError:
     )
 
 
-def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
+def _sample(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
     """Return the matrices inside the domain and at its corners, all of them where they are few.
 
     Raises:

@@ -10,8 +10,8 @@ from echelon.cli import tables
 from echelon.cli.console import JsonOption, ScenarioArgument
 
 if TYPE_CHECKING:
-    from echelon.gains.gain import Gain
-    from echelon.scenario.build import Built
+    from echelon.engine.parts import Parts
+    from echelon.engine.settings import Settings
 
 
 def design(
@@ -35,27 +35,20 @@ def design(
 
     checked = load_scenario(scenario, set_ or [])
     from echelon.gains.file import save_gain
-    from echelon.scenario.build import build
-    from echelon.studies.design import because, designs, recommended
+    from echelon.studies.design import design as study
 
-    _known_method(method)
-    built = build(checked)
-    parts = built.parts
-    dt = checked.simulation.dt
-    tried = designs(checked, built, method)
-    best = recommended(tried, dt)
-    sentence = "No method gives a stable loop here."
+    found = study(checked, method)
+    sentence, best = found.because, found.recommended
     told: dict[str, Any] = {"recommended": None}
-    if best is not None and best.gain is not None:
-        sentence = because(best, tried, dt)
+    if best is not None and best.gain is not None and best.parts is not None:
         told = {"recommended": best.method, "because": sentence}
         if out is not None:
-            save_gain(best.gain, parts.model, parts.graph, out)
+            save_gain(best.gain, best.parts.model, best.parts.graph, out)
         if figures is not None:
-            radii = _design_figures(built, best.gain, figures, slice_)
+            radii = _draw(best.parts, found.settings, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             told["radii"] = radii
-    told["methods"] = [tables.design_row(each) for each in tried]
+    told["methods"] = [tables.design_row(each) for each in found.designs]
     if as_json:
         print(json.dumps(told, indent=2))
     else:
@@ -63,25 +56,13 @@ def design(
     raise typer.Exit(0 if best is not None else 1)
 
 
-def _design_figures(built: "Built", gain: "Gain", folder: Path, asked: str | None) -> str | None:
+def _draw(parts: "Parts", settings: "Settings", folder: Path, asked: str | None) -> str | None:
     """Draw a design's figures, and return a sentence on its radii if it has any."""
     from echelon.core.errors import OutputError
     from echelon.plots.design import save_design_figures
-    from echelon.studies.design import with_gain
 
     try:
-        _, radii = save_design_figures(with_gain(built, gain), folder, asked)
+        _, radii = save_design_figures(parts, settings, folder, asked)
     except OSError as error:
         raise OutputError(f"`{folder}` cannot be written: {error.strerror or error}.") from error
     return None if radii is None else radii.sentence()
-
-
-def _known_method(method: str | None) -> None:
-    from echelon.core.errors import GainError, did_you_mean, listing
-    from echelon.scenario.registry import METHODS
-
-    if method is not None and method not in METHODS:
-        raise GainError(
-            f"`--method` is `{method}`, allowed are {listing(METHODS)}"
-            f"{did_you_mean(method, METHODS)}."
-        )

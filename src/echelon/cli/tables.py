@@ -32,30 +32,29 @@ def pairs(facts: dict[str, str]) -> "Table":
 def design_row(design: "Design") -> dict[str, Any]:
     """Return what is told of a design; what does not exist is None."""
     row: dict[str, Any] = {"method": design.method, "reason": design.reason}
-    gain = design.gain
-    if gain is None:
+    gain, promise = design.gain, design.promise
+    if gain is None or promise is None:
         return {**row, "seconds": design.seconds}
     import numpy as np
 
-    certificate, region, found = gain.certificate, gain.certificate.region, design.certified
-    factors, delay = design.factors, design.delay
+    found, theorem, factors = promise.certified, promise.theorem, design.factors
     return {
         **row,
         "advice": design.advice,
         "coupling": gain.coupling,
-        "edge": certificate.edge,
-        "slowest_mode": certificate.abscissa,
+        "edge": promise.edge,
+        "slowest_mode": promise.loop.slowest,
         "fastest_mode": design.fastest,
         "longest_step": _finite(design.step),
         "condition": float(np.linalg.cond(gain.P)),
         "gain_margin": None if factors is None else [_finite(factor) for factor in factors],
-        "delay_margin": _finite(delay),
-        "region_rate": None if region is None else region.rate,
-        "region_kind": None if region is None else region.kind,
-        "theorem": None if region is None else region.theorem,
+        "delay_margin": _finite(design.delay),
+        "promised": promise.promised,
+        "rate": promise.rate,
+        "kind": str(promise.kind) if promise.promised else None,
+        "theorem": None if theorem is None else str(theorem),
         "radius": None if found is None else _finite(found.radius),
-        "radius_kind": None if found is None else found.kind,
-        "radius_limit": None if found is None else found.why,
+        "promise": promise.as_mapping(),
         "seconds": design.seconds,
     }
 
@@ -75,8 +74,8 @@ _COLUMNS = {
     "condition": "cond(P)",
     "gain_margin": "gain\nmargin",
     "delay_margin": "delay\nmargin, s",
-    "region_rate": "rate on\ndomain, 1/s",
-    "region_kind": "kind",
+    "rate": "promised,\n1/s",
+    "kind": "by",
     "theorem": "theorem",
     "radius": "certified\nradius (2)",
     "seconds": "seconds",

@@ -17,6 +17,10 @@ class Linearization(NamedTuple):
     A: Array
     B: Array
 
+    def closed(self, K: Array | None) -> "Linearization":
+        """Return the same with an inner loop v = -K (x - x*) closed, K (m, n); None is none."""
+        return self if K is None else Linearization(self.A - self.B @ K, self.B)
+
 
 def linearize(model: ControlAffine) -> Linearization:
     """Return A = d(f + g u*)/dx and B = g S at the trim."""

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.gains.gain import Gain
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
 from echelon.plots import style as draw
-from echelon.promises.certified_set import certified_at_rest
-from echelon.promises.closed_loop import CheckedLoop
+from echelon.promises.closed_loop import Loop
+from echelon.promises.promise import promise
 from echelon.studies.basin import (
     Radii,
     Slice,
@@ -18,8 +19,9 @@ from echelon.studies.basin import (
     converged,
     grid,
     observed_radius,
-    prepare_trial,
     side_of,
+    slice_of,
+    trial,
 )
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ _CERTIFIED, _OBSERVED = draw.COLOURS[2], draw.COLOURS[0]
 
 
 def save_design_figures(
-    loop: CheckedLoop, folder: Path, asked: str | None = None
+    parts: Parts, settings: Settings, folder: Path, asked: str | None = None
 ) -> tuple[list[Path], Radii | None]:
     """Write `modes` and `certified_set` of a gain as PNG and PDF; return paths and both radii.
 
@@ -42,22 +44,21 @@ def save_design_figures(
         GainError: the slice asked for is none of the model's.
         OSError: the folder or a file cannot be written.
     """
-    gain, parts = loop.gain, loop.parts
-    assert gain is not None
+    loop = promise(parts, settings).loop
     made, radii = {}, None
     sliced = asked is not None or len(parts.model.state_names) > 1
-    states = chosen_slice(parts.model, gain, asked) if sliced else None
+    states = chosen_slice(parts.model, asked) if sliced else None
     with draw.style():
         made["modes"] = _modes(loop)
         if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
-            made["certified_set"], radii = _certified_set(loop, gain, states)
+            made["certified_set"], radii = _certified_set(parts, settings, states)
     return draw.save(made, folder), radii
 
 
 # ---- modes ------------------------------------------------------------------------------------
 
 
-def _modes(loop: CheckedLoop) -> "Figure":
+def _modes(loop: Loop) -> "Figure":
     """Return the poles of every mode looked at in the complex plane, coloured by lambda."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -121,7 +122,7 @@ def _label_bar(bar: Any, values: Array) -> None:
 
 
 def _certified_set(
-    loop: CheckedLoop, gain: Gain, states: tuple[int, int]
+    parts: Parts, settings: Settings, states: tuple[int, int]
 ) -> "tuple[Figure, Radii]":
     """Return starts of a slice by whether they converge, with the certified ellipse over them.
 
@@ -129,9 +130,9 @@ def _certified_set(
     """
     from matplotlib.figure import Figure
 
-    parts = loop.parts
-    run, plane = prepare_trial(parts, loop.settings, gain, states)
-    certified, observed = certified_at_rest(loop), observed_radius(run, plane)
+    run, plane = trial(parts, settings), slice_of(parts, states)
+    found = promise(run.parts, settings).certified
+    certified, observed = None if found is None else found.radius, observed_radius(run, plane)
     named = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(named, certified, observed, plane.largest, run.horizon)
     wide = np.minimum(plane.reach, plane.extents(1.8 * max(observed, 1e-2 * plane.largest)))
@@ -159,7 +160,7 @@ def _starts(ax: Any, run: Trial, plane: Slice, half: Array) -> None:
     """Colour a grid of starts by whether they converge."""
     from matplotlib.colors import ListedColormap
 
-    side = side_of(len(run.laplacian))
+    side = side_of(run.followers)
     x, y = grid(plane, half, side)
     starts = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
     held = converged(run, plane, starts).reshape(side, side)

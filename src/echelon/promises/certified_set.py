@@ -11,7 +11,7 @@ from echelon.core.words import Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.promises.leaders import Leaders, excursion, own_paths
-from echelon.promises.statement import Hypothesis, Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement
 
 
 class CertifiedSet(NamedTuple):
@@ -37,15 +37,15 @@ def certified_set(
     g varies, what cannot rise is V = delta'(L kron P) delta, which costs the factor
     lambda_min / lambda_max.
     """
-    if region is None or Theorem.named(region.theorem) is Theorem.T2:
+    if region is None or region.theorem is Theorem.T2:
         return None
-    kind, free = Kind.named(region.kind), Theorem.named(region.theorem) is Theorem.A5
+    kind, free = region.kind, region.theorem is Theorem.A5
     if free and not leaders.rest and not _constant(parts, region):
         text = "g varies, and a leader that moves then adds to V; needs a constant g"
         return CertifiedSet(0.0, kind, text)
     trim = np.asarray(parts.model.trim[0], float)
     if leaders.rest and (leaders.starts == trim).all():
-        return certified_at_rest(parts, region)
+        return _less(parts, region, kind, np.zeros(len(trim)))
     if leaders.answer:
         text = "the leader reacts, so its excursion is not its own; `reacts: false`"
         return CertifiedSet(0.0, kind, text)
@@ -55,29 +55,21 @@ def certified_set(
     return _less(parts, region, Kind.SAMPLES, excursion(parts, paths))
 
 
-def certified_at_rest(parts: Parts, region: RegionCertificate) -> CertifiedSet:
-    """Return the certified set for a leader that rests at the trim."""
-    nowhere = np.zeros(len(parts.model.state_names))
-    return _less(parts, region, Kind.named(region.kind), nowhere)
-
-
 def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> CertifiedSet:
     """Return the set that is left when the leader goes so far from the trim, (n,)."""
     gain, model, margins = parts.drive.gain, parts.model, region.domain.margins()
     assert gain is not None
     radii = np.maximum(margins - away, 0.0) / np.sqrt(np.diag(np.linalg.inv(gain.P)))
     if not np.isfinite(radii).any():
-        return CertifiedSet(
-            np.inf, Kind.named(region.kind), "everywhere: the domain bounds no state"
-        )
+        return CertifiedSet(np.inf, region.kind, "everywhere: the domain bounds no state")
     j = int(np.argmin(radii))
     name, wide = model.state_names[j], margins[j]
     if radii[j] == 0.0:
         text = f"the leader alone reaches {away[j]:.3g} in `{name}`, and the domain {wide:.3g}"
         return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
     shrink = 1.0
-    if Theorem.named(region.theorem) is Theorem.A5 and not _constant(parts, region):
-        shrink = np.sqrt(np.divide(*parts.graph.grounded_spectrum()[[0, -1]]))
+    if region.theorem is Theorem.A5 and not _constant(parts, region):
+        shrink = np.sqrt(parts.graph.spectrum().low / parts.graph.spectrum().high)
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
     text += f" less {away[j]:.3g} of the leader" if away.any() else ", leader at the trim"
     return CertifiedSet(float(shrink * radii[j]), kind, text)
@@ -101,16 +93,16 @@ def set_lines(
 ) -> list[Statement]:
     """Return the set as a line, and whether the starts (N, n) lie in it."""
     if found is None:
-        local = region is not None and Theorem.named(region.theorem) is Theorem.T2
+        local = region is not None and region.theorem is Theorem.T2
         text = "T2 is local and certifies no set" if local else "needs a region"
         return [
             Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
             for name in (Hypothesis.SET, Hypothesis.STARTS)
         ]
     size, radius, text, remedy = size_of(parts, states), found.radius, "", ""
-    shown, holds = f"radius {radius:.3g}" if radius else "empty", verdict_of(radius > 0.0)
+    shown, holds = f"radius {radius:.3g}" if radius else "empty", Verdict.of(radius > 0.0)
     line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why)
-    text, holds = "from there no follower leaves the domain", verdict_of(size <= radius)
+    text, holds = "from there no follower leaves the domain", Verdict.of(size <= radius)
     if not size <= radius:
         text, remedy = "what the set promises does not reach them", "start nearer to the goals"
     shown = f"{size:.3g} of {radius:.3g}"

@@ -3,11 +3,11 @@
 import numpy as np
 
 from echelon.certificates.certificate import RegionCertificate
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.promises.closed_loop import Loop, grounded_slowest
-from echelon.promises.statement import Hypothesis, Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement
 
 _SAME = 1e-6
 """Relative; less than that is rounding, or another library's eigenvalues."""
@@ -27,14 +27,14 @@ def claims_line(parts: Parts, loop: Loop, found: RegionCertificate | None) -> St
         text = "there is no gain"
         return Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, Kind.LINEARIZATION, text=text)
     text = _difference(parts, gain, loop, found)
-    verdict, remedy = verdict_of(not text), "what is promised here is computed anew" if text else ""
+    verdict, remedy = Verdict.of(not text), "what is promised here is computed anew" if text else ""
     text = text or "they are of this model, graph and coupling"
     return Statement(Hypothesis.CLAIMS, verdict, Kind.LINEARIZATION, text=text, remedy=remedy)
 
 
 def _difference(parts: Parts, gain: Gain, loop: Loop, found: RegionCertificate | None) -> str:
     """Return the first difference in words; empty without any."""
-    claim, low = gain.certificate, float(parts.graph.grounded_spectrum()[0])
+    claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
         return (
             f"the gain was made for lambda_min {claim.lambda_min:.4g}, and this graph has {low:.4g}"
@@ -57,5 +57,5 @@ def _rate(region: RegionCertificate | None) -> str:
     """Return a promise on a domain in words, with the digits that are compared."""
     if region is None:
         return "nothing"
-    kind, theorem = Kind.named(region.kind), Theorem.named(region.theorem)
+    kind, theorem = region.kind, region.theorem
     return f"{region.rate:.5g} 1/s ({kind}, {theorem})"

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from echelon.certificates.certificate import Certificate, certify, parent_modes
+from echelon.certificates.certificate import Certificate, certify
 from echelon.certificates.lmi import rate_of
 from echelon.certificates.margins import ClosedLoop, slowest_between
 from echelon.core.linear import held_radius, longest_step
@@ -18,6 +18,7 @@ from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+from echelon.network.spectrum import Spectrum
 
 SHOWN = 32
 """Of more eigenvalues of the graph than these, so many stand for all in the margins."""
@@ -72,14 +73,16 @@ class Loop(NamedTuple):
         return Linearization(self.linear.A + self.linear.B @ self.inner, self.linear.B)
 
 
-class Spectrum(NamedTuple):
-    """Eigenvalues by which the disagreement splits, ascending: `total` of them, or the extremes.
+class Modes(NamedTuple):
+    """What the disagreement splits by.
 
-    `symmetric` tells whether they are of the grounded Laplacian, which is.
+    Attributes:
+        spectrum: the eigenvalues that the feed-forward leaves.
+        symmetric: whether they are of the grounded Laplacian, which is.
+        what: they are, in words.
     """
 
-    values: Array
-    total: int
+    spectrum: Spectrum
     symmetric: bool
     what: str = "eigenvalues"
 
@@ -88,25 +91,23 @@ def loop_of(parts: Parts) -> Loop:
     """Return the closed loop of prepared parts."""
     model, gain = parts.model, parts.drive.gain
     n, m = len(model.state_names), len(model.input_names)
-    A, B = linearize(model)
-    P, R, c, inner = parts.drive.metric(model), np.eye(m), 1.0, np.zeros((m, n))
+    P, R, c, inner = parts.drive.metric(model), np.eye(m), 1.0, None
     P = np.eye(n) if P is None else P
     if gain is not None:
-        R, c = gain.R, gain.coupling
-        inner = inner if gain.inner is None else gain.inner
-    linear, modes = Linearization(A - B @ inner, B), spectrum(parts)
-    edge = None if gain is None else _edge(gain, linear, float(modes.values[0]))
-    certificate = certify(linear, parts.graph, P, R, c, edge, modes=modes.values)
+        R, c, inner = gain.R, gain.coupling, gain.inner
+    linear, modes = linearize(model).closed(inner), modes_of(parts)
+    edge = None if gain is None else _edge(gain, linear, modes.spectrum.low)
+    certificate = certify(linear, modes.spectrum, P, R, c, edge)
     values, where = _representatives(modes)
-    closed = ClosedLoop(*linear, P, R, c, values)
-    slowest = certificate.abscissa
-    if len(modes.values) < modes.total:
+    closed, slowest = ClosedLoop(*linear, P, R, c, values), certificate.abscissa
+    if certificate.modes < modes.spectrum.total:
         slowest = max(slowest, slowest_between(closed))
+    inner = np.zeros((m, n)) if inner is None else inner
     return Loop(linear, inner, closed, where, modes.symmetric, slowest < 0.0, slowest, certificate)
 
 
-def spectrum(parts: Parts) -> Spectrum:
-    """Return the eigenvalues that the feed-forward leaves the disagreement.
+def modes_of(parts: Parts) -> Modes:
+    """Return what the disagreement of prepared parts splits by.
 
     Where the leaders obey the followers' law, nobody is grounded: the disagreement obeys the
     Laplacian of all agents, whose eigenvalues but 0 lie above the least of the grounded one and,
@@ -114,17 +115,15 @@ def spectrum(parts: Parts) -> Spectrum:
     """
     graph = parts.graph
     if parts.drive.feedforward is Feedforward.PARENT:
-        weights = parent_modes(graph)
-        return Spectrum(weights, len(weights), False, "edges' weights")
-    grounded = graph.grounded_spectrum()
+        return Modes(graph.parent_spectrum(), False, "edges' weights")
     if not all_alike(parts.drive, parts.model):
-        return Spectrum(grounded, len(graph.followers), True)
+        return Modes(graph.spectrum(), True)
     if graph.agents <= _DENSE:
         whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
-        return Spectrum(whole, len(whole), False)
+        return Modes(Spectrum(whole, len(whole)), False)
     degrees = graph.laplacian().diagonal()
-    top = float(degrees[graph.edges].sum(axis=1).max())
-    return Spectrum(np.array([grounded[0], top]), graph.agents - 1, False)
+    ends = np.array([graph.spectrum().low, degrees[graph.edges].sum(axis=1).max()])
+    return Modes(Spectrum(ends, graph.agents - 1), False)
 
 
 def all_alike(drive: Drive, model: ControlAffine) -> bool:
@@ -151,16 +150,16 @@ def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
 
 def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:
     """Return the slowest mode, 1/s, as a gain's own certificate has it."""
-    return certify(linear, graph, gain.P, gain.R, gain.coupling, None).abscissa
+    return certify(linear, graph.spectrum(), gain.P, gain.R, gain.coupling, None).abscissa
 
 
-def _representatives(modes: Spectrum) -> tuple[Array, str]:
+def _representatives(modes: Modes) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
-    values, total, _, what = modes
+    (values, total), _, what = modes
     if len(values) < total:
         between = np.geomspace(values[0], values[-1], SHOWN)
         return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
-    if len(values) <= SHOWN:
+    if total <= SHOWN:
         return values, f"all {what} of the graph"
-    places = np.linspace(0, len(values) - 1, SHOWN).round().astype(int)
+    places = np.linspace(0, total - 1, SHOWN).round().astype(int)
     return values[places], f"{SHOWN} of {total} {what}, the extreme ones among them"

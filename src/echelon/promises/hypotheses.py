@@ -25,7 +25,7 @@ from echelon.models.check import trim_shortfall
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.leaders import Leaders, apart
-from echelon.promises.statement import Hypothesis, Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement
 
 _LINEAR = Kind.LINEARIZATION
 
@@ -92,7 +92,7 @@ def _trim_applied(case: Case) -> Statement:
     if not applied:
         text, remedy = "the law leaves out the trim input", "set `follower.trim: true`"
         reason = "the law leaves out the trim input"
-    verdict, shown = verdict_of(applied), f"|f + g u*| {size:.2g}"
+    verdict, shown = Verdict.of(applied), f"|f + g u*| {size:.2g}"
     return Statement(name, verdict, Kind.PROOF, size, shown, text, remedy, reason)
 
 
@@ -139,7 +139,7 @@ def _exact(case: Case) -> Statement:
     text = "states are known exactly, and nothing disturbs the agents"
     if case.disturbed:
         text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
-    verdict = verdict_of(not case.disturbed)
+    verdict = Verdict.of(not case.disturbed)
     return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text)
 
 
@@ -191,7 +191,7 @@ def _symmetric(case: Case) -> Statement:
         agent, why = next(iter(broken.items()))
         text, remedy = f"agent {agent}: {why}", "offset only states that f and g ignore"
         reason = "an offset is no symmetry of the dynamics"
-    verdict, count = verdict_of(not broken), len(broken)
+    verdict, count = Verdict.of(not broken), len(broken)
     name, shown = Hypothesis.SYMMETRY, f"{count} broken"
     return Statement(name, verdict, Kind.SAMPLES, count, shown, text, remedy, reason)
 
@@ -211,7 +211,7 @@ def _detectable(case: Case) -> Statement:
     if hidden:
         text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} "
         text, remedy = f"{text}it does not decay by itself", "choose another P"
-    verdict = verdict_of(not hidden)
+    verdict = Verdict.of(not hidden)
     return Statement(name, verdict, _LINEAR, rank, f"rank {rank} of {n}", text, remedy)
 
 
@@ -230,7 +230,7 @@ def _matched(case: Case) -> Statement:
         if leaders.answer and case.governed:
             text = reason = "the leader answers to followers that do not know its input, and "
             text = reason = f"{text}nothing is known of that loop"
-    verdict = verdict_of(case.matched)
+    verdict = Verdict.of(case.matched)
     return Statement(name, verdict, Kind.PROOF, None, "", text, remedy, reason)
 
 
@@ -247,7 +247,7 @@ def _coupled(case: Case) -> Statement:
     if not fine:
         text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
         remedy = f"raise `coupling` to {edge:.4g} or more"
-    return Statement(Hypothesis.COUPLED, verdict_of(fine), Kind.PROOF, c, shown, text, remedy)
+    return Statement(Hypothesis.COUPLED, Verdict.of(fine), Kind.PROOF, c, shown, text, remedy)
 
 
 def _decaying(case: Case) -> Statement:
@@ -267,7 +267,7 @@ def _decaying(case: Case) -> Statement:
     if not loop.every:
         remedy = "raise `coupling`, or use `riccati` or `inner-loop`"
         reason = "the disagreement does not decay"
-    verdict, shown = verdict_of(loop.every), f"{loop.slowest:.3g} 1/s"
+    verdict, shown = Verdict.of(loop.every), f"{loop.slowest:.3g} 1/s"
     return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)
 
 
@@ -290,5 +290,5 @@ def _held(case: Case) -> Statement:
             remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
         text = f"the step `dt` = {settings.dt:g} s is too long for this gain: {text}"
         reason = "with the input held over the step `dt` it grows"
-    verdict = verdict_of(radius < 1.0)
+    verdict = Verdict.of(radius < 1.0)
     return Statement(name, verdict, _LINEAR, float(radius), shown, text, remedy, reason)

@@ -67,13 +67,13 @@ class Promise:
     def theorem(self) -> Theorem | None:
         """The theorem behind the promise; None where it is the linearization alone, or nothing."""
         region = self.region if self.promised else None
-        return None if region is None else Theorem.named(region.theorem)
+        return None if region is None else region.theorem
 
     @property
     def kind(self) -> Kind:
         """The kind of argument behind the promise."""
         region = self.region if self.promised else None
-        return Kind.LINEARIZATION if region is None else Kind.named(region.kind)
+        return Kind.LINEARIZATION if region is None else region.kind
 
     @property
     def rate(self) -> float | None:
@@ -122,7 +122,7 @@ class Promise:
 
     def _regional(self, region: RegionCertificate) -> str:
         """Return what the region adds, as strong as its own argument and no stronger."""
-        found, condition, theorem = self.certified, self.condition, Theorem.named(region.theorem)
+        found, condition, theorem = self.certified, self.condition, region.theorem
         by, what = self.kind.value, f"errors shrink at {region.rate:.3g} 1/s or faster"
         what = "V does not rise" if theorem is Theorem.A5 else what
         if found is None:

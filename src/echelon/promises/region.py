@@ -17,7 +17,7 @@ from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.promises.leaders import Leaders
-from echelon.promises.statement import Hypothesis, Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement
 
 _NAME = Hypothesis.REGION
 
@@ -59,18 +59,18 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
 
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
     """Return what the metric promises on the claim's domain behind a relayed input."""
-    model, graph, exact = parts.model, parts.graph, Kind.named(claim.kind) is Kind.PROOF
-    if Theorem.named(claim.theorem) is Theorem.A5:
+    model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
+    if claim.theorem is Theorem.A5:
         found = jacobians(model, claim.domain)
-        monotone = falls(gain.P, found.matrices)
-        return drift_region(model, claim.domain, found, gain.P, graph) if monotone else None
-    found, *_ = pairs_on(model, claim.domain, gain.R)
-    B, strength = linearize(model).B, _strength(parts, gain)
-    return contracting_region(claim.domain, found, gain.P, B, gain.R, strength, exact)
+        if not falls(gain.P, found.matrices):
+            return None
+        return drift_region(model, claim.domain, found, gain.P, gain.coupling, spectrum)
+    pairs, B = pairs_on(model, claim.domain, gain.R), linearize(model).B
+    return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
-    return 2.0 * gain.coupling * float(parts.graph.grounded_spectrum()[0])
+    return 2.0 * gain.coupling * parts.graph.spectrum().low
 
 
 def _withheld(
@@ -86,7 +86,7 @@ def _withheld(
     if feedforward is Feedforward.NONE and not leaders.rest:
         text = f"{theorem} needs the leader's input at every follower, or at rest at its trim"
         return text, "set `feedforward: relay`"
-    if feedforward is Feedforward.RELAY_VELOCITY and Theorem.named(theorem) is Theorem.T2:
+    if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2:
         text = "T2 is of the leader's raw input; what each agent makes of its velocity turns with g"
         return f"{text}, and is not enclosed", "set `feedforward: relay`"
     if not leaders.agree:
@@ -99,8 +99,8 @@ def _lost(text: str, remedy: str) -> Statement:
 
 
 def _line(parts: Parts, found: RegionCertificate) -> Statement:
-    theorem, kind = Theorem.named(found.theorem), Kind.named(found.kind)
+    theorem, kind = found.theorem, found.kind
     text = f"{theorem}: {theorem.value} {found.domain.in_words(parts.model)}"
     text += f"; no more than {kind}, since {found.why}" if found.why else ""
     shown = f"{found.rate:.3g} 1/s"
-    return Statement(_NAME, verdict_of(True), kind, found.rate, shown, text)
+    return Statement(_NAME, Verdict.of(True), kind, found.rate, shown, text)

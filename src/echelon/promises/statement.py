@@ -74,8 +74,3 @@ class Statement(NamedTuple):
             "text": self.text,
             "remedy": self.remedy,
         }
-
-
-def verdict_of(holds: bool) -> Verdict:
-    """Return the verdict on what either holds or fails."""
-    return Verdict.HOLDS if holds else Verdict.FAILS

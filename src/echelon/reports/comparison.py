@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from echelon.core.errors import Outcome
 from echelon.engine.work import SolverStats
+from echelon.promises.promise import Promise
 from echelon.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.reports.run import say
 from echelon.studies.compare import Comparison, Row
@@ -97,7 +98,10 @@ def _costs_table(comparison: Comparison) -> "Table":
     """Return what each method asks for, a row a method."""
     table = _table(
         "what it takes",
-        ["effort", "limited,\n% steps", "least\ndistance", "computing,\nms per agent s", "told"],
+        [
+            *("effort", "limited,\n% steps", "least\ndistance", "computing,\nms per agent s"),
+            *("promised,\n1/s", "told"),
+        ],
     )
     table.columns[-1].justify = "left"
     table.columns[-1].no_wrap = False
@@ -111,6 +115,7 @@ def _costs_table(comparison: Comparison) -> "Table":
             f"{100.0 * row.numbers.saturation_fraction:.3g}",
             _number(row.numbers.minimum_distance),
             f"{1e3 * row.flight.computing:.3g}",
+            _promised(row.flight.promise),
             ", ".join(row.flight.told) or "nothing",
         )
     return table
@@ -127,6 +132,14 @@ def _table(title: str, columns: Sequence[str]) -> "Table":
     for column in columns:
         table.add_column(column, justify="right", overflow="fold")
     return table
+
+
+def _promised(promise: Promise) -> str:
+    """Return the rate that is promised, with its theorem if there is one."""
+    if promise.rate is None:
+        return "nothing"
+    by = "" if promise.theorem is None else f" ({promise.kind}, {promise.theorem})"
+    return f"{promise.rate:.3g}{by}"
 
 
 def _number(value: float | None) -> str:
@@ -163,19 +176,31 @@ def verdict(comparison: Comparison) -> tuple[str, ...]:
     """Return who wins where, a sentence each, from the numbers alone."""
     flown = [row for row in comparison.rows if row.flight is not None and row.numbers is not None]
     stayed = [row for row in flown if row.converged]
+    some = 0 < len(stayed) < len(flown)
     return tuple(
         sentence
         for sentence in (
             _lost(flown, stayed),
-            _closest(stayed or flown),
+            _of_those(some, _closest(stayed or flown)),
             _best(stayed, "settles first", lambda row: row.settled, "s"),
             _best(flown, "has the smallest error over the whole run", lambda row: row.whole, "m"),
             _leader(flown),
-            _best(stayed, "asks the least of the inputs", lambda row: row.effort, ""),
-            _cheapest(stayed),
+            _of_those(some, _best(stayed, "asks the least of the inputs", _effort, "")),
+            _of_those(some, _cheapest(stayed)),
         )
         if sentence
     )
+
+
+def _of_those(some: bool, sentence: str) -> str:
+    """Say of a sentence on those that settle that it is, where others do not."""
+    if not some or not sentence:
+        return sentence
+    return f"Of those that settle, {sentence.replace('All ', 'all ', 1)}"
+
+
+def _effort(row: Row) -> float | None:
+    return row.effort
 
 
 def _lost(flown: Sequence[Row], stayed: Sequence[Row]) -> str:
@@ -273,6 +298,7 @@ def _row_mapping(row: Row) -> dict[str, Any]:
         "saturation_fraction": numbers.saturation_fraction,
         "minimum_distance": numbers.minimum_distance,
         "computing_s_per_agent_s": row.flight.computing,
+        "promise": row.flight.promise.as_mapping(),
         "told": list(row.flight.told),
         "solver": None if row.flight.solver is None else row.flight.solver._asdict(),
     }

@@ -99,7 +99,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
     """Return the run's summary, ready for JSON; what does not exist is None."""
     numbers = metrics(result) if numbers is None else numbers
     gain = result.drive.gain
-    eigenvalues = result.graph.grounded_spectrum()
+    spectrum = result.graph.spectrum()
     return {
         "scenario": result.provenance.get("scenario", ""),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
@@ -123,8 +123,8 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
             "R": gain.R.tolist(),
         },
         "promise": promise(result.parts, result.settings).as_mapping(),
-        "lambda_min": float(eigenvalues[0]),
-        "lambda_max": float(eigenvalues[-1]),
+        "lambda_min": spectrum.low,
+        "lambda_max": spectrum.high,
         "minimum_distance": numbers.minimum_distance,
         "saturation_fraction": numbers.saturation_fraction,
         "steady_window_s": numbers.steady_window,

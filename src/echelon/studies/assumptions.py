@@ -13,7 +13,7 @@ from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
 from echelon.promises.hypotheses import goal_drifts
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Hypothesis, Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement
 from echelon.studies.finite_condition import finite_condition
 
 ZERO = 1e-9
@@ -22,8 +22,8 @@ _HOLDS, _PROOF = Verdict.HOLDS, Kind.PROOF
 
 def graph_lines(parts: Parts) -> Iterator[Statement]:
     """Yield what the paper asks of agents and graph: Assumptions 1, 2 and 6, Lemmas 1 to 3."""
-    graph, spectrum = parts.graph, parts.graph.grounded_spectrum()
-    low, high = float(spectrum[0]), float(spectrum[-1])
+    graph = parts.graph
+    low, high = graph.spectrum().low, graph.spectrum().high
     text = "f and g depend on x alone"
     yield Statement("Assumption 1, autonomous", _HOLDS, _PROOF, text=text)
     unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
@@ -48,7 +48,7 @@ def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     yield monotone
     both = not (promise.hypotheses[Hypothesis.SYMMETRY].fails or monotone.fails)
     text = "needs Assumption 5 and symmetric offsets"
-    yield Statement("Lemma 4, drift along z", verdict_of(both), Kind.LINEARIZATION, text=text)
+    yield Statement("Lemma 4, drift along z", Verdict.of(both), Kind.LINEARIZATION, text=text)
     largest = _printed_lmi(parts, promise)
     shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
     text, remedy = f"{text}block is zero", "use the finite condition"
@@ -65,7 +65,7 @@ def _leader_line(promise: Promise) -> Statement:
     if not slow < -ZERO:
         text, remedy = "the tracking error is not damped at the trim", "give `leader.gain` another "
         remedy += "method"
-    verdict, shown = verdict_of(slow < -ZERO), f"{slow:.3g} 1/s"
+    verdict, shown = Verdict.of(slow < -ZERO), f"{slow:.3g} 1/s"
     return Statement(name, verdict, Kind.LINEARIZATION, slow, shown, text, remedy)
 
 
@@ -84,7 +84,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     elif not holds:
         text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
         remedy += "without"
-    name, verdict, shown = "Assumption 5, P-monotone drift", verdict_of(holds), f"{worst:.3g}"
+    name, verdict, shown = "Assumption 5, P-monotone drift", Verdict.of(holds), f"{worst:.3g}"
     return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
 
 

@@ -3,23 +3,24 @@
 Nothing here is proved. It stands beside the certified set to show how far that falls short.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import GainError, did_you_mean, listing
-from echelon.core.numerics import precision, rk4
-from echelon.core.types import Array, Input, State
+from echelon.core.numerics import precision
+from echelon.core.types import Array
+from echelon.engine.laws import Laws
+from echelon.engine.loop import Loop, assemble, final_states
 from echelon.engine.parts import Parts
+from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
-from echelon.gains.gain import Gain
-from echelon.laws.consensus import feedback
+from echelon.laws.trim_input import TrimInput
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
+from echelon.network.formation import Formation
+from echelon.promises.promise import promise
 
 SIDE = 41
 _AGENTS = 6000  # followers of all starts together; a slice of larger graphs is coarser
@@ -63,30 +64,41 @@ class Trial(NamedTuple):
     `fallen` of what they were: half as fast, in the logarithm, as the slowest mode falls.
     """
 
-    model: ControlAffine
-    gain: Gain
-    laplacian: Array
+    parts: Parts
+    loop: Loop
     dt: float
     steps: int
     fallen: float
-    limits: bool
 
     @property
     def horizon(self) -> float:
         """How long each start is run, s."""
         return self.steps * self.dt
 
+    @property
+    def followers(self) -> int:
+        """How many followers start off their goals."""
+        return len(self.parts.graph.followers)
 
-def trial(model: ControlAffine, graph: Graph, gain: Gain, dt: float, limits: bool) -> Trial:
+
+def trial(parts: Parts, settings: Settings) -> Trial:
     """Return the closed loop of a stable gain, run for six times its slowest time constant."""
-    slow = -gain.certificate.abscissa
+    model, graph, dt = parts.model, parts.graph, settings.dt
+    assert isinstance(parts.drive, Laws)
+    rest = np.tile(np.asarray(model.trim[0], float), (graph.agents, 1))
+    laws = Laws(TrimInput(), parts.drive.follower)
+    alone = Parts(model, graph, Formation(np.zeros_like(rest)), laws, initial=rest)
+    prepared = prepare(alone, settings)
+    loop = assemble(prepared.problem, laws.leader, laws.follower)
+    slow = -promise(parts, settings).loop.slowest
     steps = int(np.clip(np.ceil(6.0 / (slow * dt)), 1, _STEPS))
-    L = graph.grounded_laplacian().toarray()
-    return Trial(model, gain, L, dt, steps, float(np.exp(-0.5 * slow * steps * dt)), limits)
+    return Trial(prepared.parts, loop, dt, steps, float(np.exp(-0.5 * slow * steps * dt)))
 
 
-def slice_of(model: ControlAffine, gain: Gain, followers: int, states: tuple[int, int]) -> Slice:
-    """Return the slice through the goals in two states."""
+def slice_of(parts: Parts, states: tuple[int, int]) -> Slice:
+    """Return the slice through the goals in two states, in the metric of the gain."""
+    model, gain, followers = parts.model, parts.drive.gain, len(parts.graph.followers)
+    assert gain is not None
     trim, reach = np.asarray(model.trim[0], float), []
     for k in states:
         angle = model.state_units[k] == "rad"
@@ -107,7 +119,7 @@ def observed_radius(run: Trial, plane: Slice) -> float:
     The starts lie within reach on ellipses s'form s = r^2, each a fixed factor larger than the one
     before, over three decades up to the largest that the slice allows.
     """
-    side = side_of(len(run.laplacian))
+    side = side_of(run.followers)
     radii = np.geomspace(1e-3 * plane.largest, plane.largest, side)
     rings = np.stack([plane.ellipse(r, side) for r in radii])
     tried = np.all(np.abs(rings) <= plane.reach, axis=2)
@@ -124,51 +136,22 @@ def grid(plane: Slice, half: Array, side: int) -> tuple[Array, Array]:
 
 def converged(run: Trial, plane: Slice, starts: Array) -> Array:
     """Return for deviations (S, 2) in a slice whether the followers converge, (S,) of bool."""
-    n = len(run.model.state_names)
-    deviations = np.zeros((len(starts), n))
-    deviations[:, plane.states] = starts
-    lean: Any = eqx.tree_at(
-        lambda gain: (gain.coupling, gain.certificate),
-        run.gain,
-        (np.asarray(run.gain.coupling), None),
-    )
-    with precision("float64"):
-        ratio = _ratio(run.model, lean, run.laplacian, deviations, run.dt, run.steps, run.limits)
+    model, graph, gain = run.parts.model, run.parts.graph, run.parts.drive.gain
+    assert gain is not None
+    trim, shape = np.asarray(model.trim[0], float), (len(starts), graph.agents)
+    deviations = np.zeros((*shape, len(trim)))
+    # Two advanced indices and a slice between would put the slice last.
+    for place, k in enumerate(plane.states):
+        deviations[:, list(graph.followers), k] = starts[:, place, None]
+
+    def size(y: Array) -> Array:
+        return np.sqrt(np.einsum("sfi,ij,sfj->s", y, gain.P, y))
+
+    with precision("float64"), np.errstate(invalid="ignore", over="ignore"):
+        ends = np.asarray(final_states(run.loop, jnp.asarray(trim + deviations), run.steps))
         # A start on the goal stays there, and what is not finite has not converged.
-        return np.asarray(ratio <= run.fallen) | ~deviations.any(axis=1)
-
-
-@eqx.filter_jit
-def _ratio(
-    model: ControlAffine,
-    gain: Gain,
-    laplacian: Array,
-    deviations: Array,
-    dt: float,
-    steps: int,
-    limits: bool,
-) -> jax.Array:
-    """Return the size of the errors at the end over that at the start, in the metric of P, (S,)."""
-    trim = jnp.asarray(np.asarray(model.trim[0], float))
-    L, P = jnp.asarray(laplacian), jnp.asarray(gain.P)
-
-    def control(x: State, z: State) -> Input:
-        v = gain.inner_loop(model, x) - feedback(gain, model, x, z)
-        u = model.physical(v)
-        return model.limit(u) if limits else u
-
-    def step(_: jax.Array, x: jax.Array) -> jax.Array:
-        z = jnp.einsum("fg,sgn->sfn", L, x - trim[None, None])
-        u = jax.vmap(jax.vmap(control))(x, z)
-        move = jax.vmap(jax.vmap(lambda x, u: rk4(model.velocity, x, u, dt)))
-        return move(x, u)
-
-    def size(x: jax.Array) -> jax.Array:
-        y = x - trim[None, None]
-        return jnp.sqrt(jnp.einsum("sfi,ij,sfj->s", y, P, y))
-
-    start = trim[None, None] + jnp.repeat(jnp.asarray(deviations)[:, None], len(laplacian), axis=1)
-    return size(jax.lax.fori_loop(0, steps, step, start)) / size(start)
+        fallen = size(ends - trim) <= run.fallen * size(deviations)
+        return fallen | ~starts.any(axis=1)
 
 
 class Radii(NamedTuple):
@@ -198,7 +181,7 @@ class Radii(NamedTuple):
         )
 
 
-def chosen_slice(model: ControlAffine, gain: Gain, asked: str | None) -> tuple[int, int]:
+def chosen_slice(model: ControlAffine, asked: str | None) -> tuple[int, int]:
     """Return the two states of a slice: those asked for, as `y,roll`, or a telling pair.
 
     That is a velocity with the angle that drives it; where there is none, the first two coordinates
@@ -221,10 +204,10 @@ def chosen_slice(model: ControlAffine, gain: Gain, asked: str | None) -> tuple[i
         return names.index(parts[0]), names.index(parts[1])
     if len(names) < 2:
         raise GainError(f"a slice needs two states, and `{type(model).__name__}` has one.")
-    return _telling(model, gain)
+    return _telling(model)
 
 
-def _telling(model: ControlAffine, gain: Gain) -> tuple[int, int]:
+def _telling(model: ControlAffine) -> tuple[int, int]:
     """Return a pair of states in which the loop is seen to work."""
     groups = model.state_groups
     if "velocity" in groups and "attitude" in groups:
@@ -235,11 +218,3 @@ def _telling(model: ControlAffine, gain: Gain) -> tuple[int, int]:
         return moved[row], turned[column]
     places = model.position_indices()
     return (places[0], places[1]) if len(places) > 1 else (0, 1)
-
-
-def prepare_trial(
-    parts: Parts, settings: Settings, gain: Gain, states: tuple[int, int]
-) -> tuple[Trial, Slice]:
-    """Return the loop that starts of a slice are run in, and the slice."""
-    run = trial(parts.model, parts.graph, gain, settings.dt, settings.limits)
-    return run, slice_of(parts.model, gain, len(parts.graph.followers), states)

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 from echelon.core.errors import EchelonError, LawError, did_you_mean, listing
@@ -22,7 +23,9 @@ from echelon.gains.inner_loop import InnerLoop
 from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import Consensus
 from echelon.optimal.drives import Plans, RecedingHorizon
+from echelon.promises.promise import Promise, promise
 from echelon.results.metrics import Metrics, metrics
+from echelon.scenario import registry
 from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
 
@@ -34,12 +37,14 @@ class Flight(NamedTuple):
 
     Attributes:
         result: the run.
+        promise: of what flew.
         told: what each agent must be told by others, in words.
         computing: seconds of computing for one agent and one second of flight, compilation apart.
         solver: what solving took; None for a law.
     """
 
     result: Result
+    promise: Promise
     told: tuple[str, ...]
     computing: float
     solver: SolverStats | None
@@ -106,6 +111,8 @@ class Comparison(NamedTuple):
     conditions: tuple[str, ...]
 
 
+_LAWS = registry.FOLLOWER_LAWS
+
 DriveOf = Callable[[Parts], Drive]
 """What drives the agents of a scenario under a method."""
 
@@ -139,19 +146,22 @@ def compare(
         only: the labels of the methods to fly.
         began: called with each method's label before it flies.
 
-    A method that does not apply, or whose solver is missing, is a row with its reason. Where the
-    scenario's own law is none of the methods, it flies too, under the name of its gain.
+    A method that does not apply, or whose solver is missing, is a row with its reason. Where all
+    fly, the scenario's own drive does: as one of them if it is the same, or else as one more.
 
     Raises:
         ScenarioError: a part cannot be made.
     """
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
-    drives = {label: _DRIVES[label] for label in only} | (_own(parts) if only == LABELS else {})
     rows = []
-    for label, drive in drives.items():
+    for label in only:
         began(label)
-        rows.append(_row(label, drive, scene, settings))
+        rows.append(_row(label, _DRIVES[label], scene, settings))
+    own = _own_label(parts, rows) if only == LABELS else None
+    if own is not None:
+        began(own)
+        rows.append(_row(own, lambda parts: parts.drive, scene, settings))
     return Comparison(
         scenario.name, tuple(rows), settings.horizon, settings.window, _conditions(parts)
     )
@@ -185,7 +195,8 @@ def _fly(parts: Parts, settings: Settings) -> Flight:
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
-    return Flight(result, result.drive.information.follower, computing, result.work)
+    told, found = result.drive.information.follower, promise(result.parts, settings)
+    return Flight(result, found, told, computing, result.work)
 
 
 # ---- the methods --------------------------------------------------------------------------------
@@ -218,13 +229,23 @@ def _synthesized(method: Method) -> Callable[[Parts], Gain]:
     return lambda parts: synthesize(parts.model, parts.graph, method)
 
 
-def _own(parts: Parts) -> dict[str, DriveOf]:
-    """Return the scenario's own drive, where no method is that one."""
-    gain, feedforward = parts.drive.gain, parts.drive.feedforward
-    if gain is None or gain.method in ("riccati", "inner-loop", "given"):
-        return {}
-    label = gain.method if feedforward is Feedforward.NONE else f"{gain.method}-{feedforward}"
-    return {label: lambda parts: parts.drive}
+def _own_label(parts: Parts, rows: list[Row]) -> str | None:
+    """Return what to call the scenario's own drive; None where a row has flown it already."""
+    drive = parts.drive.prepare(parts.model, parts.graph)
+    flown = (row.flight.result.drive for row in rows if row.flight is not None)
+    if any(eqx.tree_equal(drive, each) for each in flown):
+        return None
+    gain, feedforward = drive.gain, drive.feedforward
+    name = _law_name(drive) if gain is None else gain.method
+    label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
+    return label if label not in LABELS else f"{label}, own"
+
+
+def _law_name(drive: Drive) -> str:
+    """Return a scenario's name of the followers' law, or that of the class that drives them."""
+    kind = type(getattr(drive, "follower", drive)).__name__
+    names = {entry.target.rpartition(":")[2]: name for name, entry in _LAWS.items()}
+    return names.get(kind, kind)
 
 
 def _riccati(parts: Parts) -> Gain:

@@ -6,24 +6,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.certificates import margins
-from echelon.core.errors import EchelonError
+from echelon.core.errors import EchelonError, GainError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.words import Theorem
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
-from echelon.gains.gain import Gain, synthesize
+from echelon.gains.gain import Gain, Method, synthesize
 from echelon.laws.consensus import Consensus
 from echelon.promises.promise import Promise, promise
 from echelon.promises.statement import Hypothesis
 from echelon.scenario import registry
 from echelon.scenario.build import Built, build, resolve
 from echelon.scenario.scenario import Scenario
+from echelon.scenario.sections import GainSpec
 from echelon.studies.speedup import speedup
 
-_NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
 _ADVISED = 100
-_RATE = 0.1
-"""Rate that `contraction` is asked for where the scenario names none, 1/s."""
+"""Followers of the largest swarm that is advised on its graph; of more it would take minutes."""
 
 
 class Design(NamedTuple):
@@ -32,7 +31,8 @@ class Design(NamedTuple):
     Attributes:
         method: its name.
         gain: None where there is none, and then `reason` says why.
-        promise: of the scenario with that gain.
+        parts: of the scenario with that gain.
+        promise: of these parts.
         reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
         step: the longest step (s) with inputs held with which every mode looked at decays.
@@ -44,6 +44,7 @@ class Design(NamedTuple):
 
     method: str
     gain: Gain | None
+    parts: Parts | None = None
     promise: Promise | None = None
     reason: str = ""
     fastest: float | None = None
@@ -69,7 +70,7 @@ class Design(NamedTuple):
         region, slowest = self.promise.region, self.promise.loop.slowest
         if region is None:
             return self.step > dt, 0, 0, -slowest
-        theorem = _RANK[Theorem.named(region.theorem)]
+        theorem = _RANK[region.theorem]
         return self.step > dt, region.kind.strength, theorem, region.rate
 
 
@@ -78,11 +79,15 @@ _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
 
 
 class Designs(NamedTuple):
-    """The methods that were tried, the one that is recommended if any, and why."""
+    """The methods that were tried, the one that is recommended if any, and why.
+
+    `settings` are those that all were tried under.
+    """
 
     designs: tuple[Design, ...]
     recommended: Design | None
     because: str
+    settings: Settings
 
 
 def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
@@ -97,13 +102,28 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
         EchelonError: a part is malformed or does not fit the others. A method that does not apply
             is a design with its reason.
     """
+    if method is not None and method not in registry.METHODS:
+        raise GainError(
+            f"`method` is `{method}`, allowed are {listing(registry.METHODS)}"
+            f"{did_you_mean(method, registry.METHODS)}."
+        )
     spec = scenario.follower.gain if isinstance(scenario, Scenario) else None
     built = build(scenario) if isinstance(scenario, Scenario) else Built(*scenario)
-    names = [method] if method else [name for name in registry.METHODS if name != "given"]
-    tried = tuple(_tried(name, _options(name, spec, built.parts), built) for name in names)
-    best = recommended(tried, built.settings.dt)
-    why = "No method gives a stable loop here."
-    return Designs(tried, best, why if best is None else because(best, tried, built.settings.dt))
+    names = registry.METHODS if method is None else [method]
+    methods = [resolve(registry.METHODS[name]) for name in names]
+    tried = tuple(
+        _tried(each, _arguments(each, spec, built.parts), built)
+        for each in methods
+        if method is not None or _chooses(each)
+    )
+    best, dt = recommended(tried, built.settings.dt), built.settings.dt
+    why = "No method gives a stable loop here." if best is None else because(best, tried, dt)
+    return Designs(tried, best, why, built.settings)
+
+
+def _chooses(method: type[Method]) -> bool:
+    """Whether a method finds a gain by itself: one that wants a P, say, is no choice of design."""
+    return {*method.needs} <= {"domain", *method.usual}
 
 
 def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
@@ -153,20 +173,22 @@ def _why(best: Design, others: list[Design], rivals: list[Design], dt: float) ->
     )
 
 
-def _tried(name: str, options: dict[str, Any], built: Built) -> Design:
+def _tried(method: type[Method], arguments: dict[str, Any], built: Built) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
-    if name in _NEEDS_DOMAIN and "domain" not in options:
-        return Design(name, None, reason="give `follower.gain.domain` to try it")
-    began, (parts, settings) = time.perf_counter(), built
+    name, (parts, settings) = method.name, built
+    missing = [f"`follower.gain.{key}`" for key in method.needs if key not in arguments]
+    if missing:
+        return Design(name, None, reason=f"give {' and '.join(missing)} to try it")
+    began = time.perf_counter()
     try:
-        gain = synthesize(parts.model, parts.graph, resolve(registry.METHODS[name])(**options))
+        gain = synthesize(parts.model, parts.graph, method(**arguments))
     except EchelonError as error:
         return Design(name, None, reason=str(error), seconds=time.perf_counter() - began)
     seconds = time.perf_counter() - began
     parts = with_gain(parts, gain)
     found = promise(parts, settings)
     with precision("float64"):
-        return _known(name, parts, settings, found)._replace(seconds=seconds)
+        return _known(gain, parts, settings, found)._replace(seconds=seconds)
 
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
@@ -175,45 +197,42 @@ def with_gain(parts: Parts, gain: Gain) -> Parts:
     return parts.replace(drive=parts.drive.with_follower(law))
 
 
-def _known(name: str, parts: Parts, settings: Settings, found: Promise) -> Design:
+def _known(gain: Gain, parts: Parts, settings: Settings, found: Promise) -> Design:
     """Return what is known of a gain."""
     loop = found.loop
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
-    known = Design(name, parts.drive.gain, found, fastest=float(np.abs(poles).max()))
+    known = Design(gain.method, gain, parts, found, fastest=float(np.abs(poles).max()))
     if not loop.every:
         return known
     return known._replace(
         step=loop.longest_step(settings),
         factors=margins.gain_margin(closed),
         delay=margins.delay_margin(closed).delay,
-        advice=_advice(name, parts),
+        advice=_advice(gain, parts),
     )
 
 
-def _advice(name: str, parts: Parts) -> str:
-    """Return what else to know: for `inner-loop`, an edge or a leader that makes it faster.
+def _advice(gain: Gain, parts: Parts) -> str:
+    """Return what else to know: of an inner loop, an edge or a leader that makes it faster.
 
-    Any graph keeps it stable, and so the graph alone sets its rate. A swarm would take minutes.
+    Any graph keeps it stable, and so the graph alone sets its rate.
     """
-    graph, gain = parts.graph, parts.drive.gain
-    followers, free = len(graph.followers), graph.agents * (graph.agents - 1) // 2
-    if name != "inner-loop" or gain is None or followers > _ADVISED:
+    graph = parts.graph
+    followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
+    if gain.inner is None or followers > _ADVISED:
         return ""
-    more = int(followers > 1), int(len(graph.edges) < free)
+    more = int(followers > 1), int(len(graph.edges) < pairs)
     return speedup(parts.model, graph, gain, *more).sentence()
 
 
-def _options(name: str, spec: Any, parts: Parts) -> dict[str, Any]:
+def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
     """Return what the scenario says of this method, and its domain for those that need one."""
+    if spec is not None and spec.method == method.name and spec.file is None:
+        return {**method.usual, **spec.arguments}
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region
-    given = {} if spec is None else {k: v for k, v in spec.model_dump().items() if v is not None}
-    own = given.pop("method", None) == name and "file" not in given
-    domain = given.get("domain", None if claim is None else claim.domain)
-    given = given if own else {}
-    if name in _NEEDS_DOMAIN and domain is not None:
-        given["domain"] = domain
-    if name == "contraction":
-        given.setdefault("rate", _RATE)
-    return given
+    domain = claim.domain if spec is None and claim is not None else None
+    domain = spec.domain if spec is not None else domain
+    given = {} if domain is None or "domain" not in method.needs else {"domain": domain}
+    return {**method.usual, **given}

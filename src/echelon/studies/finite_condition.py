@@ -17,7 +17,6 @@ from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.promises.hypotheses import goal_drifts
-from echelon.promises.statement import verdict_of
 
 _ZERO = 1e-9  # what rounding makes of f at goals that are symmetric
 _MOST = 1000  # agents that are compared pair by pair; of more, so many spread over all
@@ -74,7 +73,7 @@ def finite_condition(
     largest, (i, j) = _largest(P, offsets[some], drifts[some])
     holds = largest <= _ZERO * size * float(np.abs(P).max()) and least >= 1.0 - _ZERO
     pair = (int(some[i]), int(some[j]))
-    return FiniteCondition(verdict_of(holds), largest, pair, least, len(some))
+    return FiniteCondition(Verdict.of(holds), largest, pair, least, len(some))
 
 
 def pair_values(P: Array, d: Array, f: Array) -> Array:

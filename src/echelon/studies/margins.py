@@ -15,7 +15,7 @@ from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Hypothesis, Statement, verdict_of
+from echelon.promises.statement import Hypothesis, Statement
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 
@@ -49,7 +49,7 @@ def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
         f"{worst:.3g} 1/s",
     )
     remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
-    return Statement("input scaling", verdict_of(worst < 0.0), _KIND, worst, shown, text, remedy)
+    return Statement("input scaling", Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
 
 
 class _Push(NamedTuple):
