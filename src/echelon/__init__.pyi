@@ -43,6 +43,8 @@ from .network.formation import Formation as Formation
 from .network.graph import Graph as Graph
 from .plots.run import figures as figures
 from .plots.run import save_figures as save_figures
+from .promises.promise import Promise as Promise
+from .promises.promise import promise as promise
 from .references.reference import Reference as Reference
 from .reports.comparison import comparison_report as comparison_report
 from .reports.run import report as report
@@ -71,7 +73,9 @@ from .scenario.scenario import (
 from .scenario.scenario import (
     scenario_from_mapping as scenario_from_mapping,
 )
+from .studies.check import check as check
 from .studies.compare import compare as compare
+from .studies.design import design as design
 from .studies.finite_condition import finite_condition as finite_condition
 from .studies.speedup import speedup as speedup
 from .verifier.verify import verify as verify
