@@ -4,11 +4,11 @@ import dataclasses
 import json
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from echelon.studies.region import killing_residual
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,8 +16,9 @@ import echelon as ech
 from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
 from echelon.core.words import Kind, Theorem, Verdict
-from echelon.studies.check import check
+from echelon.promises.statement import Hypothesis
 from echelon.studies.finite_condition import pair_values
+from echelon.studies.killing import killing_residual
 
 PATH = ech.Graph.path(4)
 LOW, _, HIGH = PATH.spectrum().eigenvalues
@@ -57,8 +58,7 @@ def scenario(follower, **sections):
 
 
 def checked(follower, **sections):
-    found = check(ech.build(scenario(follower, **sections)))
-    return {line.statement: line for line in found.lines}, found
+    return lines_of(ech.build(scenario(follower, **sections)))
 
 
 ROBUST = {"gain": {"method": "robust-lqr", "domain": {"angle": 0.5}}}
@@ -66,26 +66,31 @@ ROBUST = {"gain": {"method": "robust-lqr", "domain": {"angle": 0.5}}}
 
 @pytest.fixture(scope="module")
 def robust():
-    """The parts of a pendulum with a region, its leader at rest."""
+    """The parts of a pendulum with a region, its leader at rest, and their settings."""
     return ech.build(scenario(ROBUST))
 
 
-def lines_of(parts):
-    found = check(parts)
-    return {line.statement: line for line in found.lines}, found
+def lines_of(built):
+    found = ech.check(*built)
+    return {line.name: line for line in found.lines}, found.promise
 
 
-def with_region(parts, **changes):
-    """Parts whose gain carries another region."""
-    gain = parts.drive.follower.gain
+def with_gain(built, gain, **changes):
+    """The same under another gain, perhaps with another model."""
+    parts = built.parts
+    follower = dataclasses.replace(parts.drive.follower, gain=gain)
+    drive = dataclasses.replace(parts.drive, follower=follower)
+    return built._replace(parts=parts.replace(drive=drive, **changes))
+
+
+def with_claim(built, **changes):
+    """The same under a gain that says something else of its region."""
+    gain = built.parts.drive.gain
     region = dataclasses.replace(gain.certificate.region, **changes)
     certificate = dataclasses.replace(gain.certificate, region=region)
-    other = ech.Gain(gain.P, gain.R, gain.coupling, gain.method, certificate)
-    return parts._replace(follower=dataclasses.replace(parts.drive.follower, gain=other))
-
-
-def number(line):
-    return float(line.number.split()[1])
+    return with_gain(
+        built, ech.Gain(gain.P, gain.R, gain.coupling, gain.method, certificate, gain.inner)
+    )
 
 
 # ---- the finite condition ----
@@ -159,18 +164,20 @@ def test_a_p_of_another_size_or_sign_is_refused():
 
 def test_the_region_is_told_and_the_promise_says_it(robust):
     lines, found = lines_of(robust)
-    region = robust.follower.gain.certificate.region
+    region = robust.parts.drive.gain.certificate.region
     assert lines["region of the gain"].verdict is Verdict.HOLDS
     assert lines["region of the gain"].kind is region.kind is Kind.VERTICES
-    assert lines["region of the gain"].number == f"{region.rate:.3g} 1/s"
-    assert found.promised and "corners of a hull" in found.promise
-    assert f"{region.rate:.3g} 1/s or faster" in found.promise and "(T1)" in found.promise
-    assert f"<= {region.radius:.3g}^2" in found.promise
+    assert lines["region of the gain"].number == region.rate
+    assert lines["region of the gain"].shown == f"{region.rate:.3g} 1/s"
+    assert found.promised and "corners of a hull" in found.sentence()
+    assert f"{region.rate:.3g} 1/s or faster" in found.sentence() and "(T1)" in found.sentence()
+    assert f"<= {region.radius:.3g}^2" in found.sentence()
+    assert (found.theorem, found.kind, found.rate) == (Theorem.T1, Kind.VERTICES, region.rate)
 
 
 def test_no_point_of_the_certified_set_leaves_the_domain(robust):
     lines, _ = lines_of(robust)
-    radius, P = number(lines["certified set"]), robust.follower.gain.P
+    radius, P = lines["certified set"].number, robust.parts.drive.gain.P
     angles = np.linspace(0.0, 2.0 * np.pi, 4001)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
     edge = radius * np.linalg.solve(np.linalg.cholesky(P).T, circle.T)
@@ -180,7 +187,7 @@ def test_no_point_of_the_certified_set_leaves_the_domain(robust):
 def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
     error = {"angle": 0.1, "rate": 0.3}
     lines, found = checked(ROBUST, leader={"law": "passive", "start_error": error})
-    model = robust.model
+    model = robust.parts.model
     solved = scipy.integrate.solve_ivp(
         lambda t, x: np.asarray(model.drift(jnp.asarray(x))),
         (0.0, 2.0),
@@ -191,50 +198,89 @@ def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
     reach = np.abs(solved.y[0]).max()
     assert 0.1 < reach < 0.5
     alone, _ = lines_of(robust)
-    share = number(lines["certified set"]) / number(alone["certified set"])
+    share = lines["certified set"].number / alone["certified set"].number
     assert share == pytest.approx((0.5 - reach) / 0.5, rel=2e-2)
     assert lines["certified set"].kind is Kind.SAMPLES
-    assert "as in a run of its own" in found.promise
+    assert "as in a run of its own" in found.sentence()
 
 
 def test_a_leader_that_leaves_the_domain_leaves_no_set():
     lines, found = checked(ROBUST, leader={"law": "passive", "start_error": {"angle": 0.6}})
     line = lines["certified set"]
-    assert (line.verdict, line.number) == (Verdict.FAILS, "empty")
+    assert (line.verdict, line.shown, line.number) == (Verdict.FAILS, "empty", 0.0)
     assert "the leader alone reaches 0.6 in `angle`, and the domain 0.5" in line.text
-    assert "no start is certified" in found.promise
+    assert "no start is certified" in found.sentence()
+
+
+class Yielding(ech.models.Pendulum):
+    """A pendulum whose weight gives way, by a function that has no enclosure."""
+
+    def drift(self, x):
+        return jnp.stack([x[1], -jax.scipy.special.erf(x[0]) - self.damping * x[1]])
 
 
 @pytest.mark.parametrize(
-    ("changes", "told", "untold"),
+    ("model", "method", "told", "untold"),
     [
-        ({"kind": Kind.PROOF}, "Proved in exact arithmetic", "samples"),
-        ({"kind": Kind.SAMPLES}, "Seen at samples, which is no proof", "Proved"),
-        ({"theorem": Theorem.T2}, "small errors shrink", "from any start"),
-        ({"rate": 0.0}, "no region is proved", "errors shrink"),
-        ({"theorem": Theorem.A5, "rate": 0.0}, "V does not rise", "errors shrink"),
+        (ech.models.Pendulum(), ech.gains.RobustLQR({"angle": 0.5}, exact=True), "Proved", "seen"),
+        (ech.models.Pendulum(), ech.gains.RobustLQR({"angle": 0.5}), "corners of a hull", "Proved"),
+        (Yielding(), ech.gains.RobustLQR({"angle": 0.5}), "Seen at samples, which is no", "Proved"),
+        (Weakening(), ech.gains.RobustLQR({"angle": 0.2}), "small errors shrink", "any start"),
+        (ech.models.Pendulum(), ech.gains.Riccati(), "no region is proved", "errors shrink"),
+        (ech.models.Pendulum(), ech.gains.Monotone({"angle": 0.5}), "V does not rise", "shrink"),
     ],
 )
-def test_the_promise_is_as_strong_as_its_argument(robust, changes, told, untold):
-    _, found = lines_of(with_region(robust, **changes))
-    assert found.promised and told in found.promise and untold not in found.promise
+def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, untold):
+    built = with_gain(robust, ech.synthesize(model, PATH, method), model=model)
+    found = ech.promise(*built)
+    assert found.promised and told in found.sentence() and untold not in found.sentence()
+    assert not found.hypotheses[Hypothesis.CLAIMS].fails
+
+
+def test_why_a_proof_became_samples_is_said(robust):
+    model, wanted = Yielding(), "no more than samples, since "
+    gain = ech.synthesize(model, PATH, ech.gains.RobustLQR({"angle": 0.5}, exact=True))
+    lines, _ = lines_of(with_gain(robust, gain, model=model))
+    assert wanted in lines["region of the gain"].text
+    assert "erf" in lines["region of the gain"].text.partition(wanted)[2]
+    assert "erf" in gain.certificate.region.why
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rate": 5.0},
+        {"kind": Kind.SAMPLES},
+        {"theorem": Theorem.T2},
+        {"hull": np.array([[[-9.0, 0.0], [0.0, -9.0]]]), "rate": 9.0},
+    ],
+)
+def test_what_a_gain_says_of_itself_is_not_believed_but_compared(robust, changes):
+    true, found = (ech.promise(*each) for each in (robust, with_claim(robust, **changes)))
+    assert (found.theorem, found.kind, found.rate) == (true.theorem, true.kind, true.rate)
+    told = [key for key in changes if key != "hull"]
+    assert found.hypotheses[Hypothesis.CLAIMS].fails is bool(told)
+    assert "Note: the gain says" in found.sentence() and "Note" not in true.sentence()
 
 
 def test_where_only_the_drift_is_known_the_set_pays_for_the_graph_if_g_varies(robust):
-    whole, _ = lines_of(robust)
-    radius = number(whole["certified set"])
-    drift, _ = lines_of(with_region(robust, theorem=Theorem.A5, rate=0.0))
-    assert number(drift["certified set"]) == radius
-    varying = with_region(robust, theorem=Theorem.A5, rate=0.0)._replace(model=Weakening())
-    drift, _ = lines_of(varying)
-    assert number(drift["certified set"]) == pytest.approx(radius * np.sqrt(LOW / HIGH), rel=5e-3)
+    radii = {}
+    for model in (ech.models.Pendulum(), Weakening()):
+        gain = ech.synthesize(model, PATH, ech.gains.Monotone({"angle": 0.5}))
+        lines, _ = lines_of(with_gain(robust, gain, model=model))
+        radii[type(model)] = lines["certified set"].number
+        W = np.linalg.inv(gain.P)
+        whole = 0.5 / np.sqrt(W[0, 0])
+        assert gain.certificate.region.radius == pytest.approx(radii[type(model)])
+    assert radii[ech.models.Pendulum] == pytest.approx(whole)
+    assert radii[Weakening] == pytest.approx(whole * np.sqrt(LOW / HIGH), rel=5e-3)
 
 
 def test_a_linear_agent_is_certified_everywhere():
     model = {"name": "linear", "parameters": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}
     gain = {"method": "contraction", "domain": {}, "rate": 0.2}
     lines, found = checked({"gain": gain}, model=model)
-    assert lines["certified set"].number == "radius inf" and "from everywhere" in found.promise
+    assert lines["certified set"].shown == "radius inf" and "from everywhere" in found.sentence()
 
 
 # ---- what g does ----
@@ -299,7 +345,7 @@ def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
     assert lines["step, input held"].verdict is verdict
     assert found.promised is (verdict is Verdict.HOLDS)
     if not found.promised:
-        assert "with the input held over the step `dt` it grows" in found.promise
+        assert "with the input held over the step `dt` it grows" in found.sentence()
 
 
 # ---- who is promised nothing ----
@@ -308,7 +354,7 @@ def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
 def test_followers_that_ignore_each_other_are_promised_nothing():
     _, found = checked({"law": "passive"})
     assert not found.promised
-    assert found.promise == (
+    assert found.sentence() == (
         "Nothing is promised: the followers' law does not act on the disagreement."
     )
 
@@ -318,7 +364,7 @@ def test_a_law_without_its_trim_input_is_promised_nothing():
     quadrotor = {"model": {"name": "planar-quadrotor"}, "simulation": step}
     lines, found = checked({"trim": False}, **quadrotor)
     assert lines["Definition 1, f(0) = 0"].verdict is Verdict.FAILS and not found.promised
-    assert "leaves out the trim input" in found.promise
+    assert "leaves out the trim input" in found.sentence()
     lines, found = checked({}, **quadrotor)
     assert lines["Definition 1, f(0) = 0"].verdict is Verdict.HOLDS and found.promised
 
@@ -328,16 +374,16 @@ def test_wind_and_another_plant_are_left_out_of_the_promise_and_said_to_be():
     plant = {"plant": {"scale": {"damping": 1.1}}}
     lines, calm = checked({})
     assert lines["Assumption 3, exact states"].verdict is Verdict.HOLDS
-    assert "without" not in calm.promise
+    assert "without" not in calm.sentence()
     for sections, told in ((wind, "wind or noise acts"), (plant, "differ from the model")):
         lines, found = checked({}, **sections)
         assert lines["Assumption 3, exact states"].verdict is Verdict.FAILS
-        assert found.promised and told in found.promise
+        assert found.promised and told in found.sentence()
 
 
 def test_every_failure_says_what_to_change():
     for name in ("paper-literal", "paper"):
-        found = check(ech.build(ech.load_scenario(name)))
+        found = ech.check(*ech.build(ech.load_scenario(name)))
         for line in found.lines:
             assert line.statement
             assert isinstance(line.kind, Kind) and isinstance(line.verdict, Verdict)
@@ -361,15 +407,16 @@ def test_a_pushed_integrator_lags_by_its_slowest_mode():
     gain = {"method": "given", "P": "identity", "coupling": 3.0}
     lines, _ = checked({"gain": gain}, model={"name": "single-integrator"})
     for statement in ("disturbance, network", "disturbance, one mode"):
-        values = [float(part.split()[1]) for part in lines[statement].number.split(", ")]
+        values = [float(part.split()[1]) for part in lines[statement].shown.split(", ")]
         assert values == pytest.approx([1.0 / (3.0 * LOW)] * len(values), rel=5e-3)
+        assert lines[statement].number == pytest.approx(1.0 / (3.0 * LOW), rel=1e-6)
 
 
 def test_a_chain_of_integrators_passes_on_what_it_gets():
     gain = {"method": "given", "P": "identity", "coupling": 2.0}
     model = {"name": "single-integrator"}
     lines, _ = checked({"gain": gain}, model=model)
-    assert lines["string gain"].number == "1, 1 over 3 links"
+    assert lines["string gain"].shown == "1, 1 over 3 links"
     assert lines["string gain"].verdict is Verdict.NOT_NEEDED
     lines, _ = checked({"gain": gain}, model=model, graph={"name": "ring", "agents": 4})
     assert "string gain" not in lines
@@ -381,10 +428,10 @@ def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
     graph = {"name": "path", "agents": 11}
     lines, found = checked(follower, model={"name": "double-integrator"}, graph=graph)
     assert found.promised
-    assert lines["coupling"].number == "c 1, edge 0.5"
+    assert lines["coupling"].shown == "c 1, edge 0.5"
     # Q = R = I on (x, v): s^2 + sqrt(3) s + 1, whose roots have real part -sqrt(3)/2.
-    told = float(lines["disagreement decays"].number.removesuffix(" 1/s"))
-    assert told == pytest.approx(-(3.0**0.5) / 2.0, abs=5e-4)
+    assert lines["disagreement decays"].number == pytest.approx(-(3.0**0.5) / 2.0)
+    assert found.rate == pytest.approx(3.0**0.5 / 2.0) and found.theorem is None
     assert "disturbance, network" not in lines
     lines, found = checked({**follower, "feedforward": "relay"},
                            model={"name": "double-integrator"}, graph=graph)  # fmt: skip
@@ -431,7 +478,7 @@ def test_a_gain_file_of_another_model_or_graph_is_refused_by_check(echelon):
     assert echelon("design", "mine.yaml", "--method", "riccati", "--out", "gain.json")[0] == 0
     written("file: gain.json", "pendulum")
     code, out, _ = echelon("check", "mine.yaml", "--json")
-    assert code == 0 and json.loads(out)["promised"] is True
+    assert code == 0 and json.loads(out)["promise"]["promised"] is True
     for change, sentence in (
         ("agents: 5", "made for a graph of 3 agents"),
         ("agents: 3", "was made for `Pendulum` with state_names"),
@@ -452,7 +499,7 @@ def test_a_gain_from_a_file_keeps_its_region(echelon):
     assert echelon("design", "mine.yaml", "--method", "robust-lqr", "--out", "gain.json")[0] == 0
     written("file: gain.json", "pendulum")
     after = json.loads(echelon("check", "mine.yaml", "--json")[1])
-    assert after == before and "(T1)" in after["promise"]
+    assert after == before and "(T1)" in after["promise"]["sentence"]
 
 
 def test_a_missing_solver_names_its_pip_line(echelon, monkeypatch):

@@ -71,9 +71,9 @@ def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians
     names = [*model.state_names, *model.input_names]
     try:
         hull = jacobian_hull(function, *_boxes(model, domain), names)
-    except GainError:
-        samples = _sample(function, model, domain)
-        return Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES)
+    except GainError as error:
+        samples, why = _sample(function, model, domain), str(error).rstrip(".")
+        return Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES, why)
     _check_bounded(model, domain, hull)
     return Jacobians(hull.vertices, hull.error, Kind.VERTICES)
 
