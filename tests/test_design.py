@@ -11,7 +11,7 @@ from runs import simulate
 import echelon as ech
 from echelon.plots.design import save_design_figures
 from echelon.studies.basin import chosen_slice, converged, observed_radius, side_of, slice_of, trial
-from echelon.studies.design import because, designs, recommended, with_gain
+from echelon.studies.design import because, recommended
 
 PATH = ech.Graph.path(4)
 
@@ -63,10 +63,11 @@ def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon)
     row, region = rows["robust-lqr"], gain.certificate.region
     assert row["condition"] == pytest.approx(np.linalg.cond(gain.P), rel=1e-4)
     assert row["radius"] == pytest.approx(region.radius, rel=1e-4)
-    assert (row["region_kind"], row["theorem"]) == (str(region.kind), str(region.theorem))
+    assert (row["kind"], row["theorem"]) == (str(region.kind), str(region.theorem))
+    assert row["rate"] == region.rate and row["promise"]["hypotheses"]
     assert rows["inner-loop"]["reason"] and "coupling" not in rows["inner-loop"]
     strongest = max(
-        ("proof", "vertices", "samples", None).index(row.get("region_kind"))
+        ("proof", "vertices", "samples", None).index(row.get("kind"))
         for row in rows.values() if row["method"] == told["recommended"]
     )  # fmt: skip
     assert strongest <= 1 and told["because"].startswith(f"Recommended: {told['recommended']}, ")
@@ -99,8 +100,7 @@ def test_the_table_and_its_sentence_are_whole(echelon):
 
 
 def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelon):
-    parts = parts_of("paper")
-    tried = designs(ech.load_scenario("paper"), parts)
+    tried = ech.design(ech.load_scenario("paper")).designs
     steps = {d.method: d.step for d in tried if d.gain is not None}
     assert steps["riccati"] < steps["inner-loop"]
     between = 0.5 * (steps["riccati"] + steps["inner-loop"])
@@ -113,14 +113,16 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelo
 def test_an_inner_loop_comes_with_what_would_shorten_it(echelon):
     _, out, _ = echelon("design", "paper-line", "--method", "inner-loop", "--json")
     (row,) = json.loads(out)["methods"]
-    wanted = ech.speedup(*parts_of("paper-line")[:2], inner_loop_gain("paper-line")).sentence()
+    wanted = inner_loop_speedup("paper-line").sentence()
     assert row["advice"] == wanted and "as a leader too" in wanted
     _, out, _ = echelon("design", "paper-line", "--method", "inner-loop")
     assert f"- inner-loop: {wanted}" in out
 
 
-def inner_loop_gain(scenario):
-    return ech.synthesize(*parts_of(scenario)[:2], ech.gains.InnerLoop())
+def inner_loop_speedup(scenario):
+    parts, _ = parts_of(scenario)
+    gain = ech.synthesize(parts.model, parts.graph, ech.gains.InnerLoop())
+    return ech.speedup(parts.model, parts.graph, gain)
 
 
 def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
@@ -134,8 +136,16 @@ def test_agents_whose_states_are_all_symmetric_have_an_inner_loop_too(echelon):
 
 @pytest.fixture(scope="module")
 def cubic():
-    gain = ech.synthesize(Cubic(), PATH, ech.gains.FixedGain(P=[1.0, 1.0]))
-    return trial(Cubic(), PATH, gain, 0.01, True), slice_of(Cubic(), gain, 3, (0, 1))
+    parts = resting(Cubic(), ech.gains.FixedGain(P=[1.0, 1.0]))
+    return trial(parts, ech.Settings(horizon=1.0, dt=0.01)), slice_of(parts, (0, 1))
+
+
+def resting(model, method, feedforward="relay"):
+    """Agents on a path behind a leader that rests, all on their goals."""
+    gain = ech.synthesize(model, PATH, method)
+    follower = ech.laws.Consensus(gain, feedforward=feedforward)
+    goals = ech.Formation.from_offsets(model, PATH, {})
+    return ech.Parts(model, PATH, goals, ech.Laws(ech.laws.TrimInput(), follower))
 
 
 def test_a_known_basin_is_observed_and_not_overstated(cubic):
@@ -157,16 +167,15 @@ def test_the_ellipse_has_the_radius_that_it_says(cubic):
 
 def test_a_slice_stays_inside_the_chart():
     agent = ech.models.Quadrotor()
-    gain = ech.synthesize(agent, PATH, ech.gains.Riccati())
-    plane = slice_of(agent, gain, 3, (0, agent.state_names.index("pitch")))
+    plane = slice_of(resting(agent, ech.gains.Riccati()), (0, agent.state_names.index("pitch")))
     assert plane.reach[1] < np.pi / 2 and plane.reach[0] == 30.0
 
 
 def test_a_slice_runs_the_loop_that_simulate_runs():
-    parts = parts_of("planar-quadrotor")
-    gain, model = parts.drive.follower.gain, parts.model
-    run = trial(model, parts.graph, gain, 0.005, True)
-    pair = chosen_slice(model, gain, "y,roll")
+    parts, settings = parts_of("planar-quadrotor")
+    gain, model = parts.drive.gain, parts.model
+    run = trial(parts, settings)
+    pair = chosen_slice(model, "y,roll")
     for start in ([0.5, 0.2], [25.0, 1.0]):
         states = np.zeros((parts.graph.agents, len(model.state_names))) + np.array(model.trim[0])
         for follower in parts.graph.followers:
@@ -184,20 +193,19 @@ def test_a_slice_runs_the_loop_that_simulate_runs():
         )
         y = result.states[[0, -1]][:, list(parts.graph.followers)] - np.array(model.trim[0])
         first, last = np.sqrt(np.einsum("tfi,ij,tfj->t", y, gain.P, y))
-        plane = slice_of(model, gain, 3, pair)
+        plane = slice_of(parts, pair)
         assert converged(run, plane, np.array([start]))[0] == (last <= run.fallen * first)
 
 
 def test_the_pair_is_the_one_asked_for_or_a_telling_one():
     quad, cart = ech.models.Quadrotor(), ech.models.VanDerPol()
-    gain = ech.synthesize(quad, PATH, ech.gains.Riccati())
-    assert chosen_slice(quad, gain, " roll , y ") == (6, 1)
-    velocity, angle = chosen_slice(quad, gain, None)
+    assert chosen_slice(quad, " roll , y ") == (6, 1)
+    velocity, angle = chosen_slice(quad, None)
     assert (quad.state_names[velocity], quad.state_names[angle]) in {
         ("vx", "pitch"),
         ("vy", "roll"),
     }
-    assert chosen_slice(cart, ech.synthesize(cart, PATH, ech.gains.Riccati()), None) == (0, 1)
+    assert chosen_slice(cart, None) == (0, 1)
 
 
 @pytest.mark.parametrize(
@@ -210,9 +218,8 @@ def test_the_pair_is_the_one_asked_for_or_a_telling_one():
     ],
 )
 def test_a_slice_that_is_none_is_one_sentence(asked, sentence):
-    gain = ech.synthesize(ech.models.Quadrotor(), PATH, ech.gains.Riccati())
     with pytest.raises(ech.EchelonError) as caught:
-        chosen_slice(ech.models.Quadrotor(), gain, asked)
+        chosen_slice(ech.models.Quadrotor(), asked)
     assert sentence in str(caught.value) and "`--slice`" in str(caught.value)
 
 
@@ -239,14 +246,8 @@ def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
 
 
 def test_where_nothing_is_certified_the_picture_says_so(tmp_path):
-    gain = ech.synthesize(Cubic(), PATH, ech.gains.FixedGain(P=[1.0, 1.0]))
-    told = {"model": {"name": "van-der-pol"}, "graph": {"name": "path", "agents": 4}}
-    scenario = ech.scenario_from_mapping(
-        {"name": "n", "simulation": {"horizon": 1.0, "dt": 0.01}, "leader": {"law": "passive"}}
-        | told
-    )
-    parts = ech.build(scenario)._replace(model=Cubic())
-    _, radii = save_design_figures(with_gain(parts, gain), tmp_path)
+    parts = resting(Cubic(), ech.gains.FixedGain(P=[1.0, 1.0]))
+    _, radii = save_design_figures(parts, ech.Settings(horizon=1.0, dt=0.01), tmp_path)
     assert radii.certified is None and "certified none" in radii.sentence()
     assert radii.observed < radii.largest
 
@@ -261,6 +262,5 @@ def test_one_state_has_modes_and_no_slice(tmp_path):
             "simulation": {"horizon": 1.0, "dt": 0.01},
         }
     )
-    parts = ech.build(scenario)
-    paths, radii = save_design_figures(with_gain(parts, parts.drive.follower.gain), tmp_path)
+    paths, radii = save_design_figures(*ech.build(scenario), tmp_path)
     assert [path.name for path in paths] == ["modes.png", "modes.pdf"] and radii is None

@@ -151,7 +151,10 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     closed, K, strengths = modes(loop), loop.K, loop.strengths
 
     def loci(w: Array) -> Array:
-        mu = np.linalg.eigvals(K @ _resolvent(loop.A, w, loop.B))
+        # Times i w all are of one size, and real where A is nothing: LAPACK's sweeps do not end on
+        # some multiples of i that are almost one of the identity.
+        turned = 1j * w[:, None, None]
+        mu = np.linalg.eigvals(turned * (K @ _resolvent(loop.A, w, loop.B))) / turned[:, 0]
         return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
 
     def size(w: float, i: int, at: float = 0.0) -> float:

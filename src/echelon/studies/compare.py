@@ -30,6 +30,8 @@ from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
 
 LABELS = ("literal", "riccati-relay", "riccati", "inner-loop", "optimization", "mpc")
+OWN = "own"
+"""Asks for what drives the agents in the scenario itself."""
 
 
 class Flight(NamedTuple):
@@ -118,24 +120,25 @@ DriveOf = Callable[[Parts], Drive]
 
 
 def known_labels(asked: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the methods asked for in the order of `LABELS`; all where none is named.
+    """Return the methods asked for in the order of `LABELS`, then `own`; all where none is named.
 
     Raises:
         LawError: a name is no method's.
     """
+    allowed = (*LABELS, OWN)
     for label in asked or ():
-        if label not in LABELS:
+        if label not in allowed:
             raise LawError(
-                f"`--method` is `{label}`, allowed are {listing(LABELS)}"
-                f"{did_you_mean(label, LABELS)}."
+                f"`--method` is `{label}`, allowed are {listing(allowed)}"
+                f"{did_you_mean(label, allowed)}."
             )
-    return tuple(label for label in LABELS if not asked or label in asked)
+    return tuple(label for label in allowed if not asked or label in asked)
 
 
 def compare(
     scenario: Scenario,
     built: Built | None = None,
-    only: tuple[str, ...] = LABELS,
+    only: tuple[str, ...] = (*LABELS, OWN),
     began: Callable[[str], None] = lambda label: None,
 ) -> Comparison:
     """Fly each method on a scenario from the same starts, under the same limits and wind.
@@ -143,11 +146,11 @@ def compare(
     Args:
         scenario: the agents, their graph, formation, starts and conditions; its horizon is flown.
         built: its parts and settings, built unless given.
-        only: the labels of the methods to fly.
+        only: the labels of the methods to fly, `own` among them for the scenario's own drive.
         began: called with each method's label before it flies.
 
-    A method that does not apply, or whose solver is missing, is a row with its reason. Where all
-    fly, the scenario's own drive does: as one of them if it is the same, or else as one more.
+    A method that does not apply, or whose solver is missing, is a row with its reason. The
+    scenario's own drive is a row under the name of its gain, unless another row is the same.
 
     Raises:
         ScenarioError: a part cannot be made.
@@ -155,10 +158,10 @@ def compare(
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
     rows = []
-    for label in only:
+    for label in (label for label in only if label != OWN):
         began(label)
         rows.append(_row(label, _DRIVES[label], scene, settings))
-    own = _own_label(parts, rows) if only == LABELS else None
+    own = _own_label(parts, rows) if OWN in only else None
     if own is not None:
         began(own)
         rows.append(_row(own, lambda parts: parts.drive, scene, settings))
@@ -238,7 +241,7 @@ def _own_label(parts: Parts, rows: list[Row]) -> str | None:
     gain, feedforward = drive.gain, drive.feedforward
     name = _law_name(drive) if gain is None else gain.method
     label = name if feedforward is Feedforward.NONE else f"{name}-{feedforward}"
-    return label if label not in LABELS else f"{label}, own"
+    return f"{label}, own" if label in {row.label for row in rows} else label
 
 
 def _law_name(drive: Drive) -> str:
