@@ -2,6 +2,7 @@
 
 import importlib
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -216,8 +217,35 @@ def test_normalized_inputs_are_deviations_from_the_trim(model):
     assert numpy(model.physical, v) == pytest.approx(u, rel=1e-12, abs=1e-18)
     without = numpy(lambda v: model.physical(v, trim=False), v)
     assert without == pytest.approx(u - trim, rel=1e-12, abs=1e-18)
+    assert numpy(model.normalized, u) == pytest.approx(v, rel=1e-12, abs=1e-12)
     about = numpy(model.normalized_drift, x) + numpy(model.normalized_input_map, x) @ v
     assert about == pytest.approx(numpy(model.velocity, x, u), rel=1e-12, abs=1e-11)
+
+
+@every_model
+def test_many_inputs_change_as_one_does_in_numpy_and_in_jax(model):
+    v = np.random.default_rng(3).normal(size=(2, 5, len(model.input_names)))
+    for change in (model.physical, model.normalized, lambda v: model.physical(v, trim=False)):
+        one_by_one = [[numpy(change, row) for row in rows] for rows in v]
+        assert isinstance(change(v), np.ndarray)
+        assert change(v) == pytest.approx(np.array(one_by_one), rel=1e-14)
+        assert numpy(change, v) == pytest.approx(change(v), rel=1e-14)
+    assert model.physical(v[0].astype(np.float32)).dtype == np.float32
+
+
+def test_a_scale_that_depends_on_an_array_is_traced_with_it():
+    class Weighed(ControlAffine):
+        mass: np.ndarray
+        state_names, input_names = ("speed",), ("push",)
+        drift, input_map = SingleIntegrator.drift, SingleIntegrator.input_map
+
+        @property
+        def input_scale(self):
+            return ((self.mass[0],),)
+
+    change = eqx.filter_jit(lambda model, u: model.normalized(u))
+    for mass in (2.0, 4.0):
+        assert change(Weighed(np.array([mass])), jnp.array([8.0])) == 8.0 / mass
 
 
 @every_model
@@ -227,7 +255,12 @@ def test_agents_compute_in_the_precision_that_is_asked_for(model, name):
     with numerics.precision(name):
         a, b = jnp.asarray(x), jnp.asarray(u)
         values = [model.drift(a), model.input_map(a), model.output(a), model.limit(b)]
-        values += [model.physical(b), model.normalized_input_map(a), model.difference(a, a)]
+        values += [
+            model.physical(b),
+            model.normalized(b),
+            model.normalized_input_map(a),
+            model.difference(a, a),
+        ]
         assert {str(value.dtype) for value in values} == {name}
 
 

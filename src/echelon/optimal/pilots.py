@@ -12,7 +12,6 @@ from echelon.engine.host import Flight, Progress, Stopped, fly, take_off
 from echelon.engine.initial import Initial
 from echelon.engine.result import Result, Settings
 from echelon.engine.work import stats_of, with_stats
-from echelon.models.inputs import physical
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph, shares
@@ -188,7 +187,7 @@ class _Pilots:
             course = self._course(agent, states[agent], targets)
             self.courses[agent] = course
             inputs[agent] = course.inputs[0]
-        return physical(self.flight.model, inputs)
+        return self.flight.model.physical(inputs)
 
     def _targets(self, agent: int, earlier: tuple[int, ...], share: Array, period: int) -> Course:
         """Return what an agent follows: the reference, or the mean of what its neighbours plan."""

@@ -10,7 +10,6 @@ import numpy as np
 from echelon.core.errors import LawError, PlanError, listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.models.inputs import normalized
 from echelon.models.model import ControlAffine
 from echelon.references.reference import COORDINATES, Reference
 
@@ -113,7 +112,7 @@ def reference_targets(model: ControlAffine, reference: Reference | None, times: 
             f"the reference `{type(reference).__name__}` cannot be followed by "
             f"`{type(model).__name__}`: its flat state and input are not finite."
         )
-    return _targets(model, x, normalized(model, u))
+    return _targets(model, x, model.normalized(u))
 
 
 def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Targets:
