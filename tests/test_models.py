@@ -30,8 +30,7 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
-from echelon.models.quadrotor_euler import computed_torque
-from echelon.models.rigid_body import euler_rates
+from echelon.models.rigid_body import body_rates, euler_rates, free_spin
 from echelon.scenario import registry
 
 rng = np.random.default_rng(7)
@@ -556,6 +555,16 @@ def test_an_agent_of_ones_own_may_replace_any_default_by_attribute_property_or_m
     assert model.input_scale == ((0.4,),) and model.state_units == ("K", "K")
     assert numpy(model.difference, np.ones(2), np.zeros(2)) == pytest.approx([2.0, 2.0])
     assert numpy(model.physical, np.array([2.0])) == pytest.approx([1.2])
+
+
+def computed_torque(model, x, v):
+    """The thrust and torques of a quadrotor that realize an input of `QuadrotorEuler`."""
+    zeta, omega = x[6:9], x[9:12]
+    zeta_dot = euler_rates(zeta, omega)
+    # omega = W(zeta)^-1 zetadot, differentiated along (zetadot, zetaddot).
+    _, omega_dot = jax.jvp(body_rates, (zeta, zeta_dot), (zeta_dot, v[1:]))
+    torque = jnp.asarray(model.inertia) * (omega_dot - free_spin(model.inertia, omega))
+    return jnp.append(model.mass * (model.gravity + v[0]), torque)
 
 
 def test_computed_torque_turns_the_quadrotor_into_its_euler_form():
