@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 
 import echelon as ech
-from echelon.models.inputs import physical
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import Grid, TrackingOptions, coarse, grid, tracking
 from echelon.optimal.problem import OptimalControl
@@ -81,7 +80,7 @@ def least(start: np.ndarray, targets: Targets, times: Grid, seeds: Sequence[int]
     p = np.hstack([targets.outputs, targets.inputs, np.zeros((len(targets.inputs), 1))])
     found = []
     for seed in seeds:
-        states, inputs = targets.states.copy(), physical(MODEL, targets.inputs[:-1])
+        states, inputs = targets.states.copy(), MODEL.physical(targets.inputs[:-1])
         if seed:
             rng = np.random.default_rng(seed)
             fade = np.exp(-times.times / rng.uniform(0.2, 1.0))[:, None]

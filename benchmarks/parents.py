@@ -10,7 +10,6 @@ import numpy as np
 
 import echelon as ech
 from echelon.certificates.margins import ClosedLoop, string_gain
-from echelon.core.numerics import precision
 from echelon.models.linearization import linearize
 from echelon.results.metrics import formation_errors
 
@@ -48,8 +47,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     seeds = parser.parse_args().seeds
     gain = ech.synthesize(MODEL, ech.Graph.path(2), ech.gains.Riccati(coupling=1.0))
-    with precision("float64"):
-        A, B = linearize(MODEL)
+    A, B = linearize(MODEL)
     lines = (3, 10, 20)
     print("| feed-forward | c | ‖T‖ |", " | ".join(f"N = {n}" for n in lines), "|")
     print("|---" * (3 + len(lines)) + "|")

@@ -20,7 +20,7 @@ _ASYMMETRY = 1e-9  # relative; more than rounding can explain
 
 
 class Definiteness(NamedTuple):
-    """Whether a matrix is negative (semi)definite, and the smallest pivot d of -M = L diag(d) L'.
+    """Whether a matrix is positive definite, and the smallest pivot d of M = L diag(d) L'.
 
     Elimination ends at the first pivot that fails, which then is the smallest one told. `pivot` is
     rounded to a float, `holds` is exact.
@@ -100,14 +100,12 @@ def _scaled(values: object, name: str) -> _Scaled:
 
 
 def _symmetrized(values: object, name: str) -> _Scaled:
-    """Return the symmetric part, exactly.
+    """Return the symmetric part of a square matrix, exactly.
 
     Raises:
-        GainError: the matrix is not square, or is asymmetric by more than rounding.
+        GainError: the matrix is asymmetric by more than rounding.
     """
     matrix = _scaled(values, name)
-    if matrix.integers.ndim != 2 or matrix.integers.shape[0] != matrix.integers.shape[1]:
-        raise GainError(f"`{name}` has shape {matrix.integers.shape}, and must be square.")
     skew = matrix.minus(matrix.transposed()).sized().integers
     if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.sized().integers.max()):
         raise GainError(f"`{name}` is not symmetric, and must be.")
@@ -115,70 +113,23 @@ def _symmetrized(values: object, name: str) -> _Scaled:
     return _Scaled(both.integers, both.bits + 1)
 
 
-def negative_definite(matrix: object, strict: bool = True) -> Definiteness:
-    """Say exactly whether a symmetric matrix is negative definite (semidefinite if not `strict`).
-
-    Args:
-        matrix: (n, n) floats or dyadic fractions, symmetrized exactly.
-        strict: whether a pivot of 0 is refused.
-
-    Raises:
-        GainError: the matrix is not square, not symmetric or not finite.
-    """
-    symmetric = _symmetrized(matrix, "matrix")
-    return _positive(_Scaled(-symmetric.integers, symmetric.bits), strict)
-
-
-def _positive(matrix: _Scaled, strict: bool = True) -> Definiteness:
-    """Say whether a symmetric matrix is positive definite, or semidefinite."""
+def _positive(matrix: _Scaled) -> Definiteness:
+    """Say whether a symmetric matrix is positive definite."""
     rest, previous, smallest = matrix.integers, 1, None
     while len(rest):
         pivot, row, rest = rest[0, 0], rest[0, 1:], rest[1:, 1:]
         size = Fraction(pivot, previous)
         smallest = size if smallest is None else min(smallest, size)
-        if pivot < 0 or pivot == 0 and (strict or row.any()):
-            # A zero before a row that is not zero hides a negative eigenvalue.
+        if pivot <= 0:
             return Definiteness(False, _real(smallest, matrix.bits))
-        if pivot > 0:
-            # Bareiss: every entry is a minor of the matrix, so the division leaves no remainder.
-            rest, previous = (rest * pivot - np.outer(row, row)) // previous, pivot
+        # Bareiss: every entry is a minor of the matrix, so the division leaves no remainder.
+        rest, previous = (rest * pivot - np.outer(row, row)) // previous, pivot
     return Definiteness(True, _real(smallest or Fraction(0), matrix.bits))
 
 
 def _real(x: Fraction, bits: int) -> float:
     """Return x / 2^bits as a float."""
     return float(x / (1 << bits))
-
-
-def rationalize(P: Array, bits: int = 24) -> Array:
-    """Return a symmetric matrix near P with short entries, for use in place of P ever after.
-
-    Entry (i, j) is rounded to a multiple of 2^-bits times a power of two close to
-    sqrt(P_ii P_jj), so that it changes by at most 2^-bits sqrt(P_ii P_jj) whatever the states'
-    units; exact arithmetic is faster on fewer bits, and an ill-conditioned P needs more.
-
-    Args:
-        P: (n, n) positive definite.
-        bits: from 4 to 48.
-
-    Raises:
-        GainError: `bits` is out of range, P is not symmetric and finite, or what is left of it is
-            not positive definite, in exact arithmetic.
-    """
-    if not 4 <= bits <= 48:
-        raise GainError(f"`bits` is {bits}, and must be from 4 to 48.")
-    exact = _symmetrized(P, "P")
-    matrix = (np.asarray(P, float) + np.asarray(P, float).T) / 2
-    if not _positive(exact).holds:
-        raise GainError("`P` is not positive definite, and must be.")
-    scale = np.exp2(np.round(np.log2(np.diagonal(matrix)) / 2))
-    unit = np.outer(scale, scale) * 2.0**-bits
-    rounded = np.round(matrix / unit) * unit
-    if not _positive(_scaled(rounded, "P")).holds:
-        raise GainError(
-            f"`P` rounded to {bits} bits is not positive definite; allow more `bits`, up to 48."
-        )
-    return rounded
 
 
 def prove_contraction(

@@ -54,10 +54,9 @@ class InnerLoop(Method):
                 "has nothing to leave alone; use `monotone` or `riccati`."
             )
         K = self._feedback(model, linear, fixed)
-        A = linear.A - linear.B @ K
-        P = _monotone(model, A, fixed, self._weights(model, len(fixed)))
+        closed = linear.with_inner(K)
+        P = _monotone(model, closed.A, fixed, self._weights(model, len(fixed)))
         R = np.eye(len(model.input_names))
-        closed = Linearization(A, linear.B)
         certificate = certify(closed, graph, P, R, self.coupling, edge=0.0)
         return Gain(P, R, self.coupling, "inner-loop", certificate, inner=K)
 

@@ -111,12 +111,12 @@ def checked_loop(parts: Parts, settings: Settings) -> CheckedLoop:
     model, graph = parts.model, parts.graph
     gain = parts.drive.gain
     n, m = len(model.state_names), len(model.input_names)
-    A, B = linearize(model)
+    linear = linearize(model)
     P, R, c, edge = parts.drive.metric(model), np.eye(m), 1.0, None
     if gain is not None:
         R, c, edge = gain.R, gain.coupling, gain.certificate.edge
-        A = A if gain.inner is None else A - B @ gain.inner
-    linear, P = Linearization(A, B), np.eye(n) if P is None else P
+        linear = linear.with_inner(gain.inner)
+    P = np.eye(n) if P is None else P
     modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
     if parts.drive.feedforward is Feedforward.PARENT:
         edge = None if edge is None else edge * modes[0]
@@ -124,7 +124,7 @@ def checked_loop(parts: Parts, settings: Settings) -> CheckedLoop:
         edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"
     certificate = certify(linear, graph, P, R, c, edge, modes=modes)
     values, where = _looked_at(modes, count, kind)
-    closed = ClosedLoop(A, B, P, R, c, values)
+    closed = ClosedLoop(*linear, P, R, c, values)
     every = certificate.stable and (certificate.modes == count or decays_between(closed))
     broken = parts.formation.broken_symmetries(model)
     return CheckedLoop(parts, settings, linear, closed, where, every, certificate, broken)

@@ -7,11 +7,10 @@ import numpy as np
 from echelon.certificates.certificate import Certificate, certify, parent_modes
 from echelon.core.errors import Outcome
 from echelon.core.linear import held_radius
-from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.engine.result import Result
 from echelon.gains.gain import Gain
-from echelon.models.linearization import Linearization, linearize
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.results.lyapunov import Lyapunov, lyapunov
 from echelon.results.metrics import Metrics, formation_errors
@@ -96,8 +95,7 @@ def _long_step(result: Result, gain: Gain) -> Iterator[str]:
     """Tell where the input, held over a step, makes grow what would decay in continuous time."""
     if not gain.certificate.stable:
         return
-    with precision("float64"):
-        A, B = linearize(result.model)
+    A, B = linearize(result.model)
     inner = np.zeros_like(B.T) if gain.inner is None else gain.inner
     strength = gain.coupling * gain.certificate.lambda_max
     K = inner + strength * np.linalg.solve(gain.R, B.T @ gain.P)
@@ -156,11 +154,9 @@ def _with_parents(result: Result, gain: Gain) -> tuple[float, float | None]:
 
     The modes are then those of the edges' weights (theory page, T4).
     """
-    with precision("float64"):
-        A, B = linearize(result.model)
-    A = A if gain.inner is None else A - B @ gain.inner
+    linear = linearize(result.model).with_inner(gain.inner)
     edge, weights = gain.certificate.edge, parent_modes(result.graph)
-    linear, given = Linearization(A, B), (gain.P, gain.R, gain.coupling)
+    given = (gain.P, gain.R, gain.coupling)
     found = certify(linear, result.graph, *given, edge, modes=weights)
     return found.abscissa, None if edge is None else edge * found.lambda_min / weights[0]
 

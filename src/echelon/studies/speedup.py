@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 from echelon.certificates.certificate import certify
-from echelon.core.numerics import precision
 from echelon.gains.gain import Gain
-from echelon.models.linearization import Linearization, linearize
+from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.network.topology import (
@@ -72,8 +71,6 @@ def time_constant(model: ControlAffine, graph: Graph, gain: Gain) -> float:
 
     In it the slowest disagreement falls to 1/e; it is infinite where one does not decay.
     """
-    with precision("float64"):
-        A, B = linearize(model)
-    A = A if gain.inner is None else A - B @ gain.inner
-    abscissa = certify(Linearization(A, B), graph, gain.P, gain.R, gain.coupling, None).abscissa
+    linear = linearize(model).with_inner(gain.inner)
+    abscissa = certify(linear, graph, gain.P, gain.R, gain.coupling, None).abscissa
     return -1.0 / abscissa if abscissa < 0.0 else float("inf")

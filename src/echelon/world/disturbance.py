@@ -96,7 +96,8 @@ class Disturbance:
         """
         seed = seed if self.seed is None else self.seed
         rms = _by_state(plant, self.rms)
-        noise = np.asarray(plant.input_scale, float) * _by_input(plant, self.input_rms)
+        # Column j is what noise of its rms on the normalized input j adds to the physical ones.
+        noise = plant.physical(np.diag(_by_input(plant, self.input_rms)), trim=False).T
         return Wind(
             constant=_by_state(plant, self.constant),
             rms=rms if rms.any() else None,
