@@ -17,8 +17,12 @@ class Linearization(NamedTuple):
     A: Array
     B: Array
 
-    def closed(self, K: Array | None) -> "Linearization":
-        """Return the same with an inner loop v = -K (x - x*) closed, K (m, n); None is none."""
+    def with_inner(self, K: Array | None) -> "Linearization":
+        """Return A - B K and B, the system with the inner loop v = -K (x - x*) + w closed.
+
+        Args:
+            K: (m, n); None where there is no inner loop.
+        """
         return self if K is None else Linearization(self.A - self.B @ K, self.B)
 
 

@@ -115,7 +115,7 @@ def checked_loop(parts: Parts, settings: Settings) -> CheckedLoop:
     P, R, c, edge = parts.drive.metric(model), np.eye(m), 1.0, None
     if gain is not None:
         R, c, edge = gain.R, gain.coupling, gain.certificate.edge
-        linear = linear.closed(gain.inner)
+        linear = linear.with_inner(gain.inner)
     P = np.eye(n) if P is None else P
     spectrum, kind = graph.spectrum(), "eigenvalues"
     if parts.drive.feedforward is Feedforward.PARENT:

@@ -157,7 +157,7 @@ def _with_parents(result: Result, gain: Gain) -> tuple[float, float | None]:
     The modes are then those of the edges' weights (theory page, T4).
     """
     with precision("float64"):
-        closed = linearize(result.model).closed(gain.inner)
+        closed = linearize(result.model).with_inner(gain.inner)
     low, weights = result.graph.spectrum().low, result.graph.parent_spectrum()
     edge = gain.certificate.edge
     edge = None if edge is None else edge * low / weights.low
