@@ -20,11 +20,9 @@ if sys.version_info < (3, 11):  # noqa: UP036 - the one file that an older Pytho
 
 ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
-BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
-SUFFIX = ".exe" if os.name == "nt" else ""
-PYTHON = BIN / f"python{SUFFIX}"
 STAMP = VENV / "echelon-setup.txt"
-WHAT = ["--editable", ".[all,dev]", "--constraint", "constraints.txt"]
+BUILD = ROOT / "build"
+PINNED = ["--constraint", "constraints.txt"]
 HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
 
   setup   set up .venv with all extras; does nothing when nothing changed
@@ -32,7 +30,8 @@ HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
   test    run the tests: pytest [ARGUMENT ...], on all cores
   lint    check style, layout and who imports whom: ruff, import-linter
   types   check types: pyright
-  docs    build the documentation into site/: mkdocs"""
+  docs    build the documentation into site/, with warnings as errors: zensical
+  wheel   build the wheel into build/, install it alone and without extras, and try it"""
 NO_PIP = (
     "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
     " 22.3 or later; install one of them (on Debian or Ubuntu: `apt install python3-venv`), or uv,"
@@ -64,9 +63,14 @@ def main(arguments: list[str]) -> int:
         return 130
 
 
+def program(name: str, venv: Path = VENV) -> Path:
+    """Return where a program of an environment stands, or would."""
+    return venv / "Scripts" / f"{name}.exe" if os.name == "nt" else venv / "bin" / name
+
+
 def tool(name: str, *arguments: str) -> list[str]:
     """Return the command that runs a program of .venv as a module, wherever .venv was made."""
-    return [str(PYTHON), "-m", name, *arguments]
+    return [str(program("python")), "-m", name, *arguments]
 
 
 def tests(rest: list[str]) -> list[list[str]]:
@@ -82,17 +86,41 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def wheel(rest: list[str]) -> list[list[str]]:
+    """Build the wheel, install it where nothing else is, and return the commands that try it.
+
+    They see what an editable install hides: a file that is not shipped, a dependency that only an
+    extra or a tool brings.
+    """
+    wheels, alone = BUILD / "wheels", BUILD / "alone"
+    clear(wheels)
+    clear(alone)
+    install = installer(alone)
+    step(builder(alone, wheels), "The wheel could not be built; what stands above says why.")
+    [built] = wheels.glob("*.whl")
+    step([*install, str(built), *PINNED], "The wheel could not be installed.")
+    echelon = str(program("echelon", alone))
+    every_name = "import echelon; [getattr(echelon, name) for name in echelon.__all__]"
+    return [
+        [str(program("python", alone)), "-c", every_name],
+        [echelon, "list"],
+        [echelon, "check", "paper"],
+        [echelon, "run", "paper", "--set", "simulation.horizon=1", "--out", str(alone / "run")],
+    ]
+
+
 VERBS = {
     "setup": lambda rest: [],
-    "demo": lambda rest: [[str(BIN / f"echelon{SUFFIX}"), "run", "paper", *rest]],
+    "demo": lambda rest: [[str(program("echelon")), "run", "paper", *rest]],
     "test": tests,
     "lint": lambda rest: [
         tool("ruff", "check", *rest),
         tool("ruff", "format", "--check", *rest),
-        [str(BIN / f"lint-imports{SUFFIX}")],
+        [str(program("lint-imports"))],
     ],
     "types": lambda rest: [tool("pyright", *rest)],
-    "docs": lambda rest: [tool("mkdocs", "build", "--strict", *rest)],
+    "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
+    "wheel": wheel,
 }
 
 
@@ -118,11 +146,11 @@ def run(command: list[str], folder: Path = ROOT) -> int:
 def setup() -> None:
     """Make .venv what pyproject.toml and constraints.txt ask for, unless it is so already."""
     wanted = fingerprint()
-    if PYTHON.exists() and STAMP.is_file() and STAMP.read_text("utf-8") == wanted:
+    if program("python").exists() and STAMP.is_file() and STAMP.read_text("utf-8") == wanted:
         return
     print(f"Setting up {VENV}; the first time, this takes a few minutes.", flush=True)
     STAMP.unlink(missing_ok=True)
-    install = with_uv() if shutil.which("uv") else with_pip()
+    install = [*installer(VENV), "--editable", ".[all,dev]", *PINNED]
     step(install, "The packages could not be installed; what stands above says why.")
     STAMP.write_text(wanted, "utf-8")
 
@@ -138,35 +166,47 @@ def version() -> str:
     return "{}.{}".format(*sys.version_info)
 
 
-def with_uv() -> list[str]:
-    """Make sure that .venv exists and return the command that installs into it by uv."""
-    if not fits():
-        clear()
-        step(["uv", "venv", "--python", sys.executable, str(VENV)], "uv could not make .venv.")
-    return ["uv", "pip", "install", "--python", str(PYTHON), *WHAT]
+def installer(venv: Path) -> list[str]:
+    """Make sure that an environment exists and return the command that installs into it."""
+    return with_uv(venv) if shutil.which("uv") else with_pip(venv)
 
 
-def with_pip() -> list[str]:
-    """Make sure that .venv exists and return the command that installs into it by pip."""
-    if not (fits() and pip()):
-        clear()
-        make = [sys.executable, "-m", "venv", str(VENV)]
+def builder(venv: Path, folder: Path) -> list[str]:
+    """Return the command that builds the wheel into a folder."""
+    if shutil.which("uv"):
+        return ["uv", "build", "--wheel", "--out-dir", str(folder)]
+    return [*pip(venv), "wheel", *quiet(), "--no-deps", "--wheel-dir", str(folder), "."]
+
+
+def with_uv(venv: Path) -> list[str]:
+    """Make sure that an environment exists and return how uv installs into it."""
+    if not fits(venv):
+        clear(venv)
+        step(["uv", "venv", "--python", sys.executable, str(venv)], f"uv could not make {venv}.")
+    return ["uv", "pip", "install", "--python", str(program("python", venv))]
+
+
+def with_pip(venv: Path) -> list[str]:
+    """Make sure that an environment exists and return how pip installs into it."""
+    if not (fits(venv) and pip(venv)):
+        clear(venv)
+        make = [sys.executable, "-m", "venv", str(venv)]
         if not (importlib.util.find_spec("ensurepip") and works(make)):
-            clear()
+            clear(venv)
             works([*make, "--without-pip"])
-    if not pip():
+    if not pip(venv):
         raise SetupError(NO_PIP)
-    return [*pip(), "install", *quiet(), "--disable-pip-version-check", *WHAT]
+    return [*pip(venv), "install", *quiet(), "--disable-pip-version-check"]
 
 
-def pip() -> list[str]:
-    """Return a pip that installs into .venv, or nothing where there is none.
+def pip(venv: Path) -> list[str]:
+    """Return a pip that installs into an environment, or nothing where there is none.
 
     Debian takes `ensurepip` out of its Python, and then an environment is born without pip; a pip
     outside the environment can install into it all the same (from pip 22.3 on).
     """
-    inner = [str(PYTHON), "-m", "pip"]
-    outer = [sys.executable, "-m", "pip", "--python", str(PYTHON)]
+    python = str(program("python", venv))
+    inner, outer = [python, "-m", "pip"], [sys.executable, "-m", "pip", "--python", python]
     return next((one for one in (inner, outer) if works([*one, "--version"])), [])
 
 
@@ -175,10 +215,10 @@ def quiet() -> list[str]:
     return [] if sys.stdout.isatty() else ["--quiet"]
 
 
-def fits() -> bool:
-    """Tell whether .venv exists and is for this version of Python, whoever made it."""
-    config = VENV / "pyvenv.cfg"
-    if not (PYTHON.exists() and config.is_file()):
+def fits(venv: Path) -> bool:
+    """Tell whether an environment exists and is for this version of Python, whoever made it."""
+    config = venv / "pyvenv.cfg"
+    if not (program("python", venv).exists() and config.is_file()):
         return False
     pairs = (line.partition("=") for line in config.read_text().splitlines())
     settings = {key.strip(): value.strip() for key, _, value in pairs}
@@ -186,12 +226,12 @@ def fits() -> bool:
     return made_for.startswith(f"{version()}.")
 
 
-def clear() -> None:
-    """Remove what stands where .venv will be made: one that does not fit, or is half made."""
-    if VENV.is_symlink():
-        VENV.unlink()
-    elif VENV.exists():
-        shutil.rmtree(VENV)
+def clear(folder: Path) -> None:
+    """Remove what stands where a folder will be made: what does not fit, or is half made."""
+    if folder.is_symlink():
+        folder.unlink()
+    elif folder.exists():
+        shutil.rmtree(folder)
 
 
 def works(command: list[str]) -> bool:

@@ -21,7 +21,7 @@ MODEL, LOOP = ech.models.Quadrotor.crazyflie(), ech.references.Lemniscate()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])
 OFFSETS = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
 DRAWN = ech.Formation.from_offsets(MODEL, TREE, OFFSETS)
-FLIGHT = {"reference": LOOP, "horizon": 10.0, "dt": 0.005}
+FLIGHT = ech.Settings(horizon=10.0, dt=0.005)
 SHARP = TrackingOptions(interval=0.02, input_weight=3e-6)
 """For followers without limits, whose error shall be gone within a sample of the paper."""
 
@@ -187,10 +187,11 @@ def times_and_mpc() -> Iterator[Row]:
         "5 s",
     )
     for limits in (True, False):
-        result = ech.optimal.simulate_mpc(
-            MODEL, TREE, DRAWN, initial=starts(), limits=limits, **FLIGHT
+        result = ech.simulate(
+            ech.Parts(MODEL, TREE, DRAWN, ech.optimal.RecedingHorizon(LOOP), initial=starts()),
+            FLIGHT._replace(limits=limits),
         )
-        figures, numbers = ech.optimal.solver_stats(result), ech.metrics(result)
+        figures, numbers = result.work, ech.metrics(result)
         assert figures is not None and numbers.worst_steady is not None
         name = "MPC, motor limits" if limits else "MPC, inputs unconstrained"
         e = off_reference(result)
@@ -215,10 +216,16 @@ def times_and_mpc() -> Iterator[Row]:
 def rows() -> Iterator[Row]:
     """Yield all rows of the table."""
     initial = starts()
-    within = ech.optimal.simulate_plans(MODEL, TREE, DRAWN, initial=initial, **FLIGHT)
-    free = ech.optimal.simulate_plans(MODEL, TREE, DRAWN, initial=initial, limits=False, **FLIGHT)
-    sharp = ech.optimal.simulate_plans(
-        MODEL, TREE, DRAWN, planning=SHARP, initial=initial, limits=False, **FLIGHT
+    within = ech.simulate(
+        ech.Parts(MODEL, TREE, DRAWN, ech.optimal.Plans(LOOP), initial=initial), FLIGHT
+    )
+    free = ech.simulate(
+        ech.Parts(MODEL, TREE, DRAWN, ech.optimal.Plans(LOOP), initial=initial),
+        FLIGHT._replace(limits=False),
+    )
+    sharp = ech.simulate(
+        ech.Parts(MODEL, TREE, DRAWN, ech.optimal.Plans(LOOP, options=SHARP), initial=initial),
+        FLIGHT._replace(limits=False),
     )
     yield from leader(free, within)
     yield from followers(sharp, within)

@@ -25,16 +25,17 @@ def converged(followers: int, feedforward: str, coupling: float | None, seeds: i
     count = 0
     for seed in range(seeds):
         run = ech.simulate(
-            MODEL,
-            graph,
-            ech.Formation.line(MODEL, graph),
-            leader=ech.laws.Tracking(ech.references.Lemniscate()),
-            follower=ech.laws.Consensus(gain, feedforward=feedforward),  # pyright: ignore
-            initial={"position": 1.0, "attitude": 0.3},
-            horizon=60.0,
-            dt=0.005,
-            store_every=200,
-            seed=seed,
+            ech.Parts(
+                MODEL,
+                graph,
+                ech.Formation.line(MODEL, graph),
+                ech.Laws(
+                    ech.laws.Tracking(ech.references.Lemniscate()),
+                    ech.laws.Consensus(gain, feedforward=feedforward),
+                ),
+                initial={"position": 1.0, "attitude": 0.3},
+            ),
+            ech.Settings(horizon=60.0, dt=0.005, store_every=200, seed=seed),
         )
         done = run.outcome is ech.Outcome.COMPLETED
         count += bool(done and np.all(formation_errors(run)[-1] < 0.01))

@@ -9,6 +9,9 @@ from beartype import beartype
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+# What one test compiled must not stand in for what another is to compile.
+os.environ["ECHELON_CACHE"] = "off"
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 

@@ -447,7 +447,7 @@ SIMULATIONS = {
     ),
     "unknown precision": (
         lambda: run(precision="float16"),
-        "`precision` is `float16`, allowed are `float64`, `float32`.",
+        "`precision` is `float16`, allowed are `float64`, `float32` (did you mean `float64`?).",
     ),
     "a formation of others": (
         lambda: run(formation=Formation(np.zeros((3, 1)))),

@@ -121,14 +121,8 @@ def test_a_users_own_agent_runs_as_from_python(here, echelon):
         horizon=1.0,
         dt=0.01,
     )
-    expected = [each.rmse for each in ech.Metrics(*_metrics(result)).followers]
+    expected = [each.rmse for each in ech.metrics(result).followers]
     assert [each["rmse"] for each in told["followers"]] == pytest.approx(expected, rel=1e-12)
-
-
-def _metrics(result):
-    from echelon.results.metrics import metrics
-
-    return metrics(result)
 
 
 @pytest.mark.parametrize(

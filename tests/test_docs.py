@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import operator
 import os
 import re
 import shlex
@@ -247,8 +248,40 @@ def numbers(text):
 
 
 def test_the_reference_has_every_public_name_once():
-    named = re.findall(r"^::: echelon\.(\w+)$", page("api.md").read_text("utf-8"), re.MULTILINE)
-    assert sorted(named) == sorted(ech.__all__)
+    """Those of a family too; beyond them it may have what public functions return."""
+    named = re.findall(r"^::: (echelon\.\S+)$", page("api.md").read_text("utf-8"), re.MULTILINE)
+    shown = [id(operator.attrgetter(name.removeprefix("echelon."))(ech)) for name in named]
+    families = [getattr(ech, name) for name in ech.__all__ if is_module(getattr(ech, name))]
+    public = {
+        id(getattr(family, name)): f"{family.__name__}.{name}"
+        for family in [*families, ech]
+        for name in getattr(family, "__all__", [])
+        if not is_module(getattr(family, name))
+    }
+    assert len(shown) == len(set(shown))
+    assert [name for each, name in public.items() if each not in shown] == []
+
+
+def is_module(value):
+    return isinstance(value, types.ModuleType)
+
+
+def test_every_page_is_in_the_navigation_and_is_there():
+    """The build overlooks a page of the navigation that does not exist."""
+    text = (ROOT / "mkdocs.yml").read_text("utf-8")
+    entries = re.findall(r"^  - [\w ]+: (\S+\.md)$", text, re.MULTILINE)
+    assert sorted(entries) == [path.name for path in PAGES[1:]]
+
+
+def test_what_pages_quote_of_the_readme_has_no_relative_link():
+    """It would lead nowhere from one of the two places, which the build overlooks."""
+    text, quoted = page("README.md").read_text("utf-8"), 0
+    for path in PAGES:
+        for name in re.findall(r'--8<-- "README\.md:(\w+)"', path.read_text("utf-8")):
+            part = text.partition(f"[start:{name}]")[2].partition(f"[end:{name}]")[0]
+            assert part and [t for t in LINK.findall(part) if "://" not in t] == [], name
+            quoted += 1
+    assert quoted >= 4
 
 
 def test_the_theory_page_names_tests_that_exist():

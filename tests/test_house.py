@@ -13,13 +13,14 @@ import sys
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "echelon"
 
-HEAVY = ["jax", "equinox", "scipy", "networkx", "cvxpy", "casadi", "matplotlib", "viser", "xarray"]
+HEAVY = ["jax", "equinox", "scipy", "networkx", "cvxpy", "casadi", "matplotlib", "xarray"]
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 
@@ -204,7 +205,7 @@ def test_the_texts_and_the_schema_load_no_jax():
 
 def test_using_the_library_loads_no_optional_part():
     every_name = "import echelon\nfor name in echelon.__all__: getattr(echelon, name)"
-    assert not {"cvxpy", "casadi", "viser"} & loaded_after(every_name)
+    assert not {"cvxpy", "casadi"} & loaded_after(every_name)
 
 
 def test_help_loads_no_jax():
@@ -227,19 +228,52 @@ def test_every_public_name_is_there_and_listed():
 
 def test_every_dependency_is_pinned_and_no_index_is_named():
     text = (ROOT / "constraints.txt").read_text("utf-8")
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = project["optional-dependencies"].values()
-    asked = {plain(name) for name in itertools.chain(project["dependencies"], *extras)}
+    extras = project()["optional-dependencies"].values()
+    required = {plain(name) for name in itertools.chain(project()["dependencies"], *extras)}
     pinned = {plain(line) for line in text.splitlines() if "==" in line}
-    assert asked - pinned == {"echelon"}
+    assert required - pinned == {project()["name"]}
     assert "://" not in text and "\n-" not in text
 
 
+def test_every_dependency_is_imported_or_has_its_reason():
+    not_imported = {
+        "h5netcdf": "the engine by which xarray writes and reads run.nc",
+        "h5py": "what h5netcdf writes through, and does not bring",
+    }
+    extras = project()["optional-dependencies"]
+    names = [*project()["dependencies"], *extras["certify"], *extras["optimal"]]
+    required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
+    found = {
+        target.split(".")[0]
+        for module in PATHS
+        for node in statements(tree(module))
+        for target in targets(module, node)
+    }
+    assert required - found == set(not_imported)
+    assert set(extras) == {"certify", "optimal", "all", "dev"}
+
+
+def test_every_advice_to_install_names_this_distribution():
+    """The import is `echelon`, but on the index that name is somebody else's."""
+    files = [*FILES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    advice = re.compile(r"pip install (?:-\S+ )*['\"]?([\w.-]+)(?:\[([\w,-]+)\])?")
+    named = {found for path in files for found in advice.findall(path.read_text("utf-8"))}
+    here = {(name, extra) for name, extra in named if name == "."}
+    extras = {extra for _, extra in named if extra}
+    assert {name for name, _ in named - here} == {project()["name"]}
+    assert extras and extras <= set(project()["optional-dependencies"])
+    assert f"{project()['name']}[certify,optimal]" in project()["optional-dependencies"]["all"]
+
+
 def test_the_version_is_the_same_wherever_it_stands():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    citation = (ROOT / "CITATION.cff").read_text("utf-8")
-    assert importlib.import_module("echelon").__version__ == project["version"]
-    assert f"\nversion: {project['version']}\n" in citation
+    version, citation = project()["version"], (ROOT / "CITATION.cff").read_text("utf-8")
+    assert importlib.import_module("echelon").__version__ == version
+    assert f"\nversion: {version}\n" in citation
+
+
+def project() -> dict[str, Any]:
+    """What pyproject.toml says of the distribution."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
 def plain(requirement: str) -> str:

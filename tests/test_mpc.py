@@ -105,7 +105,7 @@ def test_wind_does_not_add_up_as_it_does_open_loop():
     off, lost = (np.abs(r.states[-1, 0, 0] - r.reference[-1, 0]) for r in (closed, replayed))
     # 1 m/s^2 over 0.6 s is 0.18 m.
     assert lost == pytest.approx(0.18, abs=0.01) and off < 0.1
-    assert closed.disturbance is wind
+    assert closed.world.disturbance is wind
 
 
 def test_agents_renamed_fly_the_same():
@@ -211,7 +211,7 @@ def test_a_run_that_diverges_says_so():
 def test_the_figures_are_kept_with_the_result():
     result = swarm(horizon=0.1)
     figures = result.work
-    assert json.loads(result.provenance["solver"]) == figures._asdict()
+    assert json.loads(ech.dataset(result).attrs["solver"]) == figures._asdict()
     assert figures.method == "mpc" and figures.solver == "piqp" and figures.solves == 4 * 5
     assert 0.0 < figures.median_ms <= figures.p99_ms <= figures.worst_ms
     law = simulate(
@@ -226,14 +226,10 @@ def test_the_figures_are_kept_with_the_result():
     assert law.work is None
 
 
-def test_a_result_s_law_cannot_be_run_by_itself():
-    result = swarm(horizon=0.1)
-    assert result.leader.information == ("the reference",)
-    with pytest.raises(ech.EchelonError, match="use `simulate_plans` or `simulate_mpc`"):
-        simulate(
-            QUADROTOR, TREE, DRAWN, leader=result.leader, follower=result.follower,
-            horizon=0.1, dt=0.01,
-        )  # fmt: skip
+def test_a_result_says_what_its_agents_were_sent():
+    information = swarm(horizon=0.1).drive.information
+    assert information.leader == ("the reference",)
+    assert information.follower[0].startswith("the plans that the neighbours before it")
 
 
 @pytest.mark.parametrize(
@@ -284,7 +280,7 @@ def test_a_state_that_nothing_brings_back_is_told():
 
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'echelon\[optimal\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'echelon-formation\[optimal\]'"):
         swarm()
 
 

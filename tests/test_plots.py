@@ -153,7 +153,8 @@ def test_the_leader_is_drawn_with_its_reference_in_space(runs):
 def test_the_reference_of_a_leader_with_an_offset_has_the_offset(runs):
     result = runs("unicycle")
     offsets = result.formation.offsets + [3.0, 0.0, 0.0]
-    moved = dataclasses.replace(result, formation=Formation(offsets))
+    parts = result.parts.replace(formation=Formation(offsets))
+    moved = dataclasses.replace(result, parts=parts)
     _, lines = drawn(moved, "leader_3d")
     np.testing.assert_array_equal(lines["reference"], result.reference[:, :2] + [3.0, 0.0])
 
@@ -390,9 +391,10 @@ from pathlib import Path
 import echelon as ech
 assert "matplotlib" not in sys.modules
 model, graph = ech.models.SingleIntegrator(dimension=3), ech.Graph.path(3)
-parts = model, graph, ech.Formation.line(model, graph)
 law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
-result = simulate(*parts, leader=ech.laws.TrimInput(), follower=law, horizon=0.1, dt=0.05)
+drive = ech.Laws(ech.laws.TrimInput(), law)
+parts = ech.Parts(model, graph, ech.Formation.line(model, graph), drive)
+result = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.05))
 assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 6
 assert "matplotlib.pyplot" not in sys.modules
 """

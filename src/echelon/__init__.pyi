@@ -21,6 +21,7 @@ from . import (
 from . import (
     references as references,
 )
+from .archive.run import save_run as save_run
 from .certificates.domain import Domain as Domain
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
@@ -76,3 +77,5 @@ from .studies.speedup import speedup as speedup
 from .verifier.verify import verify as verify
 from .world.disturbance import Disturbance as Disturbance
 from .world.world import World as World
+
+__version__: str

@@ -244,7 +244,7 @@ def _cvxpy() -> Any:
     except ImportError:
         raise MissingExtraError(
             "a metric for a polytope of Jacobians needs cvxpy and clarabel; "
-            "install them with `pip install 'echelon[certify]'`."
+            "install them with `pip install 'echelon-formation[certify]'`."
         ) from None
     return cvxpy
 

@@ -3,11 +3,14 @@
 Heavy modules are imported inside each command, so that `--help` is quick.
 """
 
+import os
 import sys
 from typing import Annotated, Final
 
 import typer
 
+from echelon import __version__
+from echelon.cli.cache import keep_compiled_code
 from echelon.cli.check import check
 from echelon.cli.compare import compare
 from echelon.cli.design import design
@@ -19,7 +22,8 @@ from echelon.core.errors import EchelonError
 
 _EPILOG = (
     "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, "
-    "4 an optional part is not installed, 130 interrupted."
+    "4 an optional part is not installed, 130 interrupted. "
+    "ECHELON_CACHE names the folder where compiled code is kept between runs; `off` keeps none."
 )
 _INTERRUPTED: Final = 130
 
@@ -36,6 +40,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an echelon error becomes one sentence and its exit code."""
+    keep_compiled_code(os.environ)
     try:
         app()
     except EchelonError as error:
@@ -54,9 +59,7 @@ def _about(
     ] = False,
 ) -> None:
     if version:
-        from importlib.metadata import version as installed
-
-        print(f"echelon {installed('echelon')}")
+        print(f"echelon {__version__}")
         raise typer.Exit()
 
 

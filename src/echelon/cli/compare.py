@@ -13,7 +13,7 @@ from echelon.cli.console import JsonOption, announce, written
 def compare(
     scenarios: Annotated[
         list[str],
-        typer.Argument(help="Bundled scenarios' names, or YAML files.", metavar="SCENARIO..."),
+        typer.Argument(help="Bundled scenarios' names, or YAML ", metavar="SCENARIO..."),
     ],
     horizon: Annotated[float, typer.Option(help="Length of every run, s.")] = 10.0,
     method: Annotated[
@@ -37,7 +37,8 @@ def compare(
 
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
     checked = [load_scenario(each, changes) for each in scenarios]
-    from echelon.cli import files
+    from echelon.archive.comparison import write_comparison
+    from echelon.archive.folder import claim_folders
     from echelon.reports.comparison import (
         comparison_mapping,
         comparison_report,
@@ -49,13 +50,13 @@ def compare(
 
     labels = known_labels(method)
     parts = [build(each) for each in checked]
-    folders = files.claim_folders([each.name for each in checked], out, force)
+    folders = claim_folders([each.name for each in checked], out, force)
     told = []
     for scenario, built, folder in zip(checked, parts, folders, strict=True):
         found = fly(scenario, built, labels, announce(quiet=as_json))
         told.append(comparison_mapping(found))
         text = comparison_report(found)
-        files.write_comparison(found, told[-1], text, folder, figures)
+        write_comparison(found, told[-1], text, folder, figures)
         if not as_json:
             print_comparison(tables.console(), found)
             print(f"- Written to {folder}: {written(folder)}.")

@@ -29,23 +29,23 @@ def run(
     from echelon.scenario.scenario import load_scenario
 
     checked = load_scenario(scenario, set_ or [])
-    from echelon.cli import files
-    from echelon.reports.run import print_report, report, say
+    from echelon.archive.folder import claim_folder
+    from echelon.archive.run import write_data, write_findings
+    from echelon.reports.run import print_report, say
     from echelon.results.metrics import metrics
     from echelon.scenario import build
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
     built = build.build(checked)
-    folder = files.claim_folder(checked.name, out, force)
+    folder = claim_folder(checked.name, out, force)
     console = tables.console()
     with show_progress(quiet=as_json) as progress:
         result = build.run(checked, progress, built)
-    files.write_data(result, folder)
+    write_data(result, folder)
     numbers = metrics(result)
-    text = report(result)
-    told = files.write_run(result, numbers, text, folder, figures)
+    findings = write_findings(result, folder, figures)
     if as_json:
-        print(json.dumps(told, indent=2))
+        print(json.dumps(findings, indent=2))
     else:
         print_report(console, result, numbers)
         say(console, f"Written to {folder}: {written(folder)}.")

@@ -5,7 +5,9 @@ import subprocess
 from importlib import metadata
 from pathlib import Path
 
-_PACKAGES = ("echelon", "jax", "jaxlib", "equinox", "numpy", "scipy")
+from echelon import __version__
+
+_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 
 
 def versions() -> dict[str, str]:
@@ -13,7 +15,7 @@ def versions() -> dict[str, str]:
 
     In a checkout there is `git` too, the commit.
     """
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version(), "echelon": __version__}
     for package in _PACKAGES:
         try:
             found[package] = metadata.version(package)

@@ -5,7 +5,7 @@ another one here.
 """
 
 import abc
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -19,11 +19,13 @@ from echelon.engine.motion import Motion
 from echelon.engine.settings import Settings
 from echelon.engine.sums import Meter, Sums
 from echelon.engine.work import SolverStats
-from echelon.gains.gain import Gain
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
+
+if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+    from echelon.gains.gain import Gain
 
 Moment: TypeAlias = Any
 """All that changes during a run; each stepper has its own."""
@@ -115,7 +117,7 @@ class Drive(eqx.Module):
         """
 
     @property
-    def gain(self) -> Gain | None:
+    def gain(self) -> "Gain | None":
         """The gain that the followers run with; None where they have none."""
         return None
 

@@ -63,17 +63,20 @@ class HostStepper(Stepper):
                 if not np.isfinite(made.states[-1]).all():
                     break
         except Stopped as reason:
-            return made.chunk(now, f"The run was stopped, since {reason}")
+            made.stopped = f"The run was stopped, since {reason}"
         except KeyboardInterrupt:
-            return made.chunk(now, "The run was interrupted")
+            made.stopped = "The run was interrupted"
         return made.chunk(now)
 
     def _frame(self, now: "_Held", count: int, made: "_Made") -> "_Held":
         """Store a frame and take `count` steps; ask the pilot wherever a hold begins."""
         end = now.step + count
-        now = self._asked(now) if count else now
-        made.states.append(np.asarray(now.states, np.float64))
-        made.inputs.append(np.asarray(now.inputs, np.float64))
+        try:
+            now = self._asked(now) if count else now
+        finally:
+            # Where the pilot stops right here, the frame is kept with the inputs that led to it.
+            if now.step or now.fresh:
+                made.store(now)
         while now.step < end:
             now = self._asked(now)
             steps = min(end, (now.step // self.hold + 1) * self.hold) - now.step
@@ -121,8 +124,14 @@ class _Made:
         self.states: list[Array] = []
         self.inputs: list[Array] = []
         self.sums, self.first, self.reference = sums, first, reference
+        self.stopped: str | None = None
 
-    def chunk(self, now: _Held, stopped: str | None = None) -> Chunk:
+    def store(self, now: _Held) -> None:
+        """Store a frame."""
+        self.states.append(np.asarray(now.states, np.float64))
+        self.inputs.append(np.asarray(now.inputs, np.float64))
+
+    def chunk(self, now: _Held) -> Chunk:
         """Return what was made."""
         shape = np.shape(now.states), np.shape(now.inputs)
         states, inputs = (
@@ -130,7 +139,7 @@ class _Made:
             for rows, each in zip((self.states, self.inputs), shape, strict=True)
         )
         sums = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), self.sums)
-        return Chunk(now, states, inputs, sums, stopped)
+        return Chunk(now, states, inputs, sums, self.stopped)
 
 
 @eqx.filter_jit

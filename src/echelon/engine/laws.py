@@ -1,6 +1,6 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,12 @@ from echelon.core.words import Feedforward
 from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
 from echelon.engine.loop import Loop, Moment, advance, assemble, begin
 from echelon.engine.settings import Settings
-from echelon.gains.gain import Gain
 from echelon.laws.law import Law, gain_of
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+
+if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+    from echelon.gains.gain import Gain
 
 
 @final
@@ -41,7 +43,7 @@ class Laws(Drive):
         return Information(self.leader.information, self.follower.information)
 
     @property
-    def gain(self) -> Gain | None:
+    def gain(self) -> "Gain | None":
         """The gain of the followers' law, where it has one."""
         return gain_of(self.follower)
 

@@ -78,11 +78,17 @@ class Recorder:
             sums = sums.plus(chunk.sums)
         lost = np.argwhere(~(np.isfinite(states).all(axis=2) & np.isfinite(inputs).all(axis=2)))
         cut = int(lost[0, 0]) if len(lost) else len(times)
-        outcome, message = self._verdict(times, lost, len(states) == len(counts))
+        reached = float(times[-1]) if len(times) else 0.0
+        if self.chunks and self.chunks[-1].stopped:
+            reached = float(sums.steps[0]) * settings.dt
+        complete = len(states) == len(counts)
+        outcome, message = self._verdict(times, lost, complete, reached)
         followed = np.concatenate(self.followed)[:cut] if self.followed else None
         return Record(times[:cut], states[:cut], inputs[:cut], followed, sums, outcome, message)
 
-    def _verdict(self, times: Array, lost: Array, complete: bool) -> tuple[Outcome, str]:
+    def _verdict(
+        self, times: Array, lost: Array, complete: bool, reached: float
+    ) -> tuple[Outcome, str]:
         """Return how the run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
@@ -94,7 +100,6 @@ class Recorder:
         stopped = self.chunks[-1].stopped if self.chunks else None
         if complete and stopped is None:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
-        reached = times[-1] if len(times) else 0.0
         return (
             Outcome.INTERRUPTED,
             f"{stopped or _INTERRUPTED} at t = {reached:.6g} s; what was computed is kept.",

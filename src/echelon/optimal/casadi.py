@@ -42,7 +42,8 @@ def casadi() -> Any:
         import casadi
     except ImportError:
         raise MissingExtraError(
-            "optimal control needs casadi; install it with `pip install 'echelon[optimal]'`."
+            "optimal control needs casadi; "
+            "install it with `pip install 'echelon-formation[optimal]'`."
         ) from None
     return casadi
 

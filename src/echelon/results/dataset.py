@@ -3,6 +3,7 @@
 The dataset is one netCDF file, the summary is JSON.
 """
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,9 +59,8 @@ def dataset(result: Result) -> "xr.Dataset":
 
 def _attributes(result: Result) -> dict[str, Any]:
     """Return provenance and settings as attributes that netCDF can hold."""
-    settings = {
-        key: int(v) if isinstance(v, bool) else v for key, v in result.settings._asdict().items()
-    }
+    settings = {**result.settings._asdict(), "steady_window": result.settings.window}
+    settings = {key: int(v) if isinstance(v, bool) else v for key, v in settings.items()}
     laws = {
         f"{role}_needs": "; ".join(sent) or "nothing"
         for role, sent in result.drive.information._asdict().items()
@@ -70,6 +70,8 @@ def _attributes(result: Result) -> dict[str, Any]:
     }
     told |= {"outcome": result.outcome.name.lower(), "message": result.message}
     warnings = {"warnings": "\n".join(result.warnings)}
+    if result.work is not None:
+        told["solver"] = json.dumps(result.work._asdict())
     return {
         **result.provenance,
         **told,

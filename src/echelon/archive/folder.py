@@ -3,19 +3,12 @@
 It is checked before the run, so that nothing is lost.
 """
 
-import json
 import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from echelon.core.errors import OutputError
-from echelon.engine.result import Result
-from echelon.results.dataset import save_dataset, summary
-from echelon.results.lyapunov import lyapunov
-from echelon.results.metrics import Metrics
-from echelon.studies.compare import Comparison
 
 _OURS = (
     *("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures"),
@@ -35,7 +28,7 @@ def claim_folder(name: str, out: Path | None, force: bool) -> Path:
     try:
         return _named_folder(out, force) if out is not None else _new_folder(Path("runs"), name)
     except OSError as error:
-        raise _unwritable(out if out is not None else Path("runs"), error) from error
+        raise unwritable(out if out is not None else Path("runs"), error) from error
 
 
 def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[Path]:
@@ -86,67 +79,6 @@ def _named_folder(out: Path, force: bool) -> Path:
     return out
 
 
-def write_data(result: Result, folder: Path) -> None:
-    """Write a run's dataset and scenario: what must not be lost, before all else.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    try:
-        if "scenario_text" in result.provenance:
-            text = result.provenance["scenario_text"]
-            (folder / "scenario.yaml").write_text(text, "utf-8")
-        save_dataset(result, folder / "run.nc")
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-
-
-def write_run(
-    result: Result, numbers: Metrics, text: str, folder: Path, figures: bool = True
-) -> dict[str, Any]:
-    """Write what is made of a run: summary, report and figures; return the summary.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    told = summary(result, numbers)
-    try:
-        content = json.dumps(told, indent=2, allow_nan=False)
-        (folder / "summary.json").write_text(content + "\n", "utf-8")
-        (folder / "report.txt").write_text(text + "\n", "utf-8")
-        if figures and len(result.times):
-            from echelon.plots.run import save_figures
-
-            v = lyapunov(result)
-            save_figures(result, folder, None if v is None else (v.value, v.rate))
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-    return told
-
-
-def write_comparison(
-    comparison: Comparison, told: dict[str, Any], text: str, folder: Path, figures: bool = True
-) -> None:
-    """Write a comparison: numbers, text, each run's dataset under `runs`, and the figures.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    try:
-        (folder / "runs").mkdir(parents=True, exist_ok=True)
-        for row in comparison.rows:
-            if row.flight is not None:
-                save_dataset(row.flight.result, folder / "runs" / f"{row.label}.nc")
-        content = json.dumps(told, indent=2, allow_nan=False)
-        (folder / "comparison.json").write_text(content + "\n", "utf-8")
-        (folder / "comparison.txt").write_text(text + "\n", "utf-8")
-        if figures:
-            from echelon.plots.comparison import save_comparison_figures
-
-            save_comparison_figures(comparison, folder)
-    except OSError as error:
-        raise _unwritable(folder, error) from error
-
-
-def _unwritable(folder: Path, error: OSError) -> OutputError:
+def unwritable(folder: Path, error: OSError) -> OutputError:
+    """Return the error of a folder that cannot be written, with the reason."""
     return OutputError(f"the folder `{folder}` cannot be written: {error.strerror or error}.")

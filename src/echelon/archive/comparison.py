@@ -1,0 +1,33 @@
+"""The folder of a comparison: numbers, text, each run's dataset, and the figures."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from echelon.archive.folder import unwritable
+from echelon.results.dataset import save_dataset
+from echelon.studies.compare import Comparison
+
+
+def write_comparison(
+    comparison: Comparison, told: dict[str, Any], text: str, folder: Path, figures: bool = True
+) -> None:
+    """Write a comparison: numbers, text, each run's dataset under `runs`, and the figures.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    try:
+        (folder / "runs").mkdir(parents=True, exist_ok=True)
+        for row in comparison.rows:
+            if row.flight is not None:
+                save_dataset(row.flight.result, folder / "runs" / f"{row.label}.nc")
+        content = json.dumps(told, indent=2, allow_nan=False)
+        (folder / "comparison.json").write_text(content + "\n", "utf-8")
+        (folder / "comparison.txt").write_text(text + "\n", "utf-8")
+        if figures:
+            from echelon.plots.comparison import save_comparison_figures
+
+            save_comparison_figures(comparison, folder)
+    except OSError as error:
+        raise unwritable(folder, error) from error
