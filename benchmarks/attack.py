@@ -24,6 +24,7 @@ import numpy as np
 from attack_systems import METHODS, Plant, System, random_method, random_system
 
 import echelon as ech
+from echelon.core.words import Kind, Theorem
 
 REPORT = Path(__file__).resolve().parent / "attack.json"
 EPS = float(np.finfo(float).eps)
@@ -42,8 +43,8 @@ class Promise:
     and of normalized inputs. `radius` is None where the domain bounds nothing.
     """
 
-    kind: str
-    theorem: str
+    kind: Kind
+    theorem: Theorem
     rate: float
     radius: float | None
     P: np.ndarray
@@ -61,7 +62,7 @@ class Promise:
     def strength(self) -> float:
         """2 c lambda_min; 0 for the drift alone."""
         low = float(np.linalg.eigvalsh(self.grounded)[0])
-        return 0.0 if self.theorem == "A5" else 2.0 * self.coupling * low
+        return 0.0 if self.theorem is Theorem.A5 else 2.0 * self.coupling * low
 
     def widened(self, factor: float) -> "Promise":
         """Return the false promise of the same on a wider domain."""
@@ -87,7 +88,7 @@ class Outcome:
 def promise_of(system: System, gain: ech.Gain) -> Promise | None:
     """Return the promise on the system's domain that a gain carries, or None."""
     region, plant = gain.certificate.region, system.plant
-    if region is None or region.kind not in ("proof", "vertices"):
+    if region is None or region.kind not in (Kind.PROOF, Kind.VERTICES):
         return None
     return Promise(
         kind=region.kind,
@@ -111,7 +112,7 @@ def attack(promise: Promise, rng: np.random.Generator) -> Outcome:
     """Search for a violation by gradients, then by simulation."""
     search = Search(promise)
     margin, tolerance, worst, points = search.run(rng)
-    found = Outcome(promise.kind, promise.theorem, margin, tolerance, np.inf, points, 0)
+    found = Outcome(str(promise.kind), str(promise.theorem), margin, tolerance, np.inf, points, 0)
     if margin < -tolerance:
         found.violations.append(
             f"state: rate {margin:.3g} 1/s below the promised {promise.rate:.3g}"
@@ -218,7 +219,7 @@ def simulate(
     promise: Promise, worst: np.ndarray, size: float, rng: np.random.Generator, found: Outcome
 ) -> None:
     """Run the closed loop where the promise speaks of it, and note what it breaks."""
-    if promise.theorem == "T2":
+    if promise.theorem is Theorem.T2:
         _variational(promise, worst, size, rng, found)
     else:
         _resting(promise, worst, size, rng, found)
@@ -333,7 +334,7 @@ def _compare(
         rough, fine = (_runge_kutta(_loop(p), x, w, dt, cut) for cut in (1, 2))
     # A monotone drift promises the paper's V, whose weight is the grounded Laplacian.
     weight = np.eye(len(p.grounded))
-    if p.theorem == "A5" and not p.plant.constant:
+    if p.theorem is Theorem.A5 and not p.plant.constant:
         weight = p.grounded
     rough_v, v = (_energy(path[:, :, 1:] - path[:, :, :1], weight, p.P) for path in (rough, fine))
     inside = ((fine >= p.low) & (fine <= p.high)).all(axis=(2, 3))
@@ -425,7 +426,7 @@ def study(seed: int, number: int, methods: int = 2) -> list[dict[str, Any]]:
             record |= asdict(attack(promise, rng)) | {"rate": promise.rate}
         else:
             region = gain.certificate.region
-            record["kind"] = gain.certificate.kind if region is None else region.kind
+            record["kind"] = str(gain.certificate.kind if region is None else region.kind)
         records.append(record)
     return records
 

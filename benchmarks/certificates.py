@@ -158,7 +158,7 @@ def euler() -> list[Row]:
     """Measure the 12 states in Euler rates, whose thrust turns with the vehicle."""
     model, bounds = ech.models.QuadrotorEuler(), tilted(20.0, 10.0, 2.0)
     gain, seconds = timed(lambda: ech.synthesize(model, LINE, ech.gains.RobustLQR(bounds)))
-    low = float(LINE.grounded_spectrum()[0])
+    low = LINE.spectrum().low
     at_edge = ech.gains.RobustLQR(bounds, coupling=0.5 / low)
     what = "robust LQR, 12 states, tilt 20, yaw 10 deg, +-2 m/s^2"
     return [
@@ -250,7 +250,7 @@ def growth() -> tuple[str, str]:
     for followers in (3, 10, 30, 100):
         graph = ech.Graph.path(followers + 1)
         constant = time_constant(model, graph, ech.synthesize(model, graph, ech.gains.InnerLoop()))
-        needed = 0.5 / float(graph.grounded_spectrum()[0])
+        needed = 0.5 / graph.spectrum().low
         lines.append(f"| {followers} | {constant:.3g} s | {needed:.3g} |")
     graph = ech.Graph.path(31)
     gain = ech.synthesize(model, graph, ech.gains.InnerLoop())

@@ -61,10 +61,10 @@ def main() -> None:
     print(f"echelon check paper: {command('check', 'paper')}")
     agent = ech.models.Quadrotor()
     with precision("float64"):
-        riccati = milliseconds(lambda: ech.gains.Riccati().solve(agent, GRAPH))
-        gain, (A, B) = ech.gains.Riccati().solve(agent, GRAPH), linearize(agent)
+        riccati = milliseconds(lambda: ech.gains.Riccati().solve(agent, GRAPH.spectrum()))
+        gain, (A, B) = ech.gains.Riccati().solve(agent, GRAPH.spectrum()), linearize(agent)
     print(f"riccati: {riccati:.1f} ms")
-    loop = ClosedLoop(A, B, gain.P, gain.R, gain.coupling, GRAPH.grounded_spectrum())
+    loop = ClosedLoop(A, B, gain.P, gain.R, gain.coupling, GRAPH.spectrum().eigenvalues)
     push = np.eye(len(A))[:, 3:6]
     for name, act in {
         "gain margin": lambda: gain_margin(loop),

@@ -32,12 +32,12 @@ settings.load_profile("echelon")
 @pytest.fixture
 def echelon(monkeypatch, capsys):
     """Run the command line in this process: exit code, standard output, standard error."""
-    from echelon.cli import app as cli
+    from echelon.cli.app import main
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])
         with pytest.raises(SystemExit) as left:
-            cli.main()
+            main()
         told = capsys.readouterr()
         return left.value.code or 0, told.out, told.err
 

@@ -11,6 +11,7 @@ import pytest
 import echelon as ech
 from echelon.certificates.jacobians import model_jacobian
 from echelon.core.numerics import precision
+from echelon.core.words import Theorem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from attack import attack, promise_of, study  # noqa: E402
@@ -106,7 +107,7 @@ def test_a_varying_input_map_certifies_no_set():
     system = random_system(1, 50)
     method = ech.gains.Contraction(system.domain(), rate=0.2, exact=False)
     region = ech.synthesize(system.model, system.graph, method).certificate.region
-    assert (region.theorem, region.radius) == ("T2", None)
+    assert (region.theorem, region.radius) == (Theorem.T2, None)
 
 
 def test_a_drift_that_contracts_by_itself_takes_any_coupling():

@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.studies.check import check
 from echelon.studies.finite_condition import pair_values
 from echelon.studies.region import killing_residual
 
 PATH = ech.Graph.path(4)
-LOW, _, HIGH = PATH.grounded_spectrum()
+LOW, _, HIGH = PATH.spectrum().eigenvalues
 
 
 class Line1(ech.ControlAffine):
@@ -97,18 +98,18 @@ def goals(*offsets):
 def test_the_sign_is_that_of_goals_that_pull_together():
     # f = -x: (1 - 0) P (-1 - 0) = -P; the paper's d_ij = xi_j - xi_i would turn it.
     good = ech.finite_condition(np.eye(1) * 2.0, Line1(-1.0), goals(0.0, 1.0))
-    assert (good.verdict, good.largest, good.least) == ("holds", pytest.approx(-2.0), 2.0)
+    assert (good.verdict, good.largest, good.least) == (Verdict.HOLDS, pytest.approx(-2.0), 2.0)
     bad = ech.finite_condition(np.eye(1) * 2.0, Line1(0.5), goals(0.0, 1.0, 3.0))
-    assert (bad.verdict, bad.largest) == ("fails", pytest.approx(9.0))
+    assert (bad.verdict, bad.largest) == (Verdict.FAILS, pytest.approx(9.0))
     assert set(bad.pair) == {0, 2} and bad.agents == 3
 
 
 def test_goals_that_f_does_not_tell_apart_make_it_empty():
     agent = ech.models.Quadrotor()
     formation = ech.Formation.from_offsets(agent, PATH, {1: (1, 0, 0), 2: (0, 3, 0)})
-    assert ech.finite_condition(np.eye(12), agent, formation).verdict == "vacuous"
+    assert ech.finite_condition(np.eye(12), agent, formation).verdict is Verdict.VACUOUS
     # Smaller than I it is refused even then, and a multiple of it is not.
-    assert ech.finite_condition(0.5 * np.eye(12), agent, formation).verdict == "fails"
+    assert ech.finite_condition(0.5 * np.eye(12), agent, formation).verdict is Verdict.FAILS
 
 
 @given(st.integers(0, 10**6), st.floats(0.1, 10.0))
@@ -124,7 +125,7 @@ def test_the_condition_is_linear_in_p(seed, factor):
     formation = ech.Formation(rng.normal(size=(5, 3)))
     verdicts = [ech.finite_condition(M, model, formation).verdict for M in (P, Q, P + Q)]
     # What two pass, their sum passes.
-    assert "holds" not in verdicts[:2] or verdicts[:2] != ["holds"] * 2 or verdicts[2] == "holds"
+    assert verdicts[:2] != [Verdict.HOLDS] * 2 or verdicts[2] is Verdict.HOLDS
 
 
 @given(st.integers(0, 10**6))
@@ -143,7 +144,7 @@ def test_the_largest_pair_is_the_largest(seed):
 
 def test_a_swarm_is_compared_by_a_thousand_of_its_agents():
     found = ech.finite_condition(np.eye(1), Line1(-1.0), goals(*np.linspace(0.0, 1.0, 5000)))
-    assert (found.verdict, found.agents) == ("holds", 1000)
+    assert (found.verdict, found.agents) == (Verdict.HOLDS, 1000)
 
 
 def test_a_p_of_another_size_or_sign_is_refused():
@@ -159,8 +160,8 @@ def test_a_p_of_another_size_or_sign_is_refused():
 def test_the_region_is_told_and_the_promise_says_it(robust):
     lines, found = lines_of(robust)
     region = robust.follower.gain.certificate.region
-    assert lines["region of the gain"].verdict == "holds"
-    assert lines["region of the gain"].kind == region.kind == "vertices"
+    assert lines["region of the gain"].verdict is Verdict.HOLDS
+    assert lines["region of the gain"].kind is region.kind is Kind.VERTICES
     assert lines["region of the gain"].number == f"{region.rate:.3g} 1/s"
     assert found.promised and "corners of a hull" in found.promise
     assert f"{region.rate:.3g} 1/s or faster" in found.promise and "(T1)" in found.promise
@@ -192,14 +193,14 @@ def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
     alone, _ = lines_of(robust)
     share = number(lines["certified set"]) / number(alone["certified set"])
     assert share == pytest.approx((0.5 - reach) / 0.5, rel=2e-2)
-    assert lines["certified set"].kind == "samples"
+    assert lines["certified set"].kind is Kind.SAMPLES
     assert "as in a run of its own" in found.promise
 
 
 def test_a_leader_that_leaves_the_domain_leaves_no_set():
     lines, found = checked(ROBUST, leader={"law": "passive", "start_error": {"angle": 0.6}})
     line = lines["certified set"]
-    assert (line.verdict, line.number) == ("fails", "empty")
+    assert (line.verdict, line.number) == (Verdict.FAILS, "empty")
     assert "the leader alone reaches 0.6 in `angle`, and the domain 0.5" in line.text
     assert "no start is certified" in found.promise
 
@@ -207,11 +208,11 @@ def test_a_leader_that_leaves_the_domain_leaves_no_set():
 @pytest.mark.parametrize(
     ("changes", "told", "untold"),
     [
-        ({"kind": "proof"}, "Proved in exact arithmetic", "samples"),
-        ({"kind": "samples"}, "Seen at samples, which is no proof", "Proved"),
-        ({"theorem": "T2"}, "small errors shrink", "from any start"),
+        ({"kind": Kind.PROOF}, "Proved in exact arithmetic", "samples"),
+        ({"kind": Kind.SAMPLES}, "Seen at samples, which is no proof", "Proved"),
+        ({"theorem": Theorem.T2}, "small errors shrink", "from any start"),
         ({"rate": 0.0}, "no region is proved", "errors shrink"),
-        ({"theorem": "A5", "rate": 0.0}, "V does not rise", "errors shrink"),
+        ({"theorem": Theorem.A5, "rate": 0.0}, "V does not rise", "errors shrink"),
     ],
 )
 def test_the_promise_is_as_strong_as_its_argument(robust, changes, told, untold):
@@ -222,9 +223,9 @@ def test_the_promise_is_as_strong_as_its_argument(robust, changes, told, untold)
 def test_where_only_the_drift_is_known_the_set_pays_for_the_graph_if_g_varies(robust):
     whole, _ = lines_of(robust)
     radius = number(whole["certified set"])
-    drift, _ = lines_of(with_region(robust, theorem="A5", rate=0.0))
+    drift, _ = lines_of(with_region(robust, theorem=Theorem.A5, rate=0.0))
     assert number(drift["certified set"]) == radius
-    varying = with_region(robust, theorem="A5", rate=0.0)._replace(model=Weakening())
+    varying = with_region(robust, theorem=Theorem.A5, rate=0.0)._replace(model=Weakening())
     drift, _ = lines_of(varying)
     assert number(drift["certified set"]) == pytest.approx(radius * np.sqrt(LOW / HIGH), rel=5e-3)
 
@@ -247,14 +248,14 @@ def test_turning_the_input_stretches_distances_by_half():
     for weight in (0.25, 1.0, 9.0):
         with precision("float64"):
             found, kind = killing_residual(agent, np.diag([1.0, 1.0, weight]), domain)
-        assert (found, kind) == (pytest.approx(0.5 / np.sqrt(weight)), "samples")
+        assert (found, kind) == (pytest.approx(0.5 / np.sqrt(weight)), Kind.SAMPLES)
 
 
 def test_a_constant_input_map_is_a_proof():
     agent = ech.models.QuadrotorThrust()
     domain = ech.Domain.about(agent, {"attitude": 0.3, "thrust": 1.0})
     with precision("float64"):
-        assert killing_residual(agent, np.eye(13), domain) == (0.0, "proof")
+        assert killing_residual(agent, np.eye(13), domain) == (0.0, Kind.PROOF)
 
 
 def test_a_skew_input_is_killing_in_the_metric_that_it_turns():
@@ -286,7 +287,7 @@ def test_a_held_integrator_bears_two_time_constants():
     assert longest_step(-one, one, [0.5 * one]) == np.inf
 
 
-@pytest.mark.parametrize(("share", "verdict"), [(0.99, "holds"), (1.01, "fails")])
+@pytest.mark.parametrize(("share", "verdict"), [(0.99, Verdict.HOLDS), (1.01, Verdict.FAILS)])
 def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
     gain = {"method": "given", "P": "identity", "coupling": 1.0}
     dt = share * 2.0 / float(HIGH)
@@ -295,8 +296,8 @@ def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
         model={"name": "single-integrator"},
         simulation={"horizon": 10.0, "dt": dt},
     )
-    assert lines["step, input held"].verdict == verdict
-    assert found.promised is (verdict == "holds")
+    assert lines["step, input held"].verdict is verdict
+    assert found.promised is (verdict is Verdict.HOLDS)
     if not found.promised:
         assert "with the input held over the step `dt` it grows" in found.promise
 
@@ -316,21 +317,21 @@ def test_a_law_without_its_trim_input_is_promised_nothing():
     step = {"horizon": 1.0, "dt": 0.002}
     quadrotor = {"model": {"name": "planar-quadrotor"}, "simulation": step}
     lines, found = checked({"trim": False}, **quadrotor)
-    assert lines["Definition 1, f(0) = 0"].verdict == "fails" and not found.promised
+    assert lines["Definition 1, f(0) = 0"].verdict is Verdict.FAILS and not found.promised
     assert "leaves out the trim input" in found.promise
     lines, found = checked({}, **quadrotor)
-    assert lines["Definition 1, f(0) = 0"].verdict == "holds" and found.promised
+    assert lines["Definition 1, f(0) = 0"].verdict is Verdict.HOLDS and found.promised
 
 
 def test_wind_and_another_plant_are_left_out_of_the_promise_and_said_to_be():
     wind = {"disturbance": {"rms": {"rate": 0.1}}}
     plant = {"plant": {"scale": {"damping": 1.1}}}
     lines, calm = checked({})
-    assert lines["Assumption 3, exact states"].verdict == "holds"
+    assert lines["Assumption 3, exact states"].verdict is Verdict.HOLDS
     assert "without" not in calm.promise
     for sections, told in ((wind, "wind or noise acts"), (plant, "differ from the model")):
         lines, found = checked({}, **sections)
-        assert lines["Assumption 3, exact states"].verdict == "fails"
+        assert lines["Assumption 3, exact states"].verdict is Verdict.FAILS
         assert found.promised and told in found.promise
 
 
@@ -338,17 +339,8 @@ def test_every_failure_says_what_to_change():
     for name in ("paper-literal", "paper"):
         found = check(ech.build(ech.load_scenario(name)))
         for line in found.lines:
-            assert (
-                line.statement
-                and line.kind
-                and line.verdict
-                in (
-                    "holds",
-                    "fails",
-                    "vacuous",
-                    "not needed",
-                )
-            )
+            assert line.statement
+            assert isinstance(line.kind, Kind) and isinstance(line.verdict, Verdict)
             assert line.text, line.statement
 
 
@@ -378,7 +370,7 @@ def test_a_chain_of_integrators_passes_on_what_it_gets():
     model = {"name": "single-integrator"}
     lines, _ = checked({"gain": gain}, model=model)
     assert lines["string gain"].number == "1, 1 over 3 links"
-    assert lines["string gain"].verdict == "not needed"
+    assert lines["string gain"].verdict is Verdict.NOT_NEEDED
     lines, _ = checked({"gain": gain}, model=model, graph={"name": "ring", "agents": 4})
     assert "string gain" not in lines
 
@@ -396,7 +388,7 @@ def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
     assert "disturbance, network" not in lines
     lines, found = checked({**follower, "feedforward": "relay"},
                            model={"name": "double-integrator"}, graph=graph)  # fmt: skip
-    assert lines["coupling"].verdict == "fails"
+    assert lines["coupling"].verdict is Verdict.FAILS
 
 
 # ---- bad input ----

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.cli import app as cli
+from echelon.cli.app import app
 from echelon.reports.comparison import comparison_report, verdict
 from echelon.studies.compare import LABELS, Comparison
 
@@ -100,7 +100,7 @@ def test_the_command_writes_numbers_text_runs_and_figures(tmp_path, capsys):
     arguments = ["compare", "planar-quadrotor", "--horizon", "0.5", "--out", str(out), "--json"]
     for label in ("riccati", "riccati-relay"):
         arguments += ["--method", label]
-    cli.app(arguments, standalone_mode=False)
+    app(arguments, standalone_mode=False)
     told = json.loads(capsys.readouterr().out)
     assert told == json.loads((out / "comparison.json").read_text())
     assert list(told["methods"]) == ["riccati-relay", "riccati"]
@@ -116,7 +116,7 @@ def test_the_command_writes_numbers_text_runs_and_figures(tmp_path, capsys):
 def test_two_scenarios_get_a_folder_each(tmp_path, capsys):
     out = tmp_path / "both"
     arguments = ["compare", "integrators", "van-der-pol", "--horizon", "0.1", "--no-figures"]
-    cli.app([*arguments, "--method", "riccati", "--out", str(out)], standalone_mode=False)
+    app([*arguments, "--method", "riccati", "--out", str(out)], standalone_mode=False)
     assert sorted(path.name for path in out.iterdir()) == ["integrators", "van-der-pol"]
     assert "what it takes" in capsys.readouterr().out
 

@@ -2,9 +2,13 @@
 
 import contextlib
 import io
+import json
 import operator
+import os
 import re
 import shlex
+import shutil
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -14,8 +18,9 @@ import matplotlib
 import pytest
 
 import echelon as ech
-from echelon.cli import app as cli
+from echelon.cli.app import main
 from echelon.reports.printed import PRINTED
+from echelon.scenario.registry import METHODS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -127,7 +132,7 @@ class Reader:
         out = io.StringIO()
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
             with pytest.raises(SystemExit) as left:
-                cli.main()
+                main()
         self.code = left.value.code or 0
         return out.getvalue()
 
@@ -140,6 +145,51 @@ def test_every_block_runs_and_prints_what_stands_below_it(name, folder, monkeypa
             reader.types(block)
             done += block.language == "python"
     assert done
+
+
+PENDULUM = """name: pushed
+model: {name: pendulum}
+graph: {name: path, agents: 5}
+follower: {gain: {method: decay, weight: 2.0}}
+simulation: {horizon: 1.0, dt: 0.01}
+"""
+
+
+def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
+    """Its class becomes a file, and what its section adds to two others is added."""
+    package = tmp_path / "echelon"
+    shutil.copytree(ROOT / "src" / "echelon", package, ignore=shutil.ignore_patterns("__pycache__"))
+    section = page("extending.md").read_text("utf-8").partition("## A gain method")[2]
+    code = re.search(r"class Decay.*?\n\n\n", section, re.DOTALL)[0]
+    head = "import numpy as np\nimport scipy.linalg\n\nimport echelon as ech\n\n\n"
+    (package / "gains" / "decay.py").write_text(head + code, "utf-8")
+    added = re.findall(r"^ (.+)\n\+(.+)$", section.partition("## A reference")[0], re.MULTILINE)
+    files = ("gains/__init__.py", "scenario/registry.py")
+    for file, (above, line) in zip(files, added, strict=True):
+        text = (package / file).read_text("utf-8")
+        assert text.count(f"{above}\n") == 1
+        (package / file).write_text(text.replace(above, f"{above}\n{line}"), "utf-8")
+    (tmp_path / "pushed.yaml").write_text(PENDULUM)
+
+    def call(*arguments):
+        command = [sys.executable, "-m", "echelon", "design", "pushed.yaml", *arguments]
+        given = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=given)
+
+    done = call("--json")
+    assert done.returncode == 0, done.stderr
+    rows = {row["method"]: row for row in json.loads(done.stdout)["methods"]}
+    assert {*rows} == {*METHODS, "decay"} - {"given"}
+    assert (rows["decay"]["coupling"], rows["decay"]["edge"]) == (1.0, 0.0)
+    assert rows["decay"]["slowest_mode"] < 0.0
+    assert rows["contraction"]["reason"] == "give `follower.gain.domain` to try it"
+    refused = call("--set", "follower.gain.Q=[1, 1]")
+    assert refused.returncode == 2
+    said = "got a key that `decay` does not take, allowed beside it are `weight`, `coupling`."
+    assert refused.stderr.strip().endswith(f"follower.gain.Q: {said}")
+    refused = call("--set", "follower.gain.wait=1")
+    assert "follower.gain.wait: got an unknown key" in refused.stderr
+    assert refused.stderr.strip().endswith("(did you mean `weight`?).")
 
 
 def test_few_blocks_are_left_out():

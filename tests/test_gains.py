@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from echelon.core import numerics
 from echelon.core.errors import GainError
 from echelon.core.linear import observability_rank
-from echelon.gains import FixedGain, Riccati
+from echelon.core.words import Kind
+from echelon.gains import Feedback, FixedGain, Method, Riccati
 from echelon.gains.gain import synthesize
 from echelon.models import (
     ControlAffine,
@@ -110,7 +111,7 @@ def test_riccati_solves_its_equation_and_stabilizes_every_mode(model):
     worst = max(modes(gain, A, B, lam).real.max() for lam in (low, 1.0, 2.0 + np.sqrt(3.0)))
     assert worst < 0.0
     assert gain.certificate.abscissa == pytest.approx(worst, rel=1e-4, abs=1e-7)
-    assert gain.certificate.stable and gain.certificate.kind == "linearization"
+    assert gain.certificate.stable and gain.certificate.kind is Kind.LINEARIZATION
     assert gain.certificate.observable == len(model.state_names)
     assert gain.method == "riccati"
     assert {P.dtype, gain.R.dtype, gain.R_inverse.dtype} == {np.dtype(np.float64)}
@@ -151,7 +152,7 @@ def test_the_quadrotor_s_weights_are_those_of_its_documentation():
 def test_the_coupling_edge_is_a_guarantee_and_half_of_it_loses_the_line():
     A, B = near_trim(QUAD)
     gain = synthesize(QUAD, LINE, Riccati())
-    spectrum = LINE.grounded_spectrum()
+    spectrum = LINE.spectrum().eigenvalues
     edge = gain.certificate.edge
     assert edge == pytest.approx(0.5 / spectrum[0]) and edge == pytest.approx(2.52, abs=0.01)
     assert gain.coupling == pytest.approx(2.0 * edge)
@@ -167,8 +168,8 @@ def test_the_coupling_edge_is_a_guarantee_and_half_of_it_loses_the_line():
 def test_any_coupling_above_the_edge_stabilizes_any_linear_agent(seed):
     rng = np.random.default_rng(seed)
     A, B = rng.normal(size=(3, 3)), rng.normal(size=(3, 1))
-    gain = synthesize(Linear(A, B), LINE, Riccati(coupling=0.5 / LINE.grounded_spectrum()[0]))
-    for lam in LINE.grounded_spectrum():
+    gain = synthesize(Linear(A, B), LINE, Riccati(coupling=0.5 / LINE.spectrum().low))
+    for lam in LINE.spectrum().eigenvalues:
         assert modes(gain, A, B, lam).real.max() < 1e-9
     assert gain.certificate.abscissa < 1e-9
 
@@ -223,6 +224,38 @@ def test_a_position_without_weight_cannot_be_held():
     for Q in ([0.0, 1.0], [0.0, 0.0]):
         with pytest.raises(GainError):
             synthesize(DoubleIntegrator(1), LINE, Riccati(Q=Q))
+
+
+# ---- methods ----
+
+
+class Half(Method):
+    """P = I, which needs strength 3 for x' = 1.5 x."""
+
+    name = "half"
+
+    def feedback(self, model, linear):
+        return Feedback(np.eye(1), np.eye(1), rho=3.0)
+
+
+def test_the_coupling_is_the_edge_of_the_strength_times_the_headroom():
+    growing, low = Linear([[1.5]], [[1.0]]), LINE.spectrum().low
+    gain = synthesize(growing, LINE, Half())
+    assert gain.certificate.edge == pytest.approx(1.5 / low) and gain.method == "half"
+    assert gain.coupling == 2.0 * gain.certificate.edge
+    at_edge = synthesize(growing, LINE, Half(coupling=gain.certificate.edge))
+    assert at_edge.certificate.abscissa == pytest.approx(0.0, abs=1e-12)
+    with pytest.raises(GainError, match="`coupling` is -1.0"):
+        synthesize(growing, LINE, Half(coupling=-1.0))
+
+
+def test_a_method_without_a_name_is_refused():
+    class Nameless(Method):
+        def feedback(self, model, linear):
+            return Feedback(np.eye(1), np.eye(1), rho=3.0)
+
+    with pytest.raises(GainError, match="`Nameless` has no `name`"):
+        synthesize(Linear([[1.5]], [[1.0]]), LINE, Nameless())
 
 
 # ---- gains of one's own ----

@@ -47,7 +47,7 @@ def test_grounded_laplacian_is_the_positive_definite_follower_block(graph):
     assert np.array_equal(L, L.T)
     values = np.linalg.eigvalsh(L)
     assert values[0] > 0.0
-    assert graph.grounded_spectrum() == pytest.approx(values, rel=1e-9)
+    assert graph.spectrum().eigenvalues == pytest.approx(values, rel=1e-9)
 
 
 @given(graphs())
@@ -108,7 +108,7 @@ def test_renaming_agents_renames_everything(graph, random, seed):
     places = np.ix_(order, order)
     assert renamed.laplacian().toarray()[places] == pytest.approx(graph.laplacian().toarray())
     assert sorted(order[k] for k in graph.leaders) == list(renamed.leaders)
-    assert renamed.grounded_spectrum() == pytest.approx(graph.grounded_spectrum(), rel=1e-9)
+    assert renamed.spectrum().eigenvalues == pytest.approx(graph.spectrum().eigenvalues, rel=1e-9)
     y = np.random.default_rng(seed).normal(size=(graph.agents, 3))
     moved = np.empty_like(y)
     moved[order] = y
@@ -121,16 +121,17 @@ def test_renaming_agents_renames_everything(graph, random, seed):
 def test_an_edge_without_a_weight_weighs_one(graph):
     assert np.array_equal(graph.weights, np.ones(len(graph.edges)))
     twice = Graph([(i, j, 2.0) for i, j in graph.edges.tolist()], graph.leaders, graph.agents)
-    assert twice.grounded_spectrum() == pytest.approx(2.0 * graph.grounded_spectrum(), rel=1e-9)
+    doubled = 2.0 * graph.spectrum().eigenvalues
+    assert twice.spectrum().eigenvalues == pytest.approx(doubled, rel=1e-9)
 
 
 def test_one_more_edge_never_slows_the_slowest_mode():
     path = Graph.path(6)
-    low = path.grounded_spectrum()[0]
+    low = path.spectrum().low
     for i in range(6):
         for j in range(i + 2, 6):
             more = Graph([*path.edges.tolist(), (i, j)])
-            assert more.grounded_spectrum()[0] >= low - 1e-12
+            assert more.spectrum().low >= low - 1e-12
 
 
 # ---- spectra in closed form ----
@@ -151,7 +152,7 @@ def path_spectrum(followers):
     ids=["tree", "line"],
 )
 def test_spectra_of_the_paper_s_two_graphs(edges, spectrum):
-    got = Graph.from_edges(edges).grounded_spectrum()
+    got = Graph.from_edges(edges).spectrum().eigenvalues
     assert got == pytest.approx(spectrum, rel=1e-12)
     printed = {3.732: [0.268, 1.0, 3.732], 3.247: [0.198, 1.555, 3.247]}
     assert got == pytest.approx(printed[round(float(got[-1]), 3)], abs=5e-4)
@@ -159,22 +160,30 @@ def test_spectra_of_the_paper_s_two_graphs(edges, spectrum):
 
 @pytest.mark.parametrize("followers", [1, 10, 400, 401, 1000])
 def test_long_paths_have_the_spectrum_of_a_chain(followers):
-    spectrum = Graph.path(followers + 1).grounded_spectrum()
-    wanted = path_spectrum(followers)
-    assert spectrum[0] == pytest.approx(wanted[0], rel=1e-9)
-    assert spectrum[-1] == pytest.approx(wanted[-1], rel=1e-9)
-    assert np.all(np.diff(spectrum) >= 0.0)
+    spectrum, wanted = Graph.path(followers + 1).spectrum(), path_spectrum(followers)
+    assert spectrum.low == pytest.approx(wanted[0], rel=1e-9)
+    assert spectrum.high == pytest.approx(wanted[-1], rel=1e-9)
+    assert np.all(np.diff(spectrum.eigenvalues) >= 0.0)
+    assert spectrum.total == followers
+    assert len(spectrum.eigenvalues) == (followers if followers <= 400 else 2)
+
+
+def test_parents_make_a_spectrum_of_the_weights_that_followers_feel():
+    edges = [(0, 1, 2.0), (1, 2, 0.5), (1, 3, 2.0), (3, 4, 3.0)]
+    assert Graph(edges).parent_spectrum().eigenvalues.tolist() == [0.5, 2.0, 3.0]
+    led = Graph(edges, leaders=[3, 4]).parent_spectrum()
+    assert (led.eigenvalues.tolist(), led.total) == ([0.5, 2.0], 2)
 
 
 def test_a_star_is_grounded_to_ones_and_a_complete_graph_to_one_and_all():
-    assert Graph.star(6).grounded_spectrum() == pytest.approx(np.ones(5))
-    assert Graph.complete(6).grounded_spectrum() == pytest.approx([1.0, *[6.0] * 4])
+    assert Graph.star(6).spectrum().eigenvalues == pytest.approx(np.ones(5))
+    assert Graph.complete(6).spectrum().eigenvalues == pytest.approx([1.0, *[6.0] * 4])
 
 
 def test_two_leaders_at_the_ends_of_a_path_make_a_chain_with_two_fixed_ends():
     k = np.arange(1, 6)
     graph = Graph.path(7, leaders=[0, 6])
-    assert graph.grounded_spectrum() == pytest.approx(2.0 - 2.0 * np.cos(k * np.pi / 6.0))
+    assert graph.spectrum().eigenvalues == pytest.approx(2.0 - 2.0 * np.cos(k * np.pi / 6.0))
 
 
 # ---- Lemma 3 ----

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 from runs import simulate
@@ -54,7 +55,7 @@ def test_every_coupling_and_every_connected_graph_is_stable(gains, name, edges, 
     pairs = {tuple(sorted(pair)) for pair in edges if pair[0] != pair[1]}
     graph = ech.Graph.from_edges(sorted(pairs | {(k, k + 1) for k in range(5)}))
     A, B = closed(AGENTS[name], gains[name])
-    for value in graph.grounded_spectrum():
+    for value in graph.spectrum().eigenvalues:
         mode = A - coupling * value * B @ B.T @ gains[name].P
         assert np.linalg.eigvals(mode).real.max() < 0.0
 
@@ -104,6 +105,22 @@ def test_v_never_rises_where_the_drift_is_linear():
     v = ech.lyapunov(result)
     assert (v.drift <= 1e-9 * np.abs(v.rate).max()).all()
     assert not v.rises().any() and v.value[-1] < v.value[0]
+
+
+def test_weights_replace_the_damping_that_the_model_brings():
+    model, graph = AGENTS["quadrotor"], ech.Graph.path(4)
+    R = 4.0 * np.diag(model.weights[1])
+    plain, heavy = (ech.synthesize(model, graph, ech.gains.InnerLoop(R=r)) for r in (None, R))
+    assert np.array_equal(plain.inner, model.damping)
+    with precision("float64"):
+        linear, fixed = linearize(model), symmetric_states(model)
+    free = [k for k in range(12) if k not in fixed]
+    A, B, Q = linear.A[np.ix_(free, free)], linear.B[free], np.diag(model.weights[0])
+    P = scipy.linalg.solve_continuous_are(A, B, Q[np.ix_(free, free)], R)
+    assert heavy.inner[:, free] == pytest.approx(np.linalg.solve(R, B.T @ P), abs=1e-9)
+    assert not heavy.inner[:, fixed].any() and heavy.certificate.stable
+    with pytest.raises(ech.EchelonError, match="`R` is not positive definite"):
+        ech.synthesize(model, graph, ech.gains.InnerLoop(R=-R))
 
 
 def test_an_agent_without_symmetric_states_is_refused():

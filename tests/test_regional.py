@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.certificates.jacobians import has_constant_input_map, jacobians, weighted_jacobians
+from echelon.certificates.jacobians import has_constant_input_map, jacobians
 from echelon.certificates.lmi import robust_lqr
-from echelon.certificates.region import contracting_region, radius
+from echelon.certificates.region import contracting_region, pairs_on, radius
 from echelon.core.numerics import precision
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.models.linearization import linearize
+from echelon.network.spectrum import Spectrum
 from echelon.studies.check import check
 
 LINE = ech.Graph.path(4)
@@ -53,9 +55,9 @@ def robust():
 
 def test_a_robust_gain_is_proved_and_no_sample_contradicts_it(robust):
     region, model = robust.certificate.region, ech.models.QuadrotorThrust()
-    assert (region.kind, region.theorem) == ("proof", "T1")
+    assert (region.kind, region.theorem) == (Kind.PROOF, Theorem.T1)
     assert region.rate >= 0.2 and np.linalg.cond(robust.P) <= 500
-    low = float(LINE.grounded_spectrum()[0])
+    low = LINE.spectrum().low
     assert rate_seen(model, robust, ech.Domain.about(model, TILT), low, 60) >= region.rate
 
 
@@ -102,27 +104,27 @@ def with_its_own_map(model, gain, domain, low):
 def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
     model, bounds = ech.models.PlanarQuadrotor(), {"roll": tilt, "thrust": 1.0}
     region = (gain := ech.synthesize(model, LINE, ech.gains.RobustLQR(bounds))).certificate.region
-    seen = with_its_own_map(
-        model, gain, ech.Domain.about(model, bounds), float(LINE.grounded_spectrum()[0])
-    )
-    assert region is None or (region.theorem == "T2" and 0.0 < region.rate <= seen + 1e-12)
+    seen = with_its_own_map(model, gain, ech.Domain.about(model, bounds), LINE.spectrum().low)
+    assert region is None or (region.theorem is Theorem.T2 and 0.0 < region.rate <= seen + 1e-12)
     assert tilt > 0.3 or region is not None
 
 
 def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
-    model, low = ech.models.QuadrotorEuler(), float(LINE.grounded_spectrum()[0])
+    model, low = ech.models.QuadrotorEuler(), LINE.spectrum().low
     domain = ech.Domain.about(model, TILT)
     gain = ech.synthesize(model, LINE, ech.gains.RobustLQR(TILT))
     region = gain.certificate.region
-    assert (region.theorem, region.kind, region.radius) == ("T2", "vertices", None)
+    assert (region.theorem, region.kind, region.radius) == (Theorem.T2, Kind.VERTICES, None)
     assert 0.2 <= region.rate <= with_its_own_map(model, gain, domain, low) + 1e-12
     assert np.linalg.cond(gain.P) <= 500
     # With the input map of the trim alone a metric would seem to contract at 0.5 1/s.
     with precision("float64"):
         _, B = linearize(model)
         P = robust_lqr(jacobians(model, domain).matrices, B, np.diag(model.weights[0]), gain.R).P
-        pairs = weighted_jacobians(model, domain, gain.R)
-    assert contracting_region(domain, pairs, P, B, gain.R, 2.0, False) is None
+        pairs = pairs_on(model, domain, gain.R)
+    # Strength 2, as of c = 1 where lambda_min = 1.
+    unit = Spectrum(np.ones(1), 1)
+    assert contracting_region(pairs, P, B, gain.R, False, 1.0, unit) is None
 
 
 def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():
@@ -130,9 +132,7 @@ def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():
     full = ech.synthesize(model, LINE, ech.gains.Contraction(bounds, rate=0.5, exact=False))
     half = ech.gains.Contraction(bounds, rate=0.5, exact=False, coupling=0.5 * full.coupling)
     gain = ech.synthesize(model, LINE, half)
-    seen = with_its_own_map(
-        model, gain, ech.Domain.about(model, bounds), float(LINE.grounded_spectrum()[0])
-    )
+    seen = with_its_own_map(model, gain, ech.Domain.about(model, bounds), LINE.spectrum().low)
     assert full.certificate.region.rate >= 0.5 * (1 - 1e-5)
     assert gain.certificate.edge == full.certificate.edge
     region = gain.certificate.region
@@ -144,7 +144,8 @@ def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():
     pendulum = ech.models.Pendulum(damping=0.5)
     edge = np.arccos((1.0 - 0.5 / np.sqrt(9.81)) ** 2)
     gain = ech.synthesize(pendulum, LINE, ech.gains.Monotone({"angle": 0.99 * edge}))
-    assert gain.certificate.region.theorem == "A5" and gain.certificate.region.kind == "vertices"
+    region = gain.certificate.region
+    assert region.theorem is Theorem.A5 and region.kind is Kind.VERTICES
     with precision("float64"):
         found = jacobians(pendulum, ech.Domain.about(pendulum, {"angle": 0.99 * edge}))
     for A in found.matrices:
@@ -170,8 +171,8 @@ class Turned(ech.ControlAffine):
 
 def test_where_g_varies_a_monotone_drift_is_certified_a_smaller_set(tmp_path):
     gain = ech.synthesize(Turned(), LINE, ech.gains.Monotone({"east": 1.0, "north": 2.0}))
-    region, ends = gain.certificate.region, LINE.grounded_spectrum()[[0, -1]]
-    assert region.theorem == "A5"
+    region, ends = gain.certificate.region, LINE.spectrum().eigenvalues[[0, -1]]
+    assert region.theorem is Theorem.A5
     assert region.radius == pytest.approx(
         radius(region.domain, gain.P) * np.sqrt(ends[0] / ends[1]), rel=1e-12
     )
@@ -204,8 +205,8 @@ def test_a_contraction_gain_is_the_weakest_and_keeps_its_rate():
     model = ech.models.Pendulum()
     gain = ech.synthesize(model, LINE, ech.gains.Contraction({"angle": 1.0}, rate=0.5))
     region = gain.certificate.region
-    assert region.kind == "proof" and region.rate >= 0.5 * (1 - 1e-5)
-    low = float(LINE.grounded_spectrum()[0])
+    assert region.kind is Kind.PROOF and region.rate >= 0.5 * (1 - 1e-5)
+    low = LINE.spectrum().low
     assert rate_seen(model, gain, ech.Domain.about(model, {"angle": 1.0}), low) >= region.rate
 
 
@@ -310,7 +311,7 @@ def test_samples_stand_at_all_corners_and_need_the_bounds_that_matter():
     domain = ech.Domain.about(Yielding(), {"place": (-1.0, 0.5)})
     with precision("float64"):
         found = jacobians(Yielding(), domain)
-    assert found.kind == "samples" and not found.error.any()
+    assert found.kind is Kind.SAMPLES and not found.error.any()
     slopes = 2.0 / np.sqrt(np.pi) * np.exp(-(np.array([-1.0, 0.5]) ** 2))
     for slope in slopes:
         assert np.abs(found.matrices[:, 1, 0] + slope).min() < 1e-14
@@ -349,37 +350,37 @@ def verdicts(scenario, *changes):
 def test_the_papers_own_experiment_is_checked_line_by_line():
     lines, found = verdicts("paper-literal")
     assert not found.promised
-    assert lines["detectability of (A, g'P)"].verdict == "fails"
+    assert lines["detectability of (A, g'P)"].verdict is Verdict.FAILS
     assert lines["detectability of (A, g'P)"].number == "rank 4 of 12"
-    assert lines["finite condition on P"].verdict == "vacuous"
-    assert lines["LMI as printed"].verdict == "fails"
-    assert lines["Assumption 5, P-monotone drift"].verdict == "fails"
+    assert lines["finite condition on P"].verdict is Verdict.VACUOUS
+    assert lines["LMI as printed"].verdict is Verdict.FAILS
+    assert lines["Assumption 5, P-monotone drift"].verdict is Verdict.FAILS
     assert "no P > 0 can" in lines["Assumption 5, P-monotone drift"].text
     lines, found = verdicts("paper")
-    assert found.promised and lines["disagreement decays"].verdict == "holds"
+    assert found.promised and lines["disagreement decays"].verdict is Verdict.HOLDS
     low, high = (float(part) for part in lines["gain margin"].number.split(" to "))
     assert low <= 0.5 and high > 1e3
-    assert all(line.verdict in ("holds", "fails", "vacuous", "not needed") for line in found.lines)
+    assert all(isinstance(line.verdict, Verdict) for line in found.lines)
 
 
 def test_an_inner_loop_makes_assumption_5_hold():
     lines, found = verdicts("paper", "follower.gain={method: inner-loop}")
-    assert lines["Assumption 5, P-monotone drift"].verdict == "holds"
-    assert lines["Lemma 4, drift along z"].verdict == "holds" and found.promised
+    assert lines["Assumption 5, P-monotone drift"].verdict is Verdict.HOLDS
+    assert lines["Lemma 4, drift along z"].verdict is Verdict.HOLDS and found.promised
 
 
 def test_a_broken_offset_and_a_missing_relay_are_named():
     lines, found = verdicts("paper", "formation.offsets.1=[1,0,0,0,0,0,0.2,0,0,0,0,0]")
-    assert lines["offsets are symmetries"].verdict == "fails" and not found.promised
+    assert lines["offsets are symmetries"].verdict is Verdict.FAILS and not found.promised
     assert lines["offsets are symmetries"].text.startswith("agent 1: it changes the drift")
     lines, found = verdicts("paper", "follower.feedforward=none")
-    assert lines["leader's motion is matched"].verdict == "fails"
+    assert lines["leader's motion is matched"].verdict is Verdict.FAILS
     assert "once the leader's input rests" in found.promise
 
 
 def test_a_weak_input_weakens_the_trim_thrust_too():
     # At the edge of the gain, on the line of 3: the published corner is -0.094 1/s.
-    edge = 0.5 / float(LINE.grounded_spectrum()[0])
+    edge = 0.5 / LINE.spectrum().low
     lines, _ = verdicts("paper-line", f"follower.gain.coupling={edge!r}")
     told = float(lines["input scaling"].number.removesuffix(" 1/s"))
     assert told == pytest.approx(-0.094, abs=6e-4)

@@ -1,5 +1,6 @@
 """The scenario file: what is accepted, what every default is, and the sentence of every fault."""
 
+import dataclasses
 import json
 import math
 import re
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 import echelon.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
 from echelon.scenario import registry
+from echelon.scenario.build import resolve
 from echelon.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.scenario.scenario import (
     Fault,
@@ -219,7 +221,15 @@ def test_the_tables_of_choices_cover_the_registry():
     checks = echelon.scenario.checks
     assert set(checks._GRAPH_KEYS) == {"edges", *GRAPHS}
     assert set(checks._FORMATION_KEYS) == {"offsets", *FORMATIONS}
-    assert set(checks._GAIN_KEYS) == {*METHODS, "file"}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_table_of_methods_says_what_their_classes_say(name):
+    entry, method = METHODS[name], resolve(METHODS[name])
+    arguments = [field.name for field in dataclasses.fields(method)]
+    assert method.name == name and method.needs == entry.needs
+    assert sorted([*entry.needs, *entry.takes]) == sorted(arguments)
+    assert {*method.usual} <= {*method.needs}
 
 
 def test_yaml_1_2_decides_what_a_word_is(load, refused):

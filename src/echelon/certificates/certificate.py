@@ -1,42 +1,39 @@
 """What can be said of a gain on a graph: spectrum, abscissa and observability at the trim."""
 
-from typing import Literal, TypeAlias
-
 import equinox as eqx
 import numpy as np
 
 from echelon.certificates.domain import Domain
 from echelon.core.linear import observability_rank
 from echelon.core.types import Array
+from echelon.core.words import Kind, Theorem
 from echelon.models.linearization import Linearization
-from echelon.network.graph import Graph
-
-Kind: TypeAlias = Literal["proof", "vertices", "samples", "linearization"]
+from echelon.network.spectrum import Spectrum
 
 
 class RegionCertificate(eqx.Module):
     """What is promised on a domain, not only at a point.
 
     Attributes:
-        kind: `proof` (exact arithmetic on a hull of all Jacobians), `vertices` (the same in
-            floating point) or `samples`.
+        kind: a proof (exact arithmetic on a hull of all Jacobians), vertices (the same in floating
+            point) or samples.
         rate: alpha, 1/s: errors shrink as e^(-alpha t) in the metric of P, 0 for a drift that only
             does not grow.
-        theorem: `T1`, nonlocal on the region since g is constant; `T2`, local about the leader's
-            path; `A5`, the paper's Assumption 5 for the drift alone.
+        theorem: T1, nonlocal on the region since g is constant; T2, local about the leader's path;
+            A5, the paper's Assumption 5 for the drift alone.
         domain: what the states and inputs must respect.
         radius: r of the set {sum_i delta_i'P delta_i <= r^2} that cannot leave the domain while the
-            leader stays at the trim; None where the domain bounds nothing, and for `T2`.
-        strength: 2 c lambda_min, the weight of the feedback in the inequality; 0 for `A5`.
+            leader stays at the trim; None where the domain bounds nothing, and for T2.
+        strength: 2 c lambda_min, the weight of the feedback in the inequality; 0 for A5.
         hull: (K, n, n), matrices that the rate was looked at on: by kind, the corners of a hull of
-            all Jacobians A, or samples of them. For `T2`, whose g varies, it is (K, n, 2n): each A
+            all Jacobians A, or samples of them. For T2, whose g varies, it is (K, n, 2n): each A
             with its g S R^-1 (g S)' to the right.
         error: one such matrix, what floats may have moved a corner by, entry by entry.
     """
 
     kind: Kind = eqx.field(static=True)
     rate: float
-    theorem: str = eqx.field(static=True)
+    theorem: Theorem = eqx.field(static=True)
     domain: Domain = eqx.field(static=True)
     radius: float | None
     strength: float
@@ -49,7 +46,8 @@ class Certificate(eqx.Module):
 
     Attributes:
         kind: the kind of argument behind the abscissa.
-        lambda_min, lambda_max: extreme eigenvalues of the grounded Laplacian.
+        lambda_min, lambda_max: extreme eigenvalues of the grounded Laplacian, or of what a
+            feed-forward makes of it.
         abscissa: largest real part of an eigenvalue of A - c lambda B R^-1 B'P, 1/s, over the
             eigenvalues lambda that were looked at.
         modes: how many eigenvalues lambda that were: all, or on large graphs the extreme two.
@@ -77,39 +75,29 @@ class Certificate(eqx.Module):
 
 def certify(
     linear: Linearization,
-    graph: Graph,
+    spectrum: Spectrum,
     P: Array,
     R: Array,
     coupling: float,
     edge: float | None,
     region: RegionCertificate | None = None,
-    modes: Array | None = None,
 ) -> Certificate:
     """Return what linearization at the trim says of the law with gain P, R and coupling c.
 
-    With constant g the disagreement splits over the eigenvectors of the grounded Laplacian into
-    modes A - c lambda B R^-1 B'P (theory page, T2). Where a feed-forward changes these lambda,
-    `modes` holds those that there are.
+    With constant g the disagreement splits over the eigenvectors of the grounded Laplacian, or of
+    what a feed-forward makes of it, into modes A - c lambda B R^-1 B'P (theory page, T2).
     """
-    eigenvalues = graph.grounded_spectrum()
-    seen = eigenvalues if modes is None else modes
     feedback = linear.B @ np.linalg.solve(R, linear.B.T @ P)
     return Certificate(
-        kind="linearization",
-        lambda_min=float(eigenvalues[0]),
-        lambda_max=float(eigenvalues[-1]),
-        abscissa=_abscissa(linear.A - coupling * seen[:, None, None] * feedback),
-        modes=len(seen),
+        kind=Kind.LINEARIZATION,
+        lambda_min=spectrum.low,
+        lambda_max=spectrum.high,
+        abscissa=_abscissa(linear.A - coupling * spectrum.eigenvalues[:, None, None] * feedback),
+        modes=len(spectrum.eigenvalues),
         edge=edge,
         observable=observability_rank(linear.A, linear.B.T @ P),
         region=region,
     )
-
-
-def parent_modes(graph: Graph) -> Array:
-    """Return the eigenvalues where parents' inputs are fed forward: the weights (theory, T4)."""
-    led = np.isin(graph.edges, graph.leaders).all(axis=1)
-    return np.unique(graph.weights[~led])
 
 
 def _abscissa(matrices: Array) -> float:

@@ -1,4 +1,4 @@
-"""A domain: the box of states and inputs on which a certificate is asked for."""
+"""A domain: the box of states and inputs on which a certificate is wanted."""
 
 from collections.abc import Mapping
 from typing import TypeAlias, final
@@ -73,12 +73,12 @@ class Domain:
         names = (*model.state_names, *model.input_names)
         lower = np.concatenate([self.lower, self.input_lower])
         upper = np.concatenate([self.upper, self.input_upper])
-        told = [
+        named = [
             f"{name} in [{low:.4g}, {high:.4g}]"
             for name, low, high in zip(names, lower, upper, strict=True)
             if np.isfinite([low, high]).all() and low < high
         ]
-        return ", ".join(told) or "all states"
+        return ", ".join(named) or "all states"
 
     def margins(self) -> Array:
         """Return (n,) how far each state may deviate from the trim to both sides."""

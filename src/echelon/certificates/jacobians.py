@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Kind
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError
 from echelon.core.types import Array
+from echelon.core.words import Kind
 from echelon.enclosure.hull import Box, Hull, jacobian_hull
 from echelon.models.model import ControlAffine
 
@@ -23,8 +23,8 @@ _OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 class Jacobians(NamedTuple):
     """Matrices A with xdot = A x near each state of a domain.
 
-    `kind` says what they stand for: `vertices` of a polytope that holds every Jacobian, up to
-    `error` (n, n) entry by entry, or `samples` taken at random in the domain and at its corners.
+    `kind` says what they stand for: vertices of a polytope that holds every Jacobian, up to
+    `error` (n, n) entry by entry, or samples taken at random in the domain and at its corners.
     """
 
     matrices: Array
@@ -67,10 +67,10 @@ def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians
     try:
         hull = jacobian_hull(function, *_boxes(model, domain), names)
     except GainError:
-        samples = _sampled(function, model, domain)
-        return Jacobians(samples, np.zeros(samples.shape[1:]), "samples")
+        samples = _sample(function, model, domain)
+        return Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES)
     _check_bounded(model, domain, hull)
-    return Jacobians(hull.vertices, hull.error, "vertices")
+    return Jacobians(hull.vertices, hull.error, Kind.VERTICES)
 
 
 def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
@@ -110,7 +110,7 @@ def _unbounded(model: ControlAffine, name: str) -> GainError:
     )
 
 
-def _sampled(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
+def _sample(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
     """Return the matrices inside the domain and at its corners, all of them where they are few.
 
     Raises:

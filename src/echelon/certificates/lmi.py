@@ -24,7 +24,7 @@ from echelon.core.errors import GainError, MissingExtraError, listing
 from echelon.core.linear import in_words, riccati, symmetric_part
 from echelon.core.types import Array
 
-_STRICT = 1e-6  # asked of the solver, in scaled states, so that its own error does not reach zero
+_STRICT = 1e-6  # the solver must keep, in scaled states, so that its own error does not reach zero
 _FIRST, _BATCH = 16, 12  # vertices that the solver sees at first; violated ones added at a time
 
 
@@ -67,7 +67,7 @@ def rate_of(
     """
     if not (np.isfinite(P).all() and np.allclose(P, P.T, 1e-9, 0.0) and _condition(P) < np.inf):
         raise GainError("`P` must be a symmetric positive definite matrix of finite numbers.")
-    return _rate(P, vertices_of(As), None if B is None else _weighted(B, R), strength)
+    return _rate(P, vertices_of(As), None if B is None else _weigh_inputs(B, R), strength)
 
 
 def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None = None) -> Metric:
@@ -109,7 +109,7 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
             f"vertex of {len(As)} expands, though none alone forbids it; shrink the domain, add "
             "damping by an inner loop, or take a method with feedback."
         )
-    found = _measured(P / np.linalg.eigvalsh(P)[0], As, None, 0.0)
+    found = _measure(P / np.linalg.eigvalsh(P)[0], As, None, 0.0)
     return found._replace(rate=max(0.0, found.rate))
 
 
@@ -132,7 +132,7 @@ def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) 
         MissingExtraError: cvxpy or clarabel is not installed.
     """
     cp, As = _cvxpy(), vertices_of(As)
-    M, S = _scale(As, B, Q, R), _weighted(B, R) if W is None else W
+    M, S = _scale(As, B, Q, R), _weigh_inputs(B, R) if W is None else W
     basis, one = _basis(len(M)), np.eye(len(M))
     values, vectors = np.linalg.eigh(Q)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T @ np.linalg.inv(M)
@@ -143,13 +143,13 @@ def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) 
     cones = [cp.bmat([[Z, one], [one, V]]) >> 0, cp.bmat([[Y, V @ root.T], [root @ V, one]]) >> 0]
     gaps = _gaps(cp, _stack(As, S, M, basis), cp.hstack([v, y, [-1.0]]))
     solved = _least(cp, cp.trace(M @ M.T @ Z), cones, gaps)
-    P = _unscaled(V.value, M) if solved else None
+    P = _unscale(V.value, M) if solved else None
     if P is None or _rate(P, As, S, 1.0) <= 0.0:
         raise GainError(
             f"no constant metric was found that one gain contracts on all of the {len(As)} "
             "matrices; shrink the domain, or weigh the input less in `R`."
         )
-    return _measured(P, As, S, 1.0)
+    return _measure(P, As, S, 1.0)
 
 
 def contraction(
@@ -179,7 +179,7 @@ def contraction(
     cp, As = _cvxpy(), vertices_of(As)
     n = As.shape[-1]
     M = _scale(As + rate * np.eye(n), B, np.eye(n), np.eye(B.shape[-1]))
-    S = _weighted(B, None) if W is None else W
+    S = _weigh_inputs(B, None) if W is None else W
     # The solver's error grows with V: it is asked for a little more than eigenvalues must show.
     more = _STRICT * np.linalg.norm(M @ As @ np.linalg.inv(M), axis=(1, 2)).max()
     shifted, basis, unit = As + (rate + more) * np.eye(n), _basis(n), M @ M.T
@@ -187,7 +187,7 @@ def contraction(
     V = _matrix(cp, basis, v)
     gaps = _gaps(cp, _stack(shifted, S, M, basis[:0]), cp.hstack([v, -rho]))
     solved = _least(cp, rho, [V - unit >> 0, 0.999 * condition_max * unit - V >> 0], gaps)
-    P = _unscaled(V.value, M) if solved else None
+    P = _unscale(V.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
     tried = max(0.0, float(rho.value)) * np.array([1.0, 1.0001, 1.01, 1.1]) if solved else []
     enough = [float(s) for s in tried if P is not None and _rate(P, As, S, float(s)) >= rate]
@@ -197,10 +197,10 @@ def contraction(
             f"gain contracts at {rate:g} 1/s on all of the {len(As)} matrices; ask a smaller "
             "`rate` or shrink the domain."
         )
-    return _measured(P, As, S, enough[0])
+    return _measure(P, As, S, enough[0])
 
 
-def _weighted(B: Array, R: Array | None) -> Array:
+def _weigh_inputs(B: Array, R: Array | None) -> Array:
     """Return B R^-1 B', (n, n) or (K, n, n)."""
     return B @ (B.swapaxes(-1, -2) if R is None else np.linalg.solve(R, B.swapaxes(-1, -2)))
 
@@ -232,7 +232,7 @@ def _falls(P: Array, As: Array) -> bool:
     return -2.0 * rate_of(P, As) <= 4.0 * len(P) * np.finfo(float).eps * size.sum(-1).max()
 
 
-def _measured(P: Array, As: Array, S: Array | None, rho: float) -> Metric:
+def _measure(P: Array, As: Array, S: Array | None, rho: float) -> Metric:
     margin = float(np.linalg.eigvalsh(_drift(P, As, S, rho)).max())
     return Metric(P, rho, _rate(P, As, S, rho), _condition(P), margin)
 
@@ -317,7 +317,7 @@ def _scale(As: Array, B: Array, Q: Array, R: Array) -> Array:
         return np.eye(As.shape[-1])
 
 
-def _unscaled(W: Array, M: Array) -> Array | None:
+def _unscale(W: Array, M: Array) -> Array | None:
     """Return P in the caller's states from W = P^-1 in the states M x."""
     return None if _condition(W) == np.inf else symmetric_part(M.T @ np.linalg.inv(W) @ M)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +18,28 @@ from echelon.certificates.jacobians import (
 from echelon.certificates.lmi import rate_of
 from echelon.core.errors import GainError
 from echelon.core.types import Array
+from echelon.core.words import Kind, Theorem
 from echelon.models.model import ControlAffine
+from echelon.network.spectrum import Spectrum
 
 # The exact proof is of a rate a little below the one that eigenvalues show, for their rounding.
 _SAFE = 1.0 - 1e-6
+
+
+class Pairs(NamedTuple):
+    """What a gain must contract on a domain.
+
+    Attributes:
+        domain: where.
+        found: the Jacobians there, with their W to the right where g varies.
+        A: (K, n, n), the Jacobians alone.
+        W: (K, n, n), W_k = g S R^-1 (g S)' enclosed with A_k; None where g is constant.
+    """
+
+    domain: Domain
+    found: Jacobians
+    A: Array
+    W: Array | None
 
 
 def the_domain(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None) -> Domain:
@@ -37,63 +56,59 @@ def the_domain(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None
     return bounds if isinstance(bounds, Domain) else Domain.about(model, bounds)
 
 
-def pairs_on(
-    model: ControlAffine, domain: Domain, R: Array
-) -> tuple[Jacobians, Array, Array | None]:
-    """Return what a gain must contract: the Jacobians on a domain, and (A_k, W_k).
-
-    W_k = g S R^-1 (g S)' is enclosed with A_k where g varies, and None where it is constant.
+def pairs_on(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None, R: Array) -> Pairs:
+    """Return what a gain must contract on a method's domain, with R (m, m).
 
     Raises:
-        GainError: they depend on a state that the domain leaves unbounded.
+        GainError: there is no domain, it does not fit the model, or it leaves unbounded a state
+            that the Jacobians depend on.
     """
+    domain = the_domain(model, bounds)
     if has_constant_input_map(model, domain):
         found = jacobians(model, domain)
-        return found, found.matrices, None
+        return Pairs(domain, found, found.matrices, None)
     found = weighted_jacobians(model, domain, R)
     A, W = np.split(found.matrices, 2, axis=2)
-    return found, A, W
+    return Pairs(domain, found, A, W)
 
 
 def contracting_region(
-    domain: Domain,
-    found: Jacobians,
+    pairs: Pairs,
     P: Array,
     B: Array,
     R: Array,
-    strength: float,
     exact: bool,
+    coupling: float,
+    spectrum: Spectrum,
 ) -> RegionCertificate | None:
     """Return what a metric promises on a domain; None where it contracts at no rate there.
 
     Args:
-        domain: where.
-        found: the Jacobians on the domain, beside their W where g varies.
+        pairs: what it contracts.
         P: metric (n, n).
         B: input matrix at the trim (n, m).
         R: weight of the normalized input (m, m).
-        strength: 2 c lambda_min.
         exact: whether to prove it in rational arithmetic (seconds), where a hull is at hand and g
             is constant.
+        coupling: c.
+        spectrum: whose smallest eigenvalue makes the strength 2 c lambda_min.
     """
-    constant = found.matrices.shape[2] == len(P)
-    rate = (
-        rate_of(P, found.matrices, B, R, strength)
-        if constant
-        else _rate_where_g_varies(P, found.matrices, strength)
-    )
+    domain, found, A, W = pairs
+    strength, constant = 2.0 * coupling * spectrum.low, W is None
+    # P A + A'P - strength P W P is affine in a pair, so the corners of the pairs' hull suffice.
+    rate = rate_of(P, A, B, R, strength) if W is None else rate_of(P, A - 0.5 * strength * W @ P)
     if rate <= 0.0:
         return None
     kind = found.kind
-    if exact and constant and kind == "vertices":
+    if exact and constant and kind is Kind.VERTICES:
         shown = float(Fraction(rate * _SAFE).limit_denominator(10**6))
         weighted = B @ np.linalg.cholesky(np.linalg.inv(R))
-        proof = prove_contraction(found.matrices, found.error, weighted, P, strength, shown)
-        kind, rate = ("proof", shown) if proof.holds else (kind, rate)
+        proof = prove_contraction(A, found.error, weighted, P, strength, shown)
+        kind, rate = (Kind.PROOF, shown) if proof.holds else (kind, rate)
     return RegionCertificate(
         kind=kind,
         rate=rate,
-        theorem="T1" if constant else "T2",
+        theorem=Theorem.T1 if constant else Theorem.T2,
         domain=domain,
         # Where g varies the promise is of small errors, and none of a set.
         radius=radius(domain, P) if constant else None,
@@ -103,13 +118,32 @@ def contracting_region(
     )
 
 
-def _rate_where_g_varies(P: Array, pairs: Array, strength: float) -> float:
-    """Return the rate over pairs [A, W] with W = g S R^-1 (g S)', (K, n, 2n).
+def drift_region(
+    model: ControlAffine,
+    domain: Domain,
+    found: Jacobians,
+    P: Array,
+    coupling: float,
+    spectrum: Spectrum,
+) -> RegionCertificate:
+    """Return what a metric (n, n) promises that the drift expands at none of its Jacobians.
 
-    P A + A'P - strength P W P is affine in the pair, so the corners of its hull suffice.
+    It is the same for every coupling.
     """
-    A, W = np.split(pairs, 2, axis=2)
-    return rate_of(P, A - 0.5 * strength * W @ P)
+    reach = radius(domain, P)
+    if reach is not None and not has_constant_input_map(model, domain):
+        # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
+        reach *= float(np.sqrt(spectrum.low / spectrum.high))
+    return RegionCertificate(
+        kind=found.kind,
+        rate=0.0,
+        theorem=Theorem.A5,
+        domain=domain,
+        radius=reach,
+        strength=0.0,
+        hull=found.matrices,
+        error=found.error,
+    )
 
 
 def radius(domain: Domain, P: Array) -> float | None:

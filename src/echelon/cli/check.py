@@ -26,7 +26,7 @@ def check(
 
     found = examine(*build(checked))
     if as_json:
-        lines = [line._asdict() for line in found.lines]
+        lines = [dict(zip(line._fields, map(str, line), strict=True)) for line in found.lines]
         print(
             json.dumps(
                 {"promised": found.promised, "promise": found.promise, "lines": lines}, indent=2

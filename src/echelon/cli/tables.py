@@ -52,10 +52,10 @@ def design_row(design: "Design") -> dict[str, Any]:
         "gain_margin": None if factors is None else [_finite(factor) for factor in factors],
         "delay_margin": _finite(delay),
         "region_rate": None if region is None else region.rate,
-        "region_kind": None if region is None else region.kind,
-        "theorem": None if region is None else region.theorem,
+        "region_kind": None if region is None else str(region.kind),
+        "theorem": None if region is None else str(region.theorem),
         "radius": None if found is None else _finite(found.radius),
-        "radius_kind": None if found is None else found.kind,
+        "radius_kind": None if found is None else str(found.kind),
         "radius_limit": None if found is None else found.why,
         "seconds": design.seconds,
     }
@@ -127,5 +127,5 @@ def lines_table(lines: "Iterable[Line | Finding]", columns: tuple[str, ...] = _C
     for column in columns:
         table.add_column(column)
     for line in lines:
-        table.add_row(*(text.replace("[", "\\[") for text in line))
+        table.add_row(*(str(part).replace("[", "\\[") for part in line))
     return table

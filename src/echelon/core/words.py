@@ -75,3 +75,8 @@ class Verdict(Word):
     def __str__(self) -> str:
         """Return the verdict."""
         return self.value
+
+    @classmethod
+    def of(cls, holds: bool) -> "Verdict":
+        """Return the verdict on what either holds or fails."""
+        return cls.HOLDS if holds else cls.FAILS

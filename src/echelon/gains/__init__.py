@@ -2,7 +2,7 @@
 
 from echelon.gains.contraction import Contraction
 from echelon.gains.fixed import FixedGain
-from echelon.gains.gain import Gain, Method
+from echelon.gains.gain import Feedback, Gain, Method
 from echelon.gains.inner_loop import InnerLoop
 from echelon.gains.monotone import Monotone
 from echelon.gains.riccati import Riccati
@@ -10,8 +10,9 @@ from echelon.gains.robust_lqr import RobustLQR
 
 __all__ = [
     "Contraction",
-    "Gain",
+    "Feedback",
     "FixedGain",
+    "Gain",
     "InnerLoop",
     "Method",
     "Monotone",

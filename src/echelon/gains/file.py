@@ -12,6 +12,7 @@ from echelon.certificates.certificate import Certificate, RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError, OutputError
 from echelon.core.types import Array, PathLike
+from echelon.core.words import Kind, Theorem
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
@@ -45,7 +46,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
             "agents": graph.agents,
             "leaders": list(graph.leaders),
             "edges": _edges(graph),
-            "spectrum": graph.grounded_spectrum().tolist(),
+            "spectrum": graph.spectrum().eigenvalues.tolist(),
         },
         "certificate": _certificate_as_mapping(gain.certificate),
     }
@@ -68,10 +69,10 @@ def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
 def _parameters(model: ControlAffine) -> dict[str, Any] | None:
     """Return the fields of a model, or None where JSON cannot hold one of them."""
     fields = [field.name for field in dataclasses.fields(model) if field.init]
-    told = {name: getattr(model, name) for name in fields}
+    stored = {name: getattr(model, name) for name in fields}
     try:
         return json.loads(
-            json.dumps(told, allow_nan=False, default=lambda x: np.asarray(x).tolist())
+            json.dumps(stored, allow_nan=False, default=lambda x: np.asarray(x).tolist())
         )
     except (TypeError, ValueError):
         return None
@@ -86,7 +87,7 @@ def _edges(graph: Graph) -> list[list[float]] | None:
 def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
     region = certificate.region
     return {
-        "kind": certificate.kind,
+        "kind": str(certificate.kind),
         "lambda_min": certificate.lambda_min,
         "lambda_max": certificate.lambda_max,
         "abscissa": certificate.abscissa,
@@ -100,13 +101,13 @@ def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
 def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
     domain = region.domain
     return {
-        "kind": region.kind,
-        "theorem": region.theorem,
+        "kind": str(region.kind),
+        "theorem": str(region.theorem),
         "rate": region.rate,
         "radius": region.radius,
         "strength": region.strength,
         "domain": {name: _finite(getattr(domain, name)) for name in _ENDS},
-        "hull": _packed(region.hull),
+        "hull": _pack(region.hull),
         "error": region.error.tolist(),
     }
 
@@ -115,16 +116,17 @@ def _finite(bounds: Array) -> list[float | None]:
     return [x if np.isfinite(x) else None for x in bounds.tolist()]
 
 
-def _packed(matrices: Array) -> dict[str, Any]:
+def _pack(matrices: Array) -> dict[str, Any]:
     """Return many matrices as one, and what of it changes: most entries are the same in all."""
     places = np.argwhere((matrices != matrices[0]).any(axis=0))
     values = matrices[:, places[:, 0], places[:, 1]]
     return {"base": matrices[0].tolist(), "places": places.tolist(), "values": values.tolist()}
 
 
-def _unpacked(told: Mapping[str, Any]) -> Array:
-    values, places = np.array(told["values"], float), np.array(told["places"], int).reshape(-1, 2)
-    matrices = np.repeat(np.array(told["base"], float)[None], len(values), axis=0)
+def _unpack(stored: Mapping[str, Any]) -> Array:
+    values = np.array(stored["values"], float)
+    places = np.array(stored["places"], int).reshape(-1, 2)
+    matrices = np.repeat(np.array(stored["base"], float)[None], len(values), axis=0)
     matrices[:, places[:, 0], places[:, 1]] = values
     return matrices
 
@@ -135,8 +137,8 @@ def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) ->
     Raises:
         OutputError: the file cannot be written.
     """
-    told = gain_as_mapping(gain, model, graph)
-    lines = [f"{json.dumps(key)}: {json.dumps(told[key], allow_nan=False)}" for key in told]
+    stored = gain_as_mapping(gain, model, graph)
+    lines = [f"{json.dumps(key)}: {json.dumps(stored[key], allow_nan=False)}" for key in stored]
     try:
         Path(path).write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
     except OSError as error:
@@ -150,23 +152,23 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
         GainError: the file is no gain, holds a number that is not finite, or was made for another
             model or graph; the message says what differs.
     """
-    told = _read(path)
+    stored = _read(path)
     try:
-        _check_model(path, told["model"], model)
-        _check_graph(path, told["graph"], graph)
-        return _gain(told)
+        _check_model(path, stored["model"], model)
+        _check_graph(path, stored["graph"], graph)
+        return _gain(stored)
     except (LookupError, TypeError, ValueError) as error:
         raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
 
 
 def _read(path: PathLike) -> Mapping[str, Any]:
     try:
-        told = json.loads(Path(path).read_text("utf-8"))
+        stored = json.loads(Path(path).read_text("utf-8"))
     except OSError as error:
         raise GainError(f"the gain file `{path}` cannot be read: {error.strerror}.") from error
     except ValueError as error:
         raise GainError(f"the gain file `{path}` is no JSON: {error}.") from error
-    form = told.get("format") if isinstance(told, dict) else None
+    form = stored.get("format") if isinstance(stored, dict) else None
     if form != FORMAT:
         older = isinstance(form, str) and form.startswith("echelon gain ")
         advice = f"is `{form}`; make it again with `echelon design`" if older else "is missing"
@@ -174,53 +176,54 @@ def _read(path: PathLike) -> Mapping[str, Any]:
             f"`{path}` is no gain file that this echelon reads: its `format` must be `{FORMAT}`, "
             f"and {advice}."
         )
-    return told
+    return stored
 
 
-def _gain(told: Mapping[str, Any]) -> Gain:
-    inner, region = told["inner"], told["certificate"]["region"]
-    parts = {**told["certificate"], "region": None if region is None else _region(region)}
+def _gain(stored: Mapping[str, Any]) -> Gain:
+    inner, certificate = stored["inner"], stored["certificate"]
+    region = None if certificate["region"] is None else _region(certificate["region"])
+    parts = {**certificate, "kind": Kind.named(certificate["kind"]), "region": region}
     return Gain(
-        np.array(told["P"], float),
-        np.array(told["R"], float),
-        float(told["coupling"]),
-        str(told["method"]),
+        np.array(stored["P"], float),
+        np.array(stored["R"], float),
+        float(stored["coupling"]),
+        str(stored["method"]),
         Certificate(**parts),
         inner=None if inner is None else np.array(inner, float),
     )
 
 
-def _region(told: Mapping[str, Any]) -> RegionCertificate:
+def _region(stored: Mapping[str, Any]) -> RegionCertificate:
     bounds = [
-        [end if x is None else x for x in told["domain"][name]] for name, end in _ENDS.items()
+        [end if x is None else x for x in stored["domain"][name]] for name, end in _ENDS.items()
     ]
     return RegionCertificate(
-        kind=told["kind"],
-        rate=told["rate"],
-        theorem=told["theorem"],
+        kind=Kind.named(stored["kind"]),
+        rate=stored["rate"],
+        theorem=Theorem.named(stored["theorem"]),
         domain=Domain(*(np.array(some, float) for some in bounds)),
-        radius=told["radius"],
-        strength=told["strength"],
-        hull=_unpacked(told["hull"]),
-        error=np.array(told["error"], float),
+        radius=stored["radius"],
+        strength=stored["strength"],
+        hull=_unpack(stored["hull"]),
+        error=np.array(stored["error"], float),
     )
 
 
-def _check_model(path: PathLike, told: Mapping[str, Any], model: ControlAffine) -> None:
+def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine) -> None:
     """Check that the model is the one that the gain was made for, near its trim."""
     linear = linearize(model)
-    name, made_for = f"`{type(model).__name__}`", str(told["class"]).rpartition(":")[2]
+    name, made_for = f"`{type(model).__name__}`", str(stored["class"]).rpartition(":")[2]
     for what, ours in (("state_names", model.state_names), ("input_names", model.input_names)):
-        if tuple(told[what]) != tuple(ours):
+        if tuple(stored[what]) != tuple(ours):
             raise GainError(
                 f"the gain in `{path}` was made for `{made_for}` with {what} "
-                f"{list(told[what])}, and the model is {name} with {list(ours)}."
+                f"{list(stored[what])}, and the model is {name} with {list(ours)}."
             )
     compared = {
-        "input_scale": (told["input_scale"], model.input_scale),
-        "the trim input": (told["trim"][1], model.trim[1]),
-        "A at the trim": (told["A"], linear.A),
-        "B at the trim": (told["B"], linear.B),
+        "input_scale": (stored["input_scale"], model.input_scale),
+        "the trim input": (stored["trim"][1], model.trim[1]),
+        "A at the trim": (stored["A"], linear.A),
+        "B at the trim": (stored["B"], linear.B),
     }
     for what, (theirs, ours) in compared.items():
         theirs, ours = np.asarray(theirs, float), np.asarray(ours, float)
@@ -232,14 +235,15 @@ def _check_model(path: PathLike, told: Mapping[str, Any], model: ControlAffine) 
             )
 
 
-def _check_graph(path: PathLike, told: Mapping[str, Any], graph: Graph) -> None:
+def _check_graph(path: PathLike, stored: Mapping[str, Any], graph: Graph) -> None:
     """Check that the spectrum is the one that the coupling was chosen for."""
-    eigenvalues = graph.grounded_spectrum()
-    for what, end in (("lambda_min", 0), ("lambda_max", -1)):
-        theirs, ours = told["spectrum"][end], eigenvalues[end]
+    values, spectrum = stored["spectrum"], graph.spectrum()
+    ends = {"lambda_min": (values[0], spectrum.low), "lambda_max": (values[-1], spectrum.high)}
+    # The ends bound every mode, so a coupling fits all networks that share them.
+    for what, (theirs, ours) in ends.items():
         if not abs(theirs - ours) <= _SAME * ours:
             raise GainError(
-                f"the gain in `{path}` was made for a graph of {told['agents']} agents with "
+                f"the gain in `{path}` was made for a graph of {stored['agents']} agents with "
                 f"{what} = {theirs:.6g}, and this graph of {graph.agents} has {ours:.6g}; "
                 "make it again."
             )

@@ -4,13 +4,11 @@ from typing import Literal
 
 import numpy as np
 
-from echelon.certificates.certificate import certify
 from echelon.core.errors import GainError
-from echelon.core.linear import Weight, as_matrix, check_definite
-from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.models.linearization import linearize
+from echelon.core.linear import Weight, as_matrix
+from echelon.gains.gain import Feedback, Method
+from echelon.models.linearization import Linearization
 from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
 
 
 class FixedGain(Method):
@@ -19,29 +17,24 @@ class FixedGain(Method):
     Args:
         P: n numbers (a diagonal), (n, n), or "identity".
         R: weight of the normalized input, m numbers or (m, m); the identity when left out.
-        coupling: c.
+        coupling: c > 0; 1 when left out.
     """
+
+    name = "given"
+    needs = ("P",)
 
     P: Weight | Literal["identity"] = "identity"
     R: Weight | None = None
-    coupling: float = 1.0
 
-    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
-        """Return the gain.
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return P and R as they were given.
 
         Raises:
-            GainError: P or R is not symmetric positive definite, or the coupling is not positive.
+            GainError: P or R has another size, or P is a word other than `identity`.
         """
-        n, m = len(model.state_names), len(model.input_names)
-        P = self._matrix(n)
+        m = len(model.input_names)
         R = np.eye(m) if self.R is None else as_matrix("R", self.R, m)
-        for name, matrix in (("P", P), ("R", R)):
-            check_definite(name, matrix)
-        check_coupling(self.coupling)
-        certificate = certify(linearize(model), graph, P, R, self.coupling, edge=None)
-        return Gain(
-            P=P, R=R, coupling=float(self.coupling), method="given", certificate=certificate
-        )
+        return Feedback(self._matrix(len(model.state_names)), R, rho=None)
 
     def _matrix(self, n: int) -> np.ndarray:
         if isinstance(self.P, str):

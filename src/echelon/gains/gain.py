@@ -1,22 +1,30 @@
-"""What a synthesis returns: the gain that the law runs with.
+"""What a synthesis returns, the gain that the law runs with, and the interface of its methods.
 
-It carries the certificate that says what it promises.
+A method knows one agent and finds P and R; the graph has a say in the coupling alone, by the
+smallest eigenvalue of its spectrum.
 """
 
 import abc
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Certificate
+from echelon.certificates.certificate import Certificate, RegionCertificate, certify
 from echelon.core.errors import GainError
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 from echelon.models.check import check_model
+from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+from echelon.network.spectrum import Spectrum
+
+Region: TypeAlias = Callable[[float, Spectrum], RegionCertificate | None]
+"""From the coupling and the spectrum to what is promised on a domain."""
 
 
 class Gain(eqx.Module):
@@ -66,16 +74,77 @@ class Gain(eqx.Module):
         return -jnp.asarray(self.inner, x.dtype) @ (x - jnp.asarray(model.trim[0], x.dtype))
 
 
+class Feedback(NamedTuple):
+    """What a method finds for one agent: the law u = u_ff - c R^-1 g'P z, but for c.
+
+    Attributes:
+        P: (n, n) symmetric positive definite, acting on states.
+        R: (m, m) symmetric positive definite, acting on normalized inputs.
+        rho: the strength 2 c lambda_min from which on P A + A'P - rho P B R^-1 B'P <= 0 at the trim
+            is guaranteed, so that the edge of the coupling is rho / (2 lambda_min); 0 where any
+            coupling does, None where none is known.
+        region: what is promised on a domain; None where nothing is.
+        inner: (m, n) feedback K of an inner loop, closed in A; None without.
+    """
+
+    P: Array
+    R: Array
+    rho: float | None
+    region: Region | None = None
+    inner: Array | None = None
+
+
 class Method(eqx.Module):
-    """A way to synthesize a gain."""
+    """A way to synthesize a gain; its arguments are its keys in a scenario.
+
+    Args:
+        coupling: c > 0; chosen by the edge when left out.
+    """
+
+    name: ClassVar[str] = ""
+    """What scenarios, tables and files call it; every method must say it."""
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Arguments that a scenario must give, though Python may have a default for them."""
+
+    usual: ClassVar[Mapping[str, Any]] = {}
+    """What `design` gives of these where the scenario does not."""
+
+    headroom: ClassVar[float] = 2.0
+    """Without a coupling it is so many times the edge: at twice, half of lambda_min may go."""
+
+    free_coupling: ClassVar[float] = 1.0
+    """What it is without one where any will do, or where no edge is known."""
+
+    coupling: float | None = eqx.field(default=None, kw_only=True)
 
     @abc.abstractmethod
-    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
-        """Return the gain for a checked model on a graph.
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return what is found for one agent of a checked model, `linear` near its trim.
 
         Raises:
             GainError: the method does not apply, with the reason.
         """
+
+    def solve(self, model: ControlAffine, spectrum: Spectrum) -> Gain:
+        """Return the gain for a checked model in a network of these eigenvalues.
+
+        Raises:
+            GainError: the coupling is not positive, P or R is not symmetric positive definite, or
+                the method does not apply, with the reason.
+        """
+        if self.coupling is not None:
+            check_coupling(self.coupling)
+        linear = linearize(model)
+        P, R, rho, region, inner = self.feedback(model, linear)
+        check_definite("P", P)
+        check_definite("R", R)
+        edge = None if rho is None else rho / (2.0 * spectrum.low)
+        coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
+        promised = None if region is None else region(coupling, spectrum)
+        closed = linear.with_inner(inner)
+        certificate = certify(closed, spectrum, P, R, coupling, edge, promised)
+        return Gain(P, R, coupling, self.name, certificate, inner)
 
 
 def check_coupling(coupling: float) -> None:
@@ -100,6 +169,8 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
     if not isinstance(method, Method):
         got = f"the class `{method.__name__}`" if isinstance(method, type) else f"{method!r}"
         raise GainError(f"`method` is {got}, and must be a gain method such as `Riccati()`.")
+    if not method.name:
+        raise GainError(f"`{type(method).__name__}` has no `name`, and every gain method must.")
     with precision("float64"):
         check_model(model)
-        return method.solve(model, graph)
+        return method.solve(model, graph.spectrum())

@@ -6,15 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.certificates.certificate import certify
 from echelon.core.errors import GainError, listing
-from echelon.core.linear import as_matrix, riccati
+from echelon.core.linear import Weight, riccati
 from echelon.core.types import Array
-from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.gains.riccati import Riccati
-from echelon.models.linearization import Linearization, linearize
+from echelon.gains.gain import Feedback, Method
+from echelon.gains.weights import weights_of
+from echelon.models.linearization import Linearization
 from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
 
 _SAMPLES = 16
 
@@ -28,25 +26,28 @@ class InnerLoop(Method):
     disagreement goes to zero for every coupling c > 0 and every connected graph.
 
     Args:
-        base: whose weights shape the inner loop, by the Riccati equation of the other states; the
-            model's own `damping` when left out, or its weights where it has none.
-        coupling: c; any positive number is stable, and it sets the rate.
+        Q, R: weights of states and normalized inputs that shape the inner loop, by the Riccati
+            equation of the other states. With neither it is the model's own `damping`; the model's
+            own weights stand for what is left out otherwise, or where it has none.
+        coupling: c > 0; any is stable, and it sets the rate; 3 when left out.
         symmetry_weight: weight of the symmetric states in P, one number each or one for all; the
             model's own when left out.
     """
 
-    base: Riccati | None = None
-    coupling: float = 3.0
+    name = "inner-loop"
+    free_coupling = 3.0
+
+    Q: Weight | None = None
+    R: Weight | None = None
     symmetry_weight: tuple[float, ...] | float | None = None
 
-    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
-        """Return the gain.
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return the inner loop, and a P that what it leaves of the drift does not expand.
 
         Raises:
-            GainError: no state is symmetric, or the other states cannot be stabilized.
+            GainError: no state is symmetric, the other states cannot be stabilized, or a weight is
+                not positive.
         """
-        check_coupling(self.coupling)
-        linear = linearize(model)
         fixed = symmetric_states(model)
         if not fixed:
             raise GainError(
@@ -54,31 +55,19 @@ class InnerLoop(Method):
                 "has nothing to leave alone; use `monotone` or `riccati`."
             )
         K = self._feedback(model, linear, fixed)
-        closed = linear.with_inner(K)
-        P = _monotone(model, closed.A, fixed, self._weights(model, len(fixed)))
-        R = np.eye(len(model.input_names))
-        certificate = certify(closed, graph, P, R, self.coupling, edge=0.0)
-        return Gain(P, R, self.coupling, "inner-loop", certificate, inner=K)
+        P = _monotone(model, linear.with_inner(K).A, fixed, self._weights(model, len(fixed)))
+        return Feedback(P, np.eye(len(model.input_names)), rho=0.0, inner=K)
 
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
         """Return K (m, n), zero in the columns of the symmetric states."""
-        if self.base is None and model.damping is not None:
+        if self.Q is None and self.R is None and model.damping is not None:
             return np.asarray(model.damping, float)
         free = _others(model, fixed)
-        Q, R = self._base_weights(model)
+        Q, R = weights_of(model, self.Q, self.R)
         A, B = linear.A[np.ix_(free, free)], linear.B[free]
         K = np.zeros((len(model.input_names), len(model.state_names)))
         K[:, free] = np.linalg.solve(R, B.T @ riccati(A, B, Q[np.ix_(free, free)], R))
         return K
-
-    def _base_weights(self, model: ControlAffine) -> tuple[Array, Array]:
-        base = Riccati() if self.base is None else self.base
-        Q = model.weights[0] if base.Q is None else base.Q
-        R = model.weights[1] if base.R is None else base.R
-        return (
-            as_matrix("Q", Q, len(model.state_names)),
-            as_matrix("R", R, len(model.input_names)),
-        )
 
     def _weights(self, model: ControlAffine, count: int) -> Array:
         """Return the weights of the symmetric states, (count,)."""

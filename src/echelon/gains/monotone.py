@@ -1,18 +1,17 @@
 """The paper's Assumption 5 as a semidefinite program: a P that the drift does not expand."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
-from echelon.certificates.certificate import RegionCertificate, certify
 from echelon.certificates.domain import Bound, Domain
-from echelon.certificates.jacobians import has_constant_input_map, jacobians
+from echelon.certificates.jacobians import jacobians
 from echelon.certificates.lmi import monotone
-from echelon.certificates.region import radius, the_domain
-from echelon.gains.gain import Gain, Method, check_coupling
-from echelon.models.linearization import linearize
+from echelon.certificates.region import drift_region, the_domain
+from echelon.gains.gain import Feedback, Method
+from echelon.models.linearization import Linearization
 from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
 
 
 class Monotone(Method):
@@ -23,37 +22,24 @@ class Monotone(Method):
 
     Args:
         domain: half-widths, or (lower, upper), by state or group.
-        coupling: c; any positive number keeps V from rising.
+        coupling: c > 0; any keeps V from rising, and it is 1 when left out.
     """
 
-    domain: Mapping[str, Bound] | Domain | None = None
-    coupling: float = 1.0
+    name = "monotone"
+    needs = ("domain",)
 
-    def solve(self, model: ControlAffine, graph: Graph) -> Gain:
-        """Return the gain; needs the extra `certify` unless eigenvalues decide.
+    domain: Mapping[str, Bound] | Domain | None = None
+
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return P, which needs no feedback; needs the extra `certify` unless eigenvalues decide.
 
         Raises:
             GainError: there is no such P (the mode is named where eigenvalues show it), or the
                 domain does not fit.
             MissingExtraError: the solver is not installed.
         """
-        check_coupling(self.coupling)
-        domain, linear = the_domain(model, self.domain), linearize(model)
+        domain = the_domain(model, self.domain)
         found = jacobians(model, domain)
         P = monotone(found.matrices, names=model.state_names).P
-        R, reach = np.eye(len(model.input_names)), radius(domain, P)
-        if reach is not None and not has_constant_input_map(model, domain):
-            # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
-            reach *= float(np.sqrt(np.divide(*graph.grounded_spectrum()[[0, -1]])))
-        region = RegionCertificate(
-            kind=found.kind,
-            rate=0.0,
-            theorem="A5",
-            domain=domain,
-            radius=reach,
-            strength=0.0,
-            hull=found.matrices,
-            error=found.error,
-        )
-        certificate = certify(linear, graph, P, R, self.coupling, edge=0.0, region=region)
-        return Gain(P, R, self.coupling, "monotone", certificate)
+        region = partial(drift_region, model, domain, found, P)
+        return Feedback(P, np.eye(len(model.input_names)), 0.0, region)

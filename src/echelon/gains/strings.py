@@ -12,7 +12,7 @@ from echelon.network.graph import Graph
 
 def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
     """Return a sentence on ||T||_inf along the branch that amplifies most (theory page, T4)."""
-    linear = linearize(model).with_inner(gain.inner)
+    A, B = linearize(model).with_inner(gain.inner)
     depth, parents = graph.depths(), graph.parents()
     i, j = graph.edges.T
     weight = np.ones(graph.agents)
@@ -20,7 +20,7 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
     used = np.unique(weight[list(graph.followers)])
     try:
         gains = [
-            string_gain(ClosedLoop(*linear, gain.P, gain.R, gain.coupling * w, used)).gain
+            string_gain(ClosedLoop(A, B, gain.P, gain.R, gain.coupling * w, used)).gain
             for w in used
         ]
     except GainError:

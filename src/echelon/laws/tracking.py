@@ -44,7 +44,8 @@ class Tracking(Law):
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
         """Complete the gain, and check that the model can follow a reference."""
         check_flat(model)
-        gain = Riccati(coupling=1.0).solve(model, graph) if self.gain is None else self.gain
+        riccati, gain = Riccati(coupling=1.0), self.gain
+        gain = riccati.solve(model, graph.spectrum()) if gain is None else gain
         for each in (gain, self.reaction):
             if each is not None:
                 check_gain_fits(self, model, each.P.shape, each.R.shape)

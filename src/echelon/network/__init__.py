@@ -2,6 +2,7 @@
 
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
+from echelon.network.spectrum import Spectrum
 from echelon.network.topology import recommend_edges, recommend_leaders
 
-__all__ = ["Formation", "Graph", "recommend_edges", "recommend_leaders"]
+__all__ = ["Formation", "Graph", "Spectrum", "recommend_edges", "recommend_leaders"]

@@ -22,6 +22,7 @@ from echelon.network.edges import (
     split_weights,
 )
 from echelon.network.exchange import Exchange
+from echelon.network.spectrum import Spectrum
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -61,7 +62,7 @@ class Graph:
         if not self.followers:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         self._check_connected()
-        self._spectrum: Array | None = None
+        self._spectrum: Spectrum | None = None
         for array in (self.edges, self.weights):
             array.setflags(write=False)
 
@@ -180,17 +181,27 @@ class Graph:
         """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
         return np.linalg.inv(self.grounded_laplacian().toarray())
 
-    def grounded_spectrum(self) -> Array:
-        """Return the eigenvalues of the grounded Laplacian, ascending; computed once, read-only.
+    def spectrum(self) -> Spectrum:
+        """Return the eigenvalues of the grounded Laplacian; computed once.
 
         All of them up to 400 followers, beyond that the smallest and the largest.
         """
         if self._spectrum is None:
-            L = self.grounded_laplacian()
-            small = len(self.followers) <= _DENSE
-            self._spectrum = np.linalg.eigvalsh(L.toarray()) if small else _extremes(L)
-            self._spectrum.setflags(write=False)
+            L, count = self.grounded_laplacian(), len(self.followers)
+            eigenvalues = np.linalg.eigvalsh(L.toarray()) if count <= _DENSE else _extremes(L)
+            eigenvalues.setflags(write=False)
+            self._spectrum = Spectrum(eigenvalues, count)
         return self._spectrum
+
+    def parent_spectrum(self) -> Spectrum:
+        """Return the eigenvalues where each agent of a tree is sent its parent's input.
+
+        They are the edges' weights, those between leaders aside (theory page, T4).
+        """
+        led = np.isin(self.edges, self.leaders).all(axis=1)
+        weights = np.unique(self.weights[~led])
+        weights.setflags(write=False)
+        return Spectrum(weights, len(weights))
 
     def neighbours(self, agent: int) -> tuple[int, ...]:
         """Return the agents linked to `agent`, sorted."""

@@ -137,4 +137,4 @@ def _slowest(graph: Graph) -> Array:
 
 
 def _lambda_min(graph: Graph) -> float:
-    return float(graph.grounded_spectrum()[0])
+    return graph.spectrum().low

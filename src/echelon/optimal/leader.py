@@ -85,7 +85,8 @@ class OptimalTracking(Law):
         """
         if self.states is not None:
             return self
-        gain = Riccati(coupling=1.0).solve(model, graph) if self.gain is None else self.gain
+        riccati, gain = Riccati(coupling=1.0), self.gain
+        gain = riccati.solve(model, graph.spectrum()) if gain is None else gain
         check_gain_fits(self, model, gain.P.shape, gain.R.shape)
         times = grid(self.horizon, _STEP, self.planning.interval)
         targets = reference_targets(model, self.reference, times.times)

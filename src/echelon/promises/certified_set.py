@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Kind, RegionCertificate
+from echelon.certificates.certificate import RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import has_constant_input_map
 from echelon.core.errors import Outcome
 from echelon.core.types import Array, States
+from echelon.core.words import Kind, Theorem
 from echelon.engine.initial import initial_states
 from echelon.engine.parts import Parts
 from echelon.engine.simulate import simulate
@@ -27,7 +28,7 @@ class CertifiedSet(NamedTuple):
 
     Attributes:
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
-        kind: of the argument; `samples` where the leader's excursion is read off a run of its own.
+        kind: of the argument; samples where the leader's excursion is read off a run of its own.
         why: what limits the radius, or why there is none.
     """
 
@@ -46,7 +47,7 @@ def certified_set(loop: CheckedLoop) -> CertifiedSet | None:
     region = loop.region
     if region is None or not _certifies(region):
         return None
-    if region.theorem == "A5" and loop.moving and not _constant(loop, region.domain):
+    if region.theorem is Theorem.A5 and loop.moving and not _constant(loop, region.domain):
         text = "g varies, and a leader that moves then adds to V; needs a constant g"
         return CertifiedSet(0.0, region.kind, text)
     kind, excursion, why = _excursion(loop)
@@ -65,7 +66,7 @@ def certified_at_rest(loop: CheckedLoop) -> float | None:
 
 
 def _certifies(region: RegionCertificate) -> bool:
-    return region.theorem == "A5" or region.theorem == "T1" and region.rate > 0.0
+    return region.theorem is Theorem.A5 or region.theorem is Theorem.T1 and region.rate > 0.0
 
 
 def _less(
@@ -82,7 +83,7 @@ def _less(
         text = f"the leader alone reaches {excursion[j]:.3g} in `{name}`, and the domain {wide:.3g}"
         return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
     shrink = 1.0
-    if region.theorem == "A5" and not _constant(loop, region.domain):
+    if region.theorem is Theorem.A5 and not _constant(loop, region.domain):
         shrink = np.sqrt(loop.certificate.lambda_min / loop.certificate.lambda_max)
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
     text += f" less {excursion[j]:.3g} of the leader" if excursion.any() else ", leader at the trim"
@@ -108,7 +109,7 @@ def _excursion(loop: CheckedLoop) -> tuple[Kind | None, Array | None, str]:
     if paths is None:
         return None, None, "the leader alone diverges; see Assumption 4"
     away = np.abs(np.asarray(_differences(model, jnp.asarray(paths), jnp.asarray(trim))))
-    return "samples", away.max(axis=0), ""
+    return Kind.SAMPLES, away.max(axis=0), ""
 
 
 def _leader_starts(loop: CheckedLoop) -> Array:

@@ -9,7 +9,6 @@ from echelon.certificates.certificate import (
     Certificate,
     RegionCertificate,
     certify,
-    parent_modes,
 )
 from echelon.certificates.margins import ClosedLoop, decays_between
 from echelon.core.linear import held_radius
@@ -19,6 +18,7 @@ from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
+from echelon.network.spectrum import Spectrum
 
 SHOWN = 32
 """Of more eigenvalues of the graph than these, so many stand for all in the margins."""
@@ -117,28 +117,30 @@ def checked_loop(parts: Parts, settings: Settings) -> CheckedLoop:
         R, c, edge = gain.R, gain.coupling, gain.certificate.edge
         linear = linear.with_inner(gain.inner)
     P = np.eye(n) if P is None else P
-    modes, count, kind = graph.grounded_spectrum(), len(graph.followers), "eigenvalues"
+    spectrum, kind = graph.spectrum(), "eigenvalues"
     if parts.drive.feedforward is Feedforward.PARENT:
-        edge = None if edge is None else edge * modes[0]
-        modes = parent_modes(graph)
-        edge, count, kind = None if edge is None else edge / modes[0], len(modes), "edges' weights"
-    certificate = certify(linear, graph, P, R, c, edge, modes=modes)
-    values, where = _looked_at(modes, count, kind)
+        edge = None if edge is None else edge * spectrum.low
+        spectrum, kind = graph.parent_spectrum(), "edges' weights"
+        edge = None if edge is None else edge / spectrum.low
+    certificate = certify(linear, spectrum, P, R, c, edge)
+    values, where = _looked_at(spectrum, kind)
     closed = ClosedLoop(*linear, P, R, c, values)
-    every = certificate.stable and (certificate.modes == count or decays_between(closed))
+    whole = certificate.modes == spectrum.total
+    every = certificate.stable and (whole or decays_between(closed))
     broken = parts.formation.broken_symmetries(model)
     return CheckedLoop(parts, settings, linear, closed, where, every, certificate, broken)
 
 
-def _looked_at(spectrum: Array, count: int, kind: str) -> tuple[Array, str]:
+def _looked_at(spectrum: Spectrum, kind: str) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
-    if len(spectrum) < count:
-        values = np.geomspace(spectrum[0], spectrum[-1], SHOWN)
-        return values, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
-    if len(spectrum) <= SHOWN:
-        return spectrum, f"all {kind} of the graph"
-    places = np.linspace(0, len(spectrum) - 1, SHOWN).round().astype(int)
-    return spectrum[places], f"{SHOWN} of {count} {kind}, the extreme ones among them"
+    values, count = spectrum
+    if len(values) < count:
+        between = np.geomspace(spectrum.low, spectrum.high, SHOWN)
+        return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
+    if count <= SHOWN:
+        return values, f"all {kind} of the graph"
+    places = np.linspace(0, count - 1, SHOWN).round().astype(int)
+    return values[places], f"{SHOWN} of {count} {kind}, the extreme ones among them"
 
 
 def step_radius(loop: CheckedLoop, dt: float) -> float:

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echelon.certificates.certificate import Certificate, certify, parent_modes
+from echelon.certificates.certificate import Certificate, certify
 from echelon.core.errors import Outcome
 from echelon.core.linear import held_radius
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, Theorem
 from echelon.engine.result import Result
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
@@ -154,11 +154,11 @@ def _with_parents(result: Result, gain: Gain) -> tuple[float, float | None]:
 
     The modes are then those of the edges' weights (theory page, T4).
     """
-    linear = linearize(result.model).with_inner(gain.inner)
-    edge, weights = gain.certificate.edge, parent_modes(result.graph)
-    given = (gain.P, gain.R, gain.coupling)
-    found = certify(linear, result.graph, *given, edge, modes=weights)
-    return found.abscissa, None if edge is None else edge * found.lambda_min / weights[0]
+    closed = linearize(result.model).with_inner(gain.inner)
+    low, weights = result.graph.spectrum().low, result.graph.parent_spectrum()
+    edge = gain.certificate.edge
+    edge = None if edge is None else edge * low / weights.low
+    return certify(closed, weights, gain.P, gain.R, gain.coupling, edge).abscissa, edge
 
 
 def _region(certificate: Certificate, model: ControlAffine) -> str:
@@ -167,9 +167,9 @@ def _region(certificate: Certificate, model: ControlAffine) -> str:
     if region is None:
         return "no region is proved"
     where = region.domain.in_words(model)
-    if region.theorem == "A5":
+    if region.theorem is Theorem.A5:
         return f"the drift does not expand P for {where} ({region.kind})"
-    scope = "everywhere there" if region.theorem == "T1" else "near the leader's path there"
+    scope = "everywhere there" if region.theorem is Theorem.T1 else "near the leader's path there"
     return (
         f"for {where} it contracts at {region.rate:.3g} 1/s {scope} "
         f"({region.kind}, {region.theorem})"

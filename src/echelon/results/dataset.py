@@ -90,8 +90,7 @@ def save_dataset(result: Result, path: Path) -> None:
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
     """Return the run's summary, ready for JSON; what does not exist is None."""
     numbers = metrics(result) if numbers is None else numbers
-    gain = result.drive.gain
-    eigenvalues = result.graph.grounded_spectrum()
+    gain, spectrum = result.drive.gain, result.graph.spectrum()
     return {
         "scenario": result.provenance.get("scenario", ""),
         "outcome": {"name": result.outcome.name.lower(), "message": result.message},
@@ -114,8 +113,8 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
             "P": gain.P.tolist(),
             "R": gain.R.tolist(),
         },
-        "lambda_min": float(eigenvalues[0]),
-        "lambda_max": float(eigenvalues[-1]),
+        "lambda_min": spectrum.low,
+        "lambda_max": spectrum.high,
         "minimum_distance": numbers.minimum_distance,
         "saturation_fraction": numbers.saturation_fraction,
         "steady_window_s": numbers.steady_window,

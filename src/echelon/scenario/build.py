@@ -293,12 +293,7 @@ def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, folder: Path) -> G
     if spec.file is not None:
         return load_gain(folder / spec.file, model, graph)
     cls = resolve(registry.METHODS[spec.method])
-    given = {
-        key: value
-        for key, value in spec.model_dump().items()
-        if value is not None and key != "method"
-    }
-    return synthesize(model, graph, cls(**_checked(cls, spec.method, given)))
+    return synthesize(model, graph, cls(**_checked(cls, spec.method, spec.arguments)))
 
 
 def _follower(

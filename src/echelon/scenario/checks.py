@@ -7,7 +7,8 @@ that), so one fault never hides another. Each check yields the path of a fault a
 import math
 from collections.abc import Iterable, Iterator, Mapping
 
-from echelon.scenario.registry import LEADER_LAWS
+from echelon.core.errors import did_you_mean
+from echelon.scenario.registry import DEFAULT_METHOD, GAIN_KEYS, LEADER_LAWS, METHODS
 from echelon.scenario.yaml import Document, KeyPath, are, shown
 
 Fault = tuple[KeyPath, str]
@@ -43,15 +44,8 @@ _FORMATION_KEYS: _Taken = {
     "circle": ((), ("spacing",)),
     "grid": ((), ("spacing", "columns")),
 }
-_GAIN_KEYS: _Taken = {
-    "riccati": ((), ("Q", "R", "coupling")),
-    "given": (("P",), ("R", "coupling")),
-    "inner-loop": ((), ("coupling", "symmetry_weight")),
-    "monotone": (("domain",), ("coupling",)),
-    "robust-lqr": (("domain",), ("Q", "R", "coupling", "exact")),
-    "contraction": (("domain", "rate"), ("coupling", "exact")),
-    "file": ((), ()),
-}
+_GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in METHODS.items()}
+_GAIN_KEYS["file"] = ((), ())
 
 
 def _section(data: Part, *path: str) -> Part:
@@ -131,8 +125,12 @@ def _choices(data: Part) -> Iterator[Fault]:
         gain = _section(data, role, "gain")
         if gain.get("file") is not None and gain.get("method") is not None:
             yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
-        made_by = "file" if gain.get("file") is not None else gain.get("method", "riccati")
+        made_by = "file" if gain.get("file") is not None else gain.get("method", DEFAULT_METHOD)
         yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
+        # The schema leaves open which further keys a method has.
+        for key in (key for key in gain if isinstance(key, str) and key not in GAIN_KEYS):
+            said = f"got an unknown key, allowed {are(GAIN_KEYS)}"
+            yield (role, "gain", key), f"{said}{did_you_mean(key, GAIN_KEYS)}."
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:

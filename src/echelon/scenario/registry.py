@@ -8,10 +8,19 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """Where a named part lives (`module:Attribute`) and what it is, in one line."""
+    """Where a named part lives and what it is, in one line; of a gain method also its keys.
+
+    Attributes:
+        target: `module:Attribute`.
+        summary: for lists.
+        needs: keys that a scenario must give with it.
+        takes: keys that it may give.
+    """
 
     target: str
     summary: str
+    needs: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
 
 
 def _models(**entries: tuple[str, str]) -> dict[str, Entry]:
@@ -53,20 +62,47 @@ REFERENCES = {
     "waypoints": Entry("echelon.references:Waypoints", "smooth polynomials through timed points"),
 }
 
+# The keys are the arguments of the class; they stand here too since the class needs JAX.
 METHODS = {
     "riccati": Entry(
-        "echelon.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"
+        "echelon.gains:Riccati",
+        "Riccati equation at the trim, coupling 1/lambda_min",
+        takes=("Q", "R", "coupling"),
     ),
-    "given": Entry("echelon.gains:FixedGain", "a P (and R, coupling) of your own"),
+    "given": Entry(
+        "echelon.gains:FixedGain",
+        "a P (and R, coupling) of your own",
+        needs=("P",),
+        takes=("R", "coupling"),
+    ),
     "inner-loop": Entry(
-        "echelon.gains:InnerLoop", "damp all but position, then any coupling works"
+        "echelon.gains:InnerLoop",
+        "damp all but position, then any coupling works",
+        takes=("Q", "R", "coupling", "symmetry_weight"),
     ),
-    "monotone": Entry("echelon.gains:Monotone", "the paper's Assumption 5 on a domain, as an SDP"),
+    "monotone": Entry(
+        "echelon.gains:Monotone",
+        "the paper's Assumption 5 on a domain, as an SDP",
+        needs=("domain",),
+        takes=("coupling",),
+    ),
     "robust-lqr": Entry(
-        "echelon.gains:RobustLQR", "one P for all Jacobians of a domain, as an SDP"
+        "echelon.gains:RobustLQR",
+        "one P for all Jacobians of a domain, as an SDP",
+        needs=("domain",),
+        takes=("Q", "R", "coupling", "exact"),
     ),
-    "contraction": Entry("echelon.gains:Contraction", "weakest gain of a given rate on a domain"),
+    "contraction": Entry(
+        "echelon.gains:Contraction",
+        "weakest gain of a given rate on a domain",
+        needs=("domain", "rate"),
+        takes=("coupling", "exact"),
+    ),
 }
+DEFAULT_METHOD = "riccati"
+_ARGUMENTS = (key for entry in METHODS.values() for key in entry.needs + entry.takes)
+GAIN_KEYS = tuple(dict.fromkeys(("method", *_ARGUMENTS, "file")))
+"""All keys of a gain, each once."""
 
 FOLLOWER_LAWS = {
     "consensus": Entry("echelon.laws:Consensus", "u = u_ff - c R^-1 g(x)^T P (e + d)"),

@@ -10,8 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from echelon.core.words import Feedforward
 from echelon.scenario.registry import (
+    DEFAULT_METHOD,
     FOLLOWER_LAWS,
     FORMATIONS,
+    GAIN_KEYS,
     GRAPHS,
     INTEGRATORS,
     LEADER_LAWS,
@@ -140,12 +142,18 @@ class ReferenceSpec(BaseModel):
 
 @final
 class GainSpec(BaseModel):
-    """How the gain of a law is found."""
+    """How the gain of a law is found: by a method and its arguments, or from a file."""
 
-    model_config = STRICT
+    # Arguments that deserve a description, or are no numbers, have their keys here; so that a new
+    # method needs no more than its line in the registry, further ones may be numbers.
+    model_config = STRICT | ConfigDict(
+        extra="allow", json_schema_extra={"propertyNames": {"enum": list(GAIN_KEYS)}}
+    )
+    # narrower than the base's, as pydantic wants it to check the further keys
+    __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
     method: Annotated[str, OneOf(METHODS)] = Field(
-        default="riccati", description="Name of a method."
+        default=DEFAULT_METHOD, description="Name of a method."
     )
     Q: Array | None = Field(
         default=None, description="Weight of the states: its diagonal or rows; default the model's."
@@ -177,6 +185,11 @@ class GainSpec(BaseModel):
     file: str | None = Field(
         default=None, description="Gain file of `echelon design`, relative to the scenario file."
     )
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What it gives the method."""
+        return self.model_dump(exclude={"method", "file"}, exclude_none=True)
 
 
 @final

@@ -6,6 +6,7 @@ import numpy as np
 
 from echelon.certificates.modes import obstacle
 from echelon.core.linear import in_words
+from echelon.core.words import Kind, Verdict
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.promises.closed_loop import CheckedLoop
@@ -17,22 +18,24 @@ ZERO = 1e-9
 
 def graph_lines(loop: CheckedLoop) -> Iterator[Line]:
     """Yield what the paper asks of agents, graph and leader: Assumptions 1-4 and 6, Lemmas 1-3."""
-    graph, low = loop.parts.graph, loop.certificate.lambda_min
-    unit = bool((graph.weights == 1.0).all())
+    graph = loop.parts.graph
+    low, high = graph.spectrum().low, graph.spectrum().high
+    unit, holds, proof = bool((graph.weights == 1.0).all()), Verdict.HOLDS, Kind.PROOF
     edges = f"{graph.agents} agents, {len(graph.edges)} edges"
     yield _trim_line(loop)
-    yield Line("Assumption 1, autonomous", "holds", "proof", "", "f and g depend on x alone")
+    yield Line("Assumption 1, autonomous", holds, proof, "", "f and g depend on x alone")
     text = "connected and static" + ("" if unit else "; weights need not be 1")
-    yield Line("Assumption 2, graph", "holds", "proof", edges, text)
+    yield Line("Assumption 2, graph", holds, proof, edges, text)
     yield _exact_line(loop)
     yield _leader_line(loop)
-    number = f"lambda_min {low:.6g}, lambda_max {loop.certificate.lambda_max:.6g}"
-    yield Line("Assumption 6, M L = I", "holds", "proof", number, "for the grounded Laplacian")
-    yield Line("Lemma 1, L > 0", "holds", "proof", f"{low:.6g}", "grounded Laplacian")
-    yield Line("Lemma 2, Schur complement", "not needed", "proof", "", "the LMI is not used")
+    number = f"lambda_min {low:.6g}, lambda_max {high:.6g}"
+    yield Line("Assumption 6, M L = I", holds, proof, number, "for the grounded Laplacian")
+    yield Line("Lemma 1, L > 0", holds, proof, f"{low:.6g}", "grounded Laplacian")
+    text = "the LMI is not used"
+    yield Line("Lemma 2, Schur complement", Verdict.NOT_NEEDED, proof, "", text)
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
-    yield Line("Lemma 3, sum over edges", "fails", "proof", f"row sum {rows:.3g}", text)
+    yield Line("Lemma 3, sum over edges", Verdict.FAILS, proof, f"row sum {rows:.3g}", text)
 
 
 def _trim_line(loop: CheckedLoop) -> Line:
@@ -42,8 +45,8 @@ def _trim_line(loop: CheckedLoop) -> Line:
     number, text = f"|f + g u*| {size:.2g}", "about the trim, whose input the law applies"
     if not loop.trimmed:
         text = "the law leaves out the trim input; set `follower.trim: true`"
-    verdict = "holds" if loop.trimmed else "fails"
-    return Line("Definition 1, f(0) = 0", verdict, "proof", number, text)
+    verdict = Verdict.of(loop.trimmed)
+    return Line("Definition 1, f(0) = 0", verdict, Kind.PROOF, number, text)
 
 
 def _exact_line(loop: CheckedLoop) -> Line:
@@ -51,23 +54,24 @@ def _exact_line(loop: CheckedLoop) -> Line:
     text = "states are known exactly, and nothing disturbs the agents"
     if loop.disturbed:
         text = f"{loop.disturbed}; what holds without is said, and how far it may push is below"
-    verdict = "fails" if loop.disturbed else "holds"
-    return Line("Assumption 3, exact states", verdict, "proof", "", text)
+    verdict = Verdict.of(not loop.disturbed)
+    return Line("Assumption 3, exact states", verdict, Kind.PROOF, "", text)
 
 
 def _leader_line(loop: CheckedLoop) -> Line:
     """Assumption 4: the leader tracks its reference, by linearization."""
+    statement = "Assumption 4, leader tracks"
     gain = getattr(getattr(loop.parts.drive, "leader", None), "gain", None)
     if not isinstance(gain, Gain):
-        return Line("Assumption 4, leader tracks", "not needed", "proof", "", "it follows nothing")
+        return Line(statement, Verdict.NOT_NEEDED, Kind.PROOF, "", "it follows nothing")
     A, B = linearize(loop.parts.model)
     K = np.linalg.solve(gain.R, B.T @ gain.P)
     slow = float(np.linalg.eigvals(A - gain.coupling * B @ K).real.max())
-    verdict = "holds" if slow < -ZERO else "fails"
+    verdict = Verdict.of(slow < -ZERO)
     text = "at the trim"
-    if verdict == "fails":
+    if verdict is Verdict.FAILS:
         text = "the tracking error is not damped at the trim; give `leader.gain` another method"
-    return Line("Assumption 4, leader tracks", verdict, "linearization", f"{slow:.3g} 1/s", text)
+    return Line(statement, verdict, Kind.LINEARIZATION, f"{slow:.3g} 1/s", text)
 
 
 def drift_lines(loop: CheckedLoop) -> Iterator[Line]:
@@ -79,14 +83,14 @@ def drift_lines(loop: CheckedLoop) -> Iterator[Line]:
     text = "f and g do not notice them"
     if not symmetric:
         text = f"agent {agent}: {reason}; offset only states that f and g ignore"
-    verdict = "holds" if symmetric else "fails"
-    yield Line("offsets are symmetries", verdict, "samples", f"{len(loop.broken)} broken", text)
-    both = symmetric and monotone.verdict == "holds"
+    verdict = Verdict.of(symmetric)
+    yield Line("offsets are symmetries", verdict, Kind.SAMPLES, f"{len(loop.broken)} broken", text)
+    both = symmetric and monotone.verdict is Verdict.HOLDS
     text = "needs Assumption 5 and symmetric offsets"
-    yield Line("Lemma 4, drift along z", "holds" if both else "fails", "linearization", "", text)
+    yield Line("Lemma 4, drift along z", Verdict.of(both), Kind.LINEARIZATION, "", text)
     largest = _printed_lmi(loop)
     text = "infeasible for every P > 0: its upper left block is zero; use the finite condition"
-    yield Line("LMI as printed", "fails", "proof", f"eigenvalue {largest:.3g} > 0", text)
+    yield Line("LMI as printed", Verdict.FAILS, Kind.PROOF, f"eigenvalue {largest:.3g} > 0", text)
     yield _finite_line(loop)
 
 
@@ -104,8 +108,8 @@ def _monotone_line(loop: CheckedLoop) -> Line:
         text += "an `inner-loop` gain makes it hold, `riccati` does without"
     elif not holds:
         text = "this P does not; `monotone` or `inner-loop` find one, `riccati` does without"
-    verdict = "holds" if holds else "fails"
-    return Line("Assumption 5, P-monotone drift", verdict, "linearization", f"{worst:.3g}", text)
+    verdict = Verdict.of(holds)
+    return Line("Assumption 5, P-monotone drift", verdict, Kind.LINEARIZATION, f"{worst:.3g}", text)
 
 
 def _printed_lmi(loop: CheckedLoop) -> float:
@@ -132,14 +136,14 @@ def _finite_line(loop: CheckedLoop) -> Line:
     P = P / float(np.linalg.eigvalsh(P)[0])
     found = finite_condition(P, parts.model, parts.formation, parts.drive)
     statement = "finite condition on P"
-    if found.verdict == "vacuous":
+    if found.verdict is Verdict.VACUOUS:
         text = "f is the same at all goals, so that every P passes: it says nothing"
-        return Line(statement, "vacuous", "proof", "0 <= 0", text)
+        return Line(statement, Verdict.VACUOUS, Kind.PROOF, "0 <= 0", text)
     every = found.agents == parts.graph.agents
     among = "" if every else f", for {found.agents} of {parts.graph.agents} agents"
     text = f"at the goals only{among}; it says nothing of other states"
-    if found.verdict == "fails":
+    if found.verdict is Verdict.FAILS:
         i, j = found.pair
         text = f"goals of agents {i} and {j} drift apart in this P; choose other offsets or P"
-    kind = "proof" if every else "samples"
+    kind = Kind.PROOF if every else Kind.SAMPLES
     return Line(statement, found.verdict, kind, f"{found.largest:.3g}", text)

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from echelon.core.numerics import precision
+from echelon.core.words import Theorem
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.promises.certified_set import CertifiedSet, certified_set
@@ -58,26 +59,18 @@ def _promise(loop: CheckedLoop, found: CertifiedSet | None) -> str:
         f"leader near enough to the trim, converge to them{condition}"
     )
     region = loop.region
-    if region is None or region.theorem != "A5" and not region.rate > 0.0:
+    if region is None or region.theorem is not Theorem.A5 and not region.rate > 0.0:
         return f"{local}; no region is proved."
     return f"{local}. {_regional(loop, found, condition)}"
-
-
-_BY = {
-    "proof": "Proved in exact arithmetic, in continuous time and within the inputs' limits: ",
-    "vertices": "By eigenvalues at the corners of a hull of all Jacobians, in continuous time and "
-    "within the inputs' limits: ",
-    "samples": "Seen at samples, which is no proof: ",
-}
 
 
 def _regional(loop: CheckedLoop, found: CertifiedSet | None, condition: str) -> str:
     """Return what the region adds, as strong as its own argument and no stronger."""
     region = loop.region
     assert region is not None
-    by, where = _BY[region.kind], region.domain.in_words(loop.parts.model)
+    by, where = f"{region.kind.value}: ", region.domain.in_words(loop.parts.model)
     theorem, what = region.theorem, f"errors shrink at {region.rate:.3g} 1/s or faster"
-    if theorem == "A5":
+    if theorem is Theorem.A5:
         what = "V does not rise"
     if found is None:
         return f"{by}small {what}{condition}, while the leader stays in {where} ({theorem})."
@@ -86,7 +79,7 @@ def _regional(loop: CheckedLoop, found: CertifiedSet | None, condition: str) -> 
             f"{by}{what}{condition}, for as long as all agents stay in {where} ({theorem}), and no "
             f"start is certified to stay: {found.why}."
         )
-    read = "" if found.kind == region.kind else ", the leader going as in a run of its own"
+    read = "" if found.kind is region.kind else ", the leader going as in a run of its own"
     start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
     start = "everywhere" if found.radius == float("inf") else start
     return f"{by}from {start}, {what}{condition}{read} ({theorem})."

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.certificates import margins
-from echelon.certificates.certificate import Kind
 from echelon.core.errors import EchelonError
 from echelon.core.linear import longest_step
 from echelon.core.numerics import precision
-from echelon.gains.gain import Gain, synthesize
+from echelon.gains.gain import Gain, Method, synthesize
 from echelon.laws.consensus import Consensus
 from echelon.promises.certified_set import CertifiedSet, certified_set
 from echelon.promises.closed_loop import CheckedLoop, checked_loop
@@ -19,11 +18,8 @@ from echelon.scenario.build import Built, resolve
 from echelon.scenario.scenario import Scenario
 from echelon.studies.speedup import speedup
 
-_NEEDS_DOMAIN = ("monotone", "robust-lqr", "contraction")
 _ADVISED = 100
-_RATE = 0.1
-"""Rate that `contraction` is asked for where the scenario names none, 1/s."""
-_STRENGTH: dict[Kind, int] = {"proof": 3, "vertices": 2, "samples": 1, "linearization": 0}
+"""Followers of the largest swarm that is advised on its graph; of more it would take minutes."""
 
 
 class Design(NamedTuple):
@@ -56,8 +52,13 @@ class Design(NamedTuple):
 
 def designs(scenario: Scenario, built: Built, only: str | None = None) -> tuple[Design, ...]:
     """Try the methods on a built scenario, or `only` one of them."""
-    names = [only] if only else [name for name in registry.METHODS if name != "given"]
-    return tuple(_design(name, scenario, built) for name in names)
+    methods = [resolve(registry.METHODS[name]) for name in ([only] if only else registry.METHODS)]
+    return tuple(_design(each, scenario, built) for each in methods if only or _chooses(each))
+
+
+def _chooses(method: type[Method]) -> bool:
+    """Whether a method finds a gain by itself: one that wants a P, say, is no choice of design."""
+    return {*method.needs} <= {"domain", *method.usual}
 
 
 def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
@@ -92,25 +93,24 @@ def _merit(design: Design, dt: float) -> tuple[bool, int, float]:
     assert design.gain is not None and design.step is not None
     certificate = design.gain.certificate
     region = certificate.region
-    strength = _STRENGTH[region.kind] if region is not None and region.rate > 0.0 else 0
+    strength = region.kind.strength if region is not None and region.rate > 0.0 else 0
     return design.step > dt, strength, -certificate.abscissa
 
 
-def _design(name: str, scenario: Scenario, built: Built) -> Design:
+def _design(method: type[Method], scenario: Scenario, built: Built) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
-    options = _options(name, scenario)
-    if name in _NEEDS_DOMAIN and "domain" not in options:
-        return Design(name, None, "give `follower.gain.domain` to try it")
+    arguments = _arguments(method, scenario)
+    missing = [f"`follower.gain.{key}`" for key in method.needs if key not in arguments]
+    if missing:
+        return Design(method.name, None, f"give {' and '.join(missing)} to try it")
     began = time.perf_counter()
     try:
-        gain = synthesize(
-            built.parts.model, built.parts.graph, resolve(registry.METHODS[name])(**options)
-        )
+        gain = synthesize(built.parts.model, built.parts.graph, method(**arguments))
     except EchelonError as error:
-        return Design(name, None, str(error), seconds=time.perf_counter() - began)
+        return Design(method.name, None, str(error), seconds=time.perf_counter() - began)
     seconds = time.perf_counter() - began
     with precision("float64"):
-        return _known(name, with_gain(built, gain))._replace(seconds=seconds)
+        return _known(gain, with_gain(built, gain))._replace(seconds=seconds)
 
 
 def with_gain(built: Built, gain: Gain) -> CheckedLoop:
@@ -121,11 +121,11 @@ def with_gain(built: Built, gain: Gain) -> CheckedLoop:
         return checked_loop(parts.replace(drive=drive), settings)
 
 
-def _known(name: str, loop: CheckedLoop) -> Design:
-    """Return what is known of a gain."""
+def _known(gain: Gain, loop: CheckedLoop) -> Design:
+    """Return what is known of a gain and its loop."""
     closed, (A, B) = loop.closed, loop.linear
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
-    found = Design(name, loop.gain, fastest=float(np.abs(poles).max()))
+    found = Design(gain.method, gain, fastest=float(np.abs(poles).max()))
     if not loop.every:
         return found._replace(step=0.0)
     ends = closed.strengths[[0, -1]]
@@ -135,32 +135,27 @@ def _known(name: str, loop: CheckedLoop) -> Design:
         factors=margins.gain_margin(closed),
         delay=margins.delay_margin(closed).delay,
         certified=certified_set(loop),
-        advice=_advice(name, loop),
+        advice=_advice(gain, loop),
     )
 
 
-def _advice(name: str, loop: CheckedLoop) -> str:
-    """Return what else to know: for `inner-loop`, an edge or a leader that makes it faster.
+def _advice(gain: Gain, loop: CheckedLoop) -> str:
+    """Return what else to know: of an inner loop, an edge or a leader that makes it faster.
 
-    Any graph keeps it stable, and so the graph alone sets its rate. A swarm would take minutes.
+    Any graph keeps it stable, and so the graph alone sets its rate.
     """
-    graph, gain = loop.parts.graph, loop.gain
-    followers, free = len(graph.followers), graph.agents * (graph.agents - 1) // 2
-    if name != "inner-loop" or gain is None or followers > _ADVISED:
+    graph = loop.parts.graph
+    followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
+    if gain.inner is None or followers > _ADVISED:
         return ""
-    more = int(followers > 1), int(len(graph.edges) < free)
+    more = int(followers > 1), int(len(graph.edges) < pairs)
     return speedup(loop.parts.model, graph, gain, *more).sentence()
 
 
-def _options(name: str, scenario: Scenario) -> dict[str, Any]:
+def _arguments(method: type[Method], scenario: Scenario) -> dict[str, Any]:
     """Return what the scenario says of this method, and its domain for those that need one."""
     spec = scenario.follower.gain
-    given: dict[str, Any] = {}
-    if spec.method == name and spec.file is None:
-        fields = spec.model_dump().items()
-        given = {key: value for key, value in fields if value is not None and key != "method"}
-    elif name in _NEEDS_DOMAIN and spec.domain is not None:
-        given["domain"] = spec.domain
-    if name == "contraction":
-        given.setdefault("rate", _RATE)
-    return given
+    if spec.method == method.name and spec.file is None:
+        return {**method.usual, **spec.arguments}
+    domain = {} if spec.domain is None or "domain" not in method.needs else {"domain": spec.domain}
+    return {**method.usual, **domain}

@@ -4,7 +4,7 @@ At the goals alone it reads P >= I and (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 
 agents. The paper writes d_ij = xi_j - xi_i for the first factor, which turns the sign.
 """
 
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,12 +15,11 @@ from echelon.core.errors import GainError
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
+from echelon.core.words import Verdict
 from echelon.engine.drive import Drive
 from echelon.laws.law import Law
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
-
-Verdict: TypeAlias = Literal["holds", "fails", "vacuous"]
 
 _ZERO = 1e-9  # what rounding makes of f at goals that are symmetric
 _MOST = 1000  # agents that are compared pair by pair; of more, so many spread over all
@@ -31,7 +30,7 @@ class FiniteCondition(NamedTuple):
     """What the paper's finite condition says of a P.
 
     Attributes:
-        verdict: `vacuous` where f is the same at all goals, so that every P >= I passes.
+        verdict: vacuous where f is the same at all goals, so that every P >= I passes.
         largest: of (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) over the pairs; at most 0 where it holds.
         pair: the agents that give it.
         least: smallest eigenvalue of P; at least 1 where it holds.
@@ -71,13 +70,13 @@ def finite_condition(
     size = max(1.0, float(np.abs(drifts).max()))
     least = float(np.linalg.eigvalsh(P)[0])
     if float(np.ptp(drifts, axis=0).max()) <= _ZERO * size:
-        verdict = "vacuous" if least >= 1.0 - _ZERO else "fails"
+        verdict = Verdict.VACUOUS if least >= 1.0 - _ZERO else Verdict.FAILS
         return FiniteCondition(verdict, 0.0, (0, 0), least, len(offsets))
     some = np.unique(np.linspace(0, len(offsets) - 1, min(_MOST, len(offsets))).astype(int))
     largest, (i, j) = _largest(P, offsets[some], drifts[some])
     holds = largest <= _ZERO * size * float(np.abs(P).max()) and least >= 1.0 - _ZERO
     pair = (int(some[i]), int(some[j]))
-    return FiniteCondition("holds" if holds else "fails", largest, pair, least, len(some))
+    return FiniteCondition(Verdict.of(holds), largest, pair, least, len(some))
 
 
 def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:

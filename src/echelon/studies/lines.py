@@ -2,15 +2,15 @@
 
 from typing import NamedTuple
 
-from echelon.certificates.certificate import Kind
+from echelon.core.words import Kind, Verdict
 
 
 class Line(NamedTuple):
     """One statement: its verdict, the kind of argument, the number behind it, what to change."""
 
     statement: str
-    verdict: str
-    kind: Kind | str
+    verdict: Verdict
+    kind: Kind
     number: str
     text: str
 

@@ -9,12 +9,13 @@ import scipy.sparse.csgraph as csgraph
 from echelon.certificates import margins
 from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
 from echelon.core.types import Array
+from echelon.core.words import Kind, Verdict
 from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import CheckedLoop, step_radius
 from echelon.studies.lines import Line
 
-_KIND = "linearization"
+_KIND = Kind.LINEARIZATION
 
 
 def law_lines(loop: CheckedLoop) -> Iterator[Line]:
@@ -25,7 +26,7 @@ def law_lines(loop: CheckedLoop) -> Iterator[Line]:
     names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
     along = ", ".join(f"`{model.state_names[k]}`" for k in names)
     text = f"never felt by the input: {along}; choose another P" if hidden else "z = 0 is reached"
-    verdict = "fails" if hidden else "holds"
+    verdict = Verdict.of(not hidden)
     yield Line("detectability of (A, g'P)", verdict, _KIND, f"rank {rank} of {n}", text)
     yield _matched_line(loop)
     edge, c = certificate.edge, loop.closed.coupling
@@ -35,7 +36,7 @@ def law_lines(loop: CheckedLoop) -> Iterator[Line]:
         text += "" if c >= edge else "; raise `coupling` to it"
     number = f"c {c:.4g}" + ("" if edge is None else f", edge {edge:.4g}")
     fine = edge is None or c >= edge
-    yield Line("coupling", "holds" if fine else "fails", "proof", number, text)
+    yield Line("coupling", Verdict.of(fine), Kind.PROOF, number, text)
     yield _decay_line(loop)
     yield _step_line(loop)
 
@@ -47,7 +48,7 @@ def _matched_line(loop: CheckedLoop) -> Line:
         text = "each follower is told its parent's input" if loop.fed_by_parents else text
     if not loop.matched:
         text = "followers lag behind a moving leader; `feedforward: relay` removes it"
-    return Line("leader's motion is matched", _verdict(loop.matched), "proof", "", text)
+    return Line("leader's motion is matched", Verdict.of(loop.matched), Kind.PROOF, "", text)
 
 
 def _decay_line(loop: CheckedLoop) -> Line:
@@ -62,32 +63,33 @@ def _decay_line(loop: CheckedLoop) -> Line:
         text = "the followers' law does not use the disagreement; use `consensus`"
     elif not loop.every:
         text += "; raise `coupling`, or use `riccati` or `inner-loop`"
-    verdict = _verdict(loop.every and loop.governed)
+    verdict = Verdict.of(loop.every and loop.governed)
     return Line("disagreement decays", verdict, _KIND, f"{certificate.abscissa:.3g} 1/s", text)
 
 
 def _step_line(loop: CheckedLoop) -> Line:
     """Whether it still decays with the input held over the scenario's step."""
     statement, dt = "step, input held", loop.settings.dt
+    number = f"dt {dt:g} s"
     if not loop.every:
-        return Line(statement, "not needed", _KIND, f"dt {dt:g} s", "there is nothing to lose")
+        return Line(statement, Verdict.NOT_NEEDED, _KIND, number, "there is nothing to lose")
     radius = step_radius(loop, dt)
     text = f"spectral radius {radius:.4g} a step, {loop.where}"
     text += "" if radius < 1.0 else "; shorten `simulation.dt` or lower the gain"
-    return Line(statement, _verdict(radius < 1.0), _KIND, f"dt {dt:g} s", text)
+    return Line(statement, Verdict.of(radius < 1.0), _KIND, number, text)
 
 
 def margin_lines(loop: CheckedLoop) -> Iterator[Line]:
     """Yield how far the loop is from losing what it promises."""
     if not (loop.every and loop.governed):
-        yield Line("margins", "not needed", _KIND, "", "there is nothing to lose")
+        yield Line("margins", Verdict.NOT_NEEDED, _KIND, "", "there is nothing to lose")
         return
     factors, delay = margins.gain_margin(loop.closed), margins.delay_margin(loop.closed)
     number = f"{factors.low:.3g} to {factors.high:.3g}"
-    yield Line("gain margin", "holds", _KIND, number, "factors on the coupling")
+    yield Line("gain margin", Verdict.HOLDS, _KIND, number, "factors on the coupling")
     number = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
-    yield Line("delay margin", "holds", _KIND, number, text)
+    yield Line("delay margin", Verdict.HOLDS, _KIND, number, text)
     yield _scaling_line(loop)
     # The bound of the network rests on a symmetric matrix, which parents' inputs take away.
     yield from () if loop.fed_by_parents else _push_lines(loop)
@@ -102,7 +104,7 @@ def _scaling_line(loop: CheckedLoop) -> Line:
     text = "inputs 30 % weaker or stronger, as by a wrong mass or inertia"
     text += "" if worst.abscissa < 0.0 else "; identify them better, or raise `coupling`"
     number = f"{worst.abscissa:.3g} 1/s"
-    return Line("input scaling", _verdict(worst.abscissa < 0.0), _KIND, number, text)
+    return Line("input scaling", Verdict.of(worst.abscissa < 0.0), _KIND, number, text)
 
 
 class _Push(NamedTuple):
@@ -134,11 +136,11 @@ def _push_lines(loop: CheckedLoop) -> Iterator[Line]:
         return ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
 
     text = f"{unit}per {where}: no push of that norm on all followers together takes any farther"
-    outer = invariant_ellipsoid(loop.closed, E)
-    yield Line("disturbance, network", "holds", _KIND, number(outer), f"{text}; {loop.where}")
+    text, outer = f"{text}; {loop.where}", invariant_ellipsoid(loop.closed, E)
+    yield Line("disturbance, network", Verdict.HOLDS, _KIND, number(outer), text)
     text = f"{unit}per {where}: the exact peak, for a push shaped like the worst eigenvector"
-    exact = peak_gain(loop.closed, E)
-    yield Line("disturbance, one mode", "holds", _KIND, number(exact), f"{text}; {loop.where}")
+    text, exact = f"{text}; {loop.where}", peak_gain(loop.closed, E)
+    yield Line("disturbance, one mode", Verdict.HOLDS, _KIND, number(exact), text)
 
 
 def _string_line(loop: CheckedLoop) -> Iterator[Line]:
@@ -155,8 +157,4 @@ def _string_line(loop: CheckedLoop) -> Iterator[Line]:
     text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
     if not used:
         text = "what feeding forward the parent's input would amplify; it is not used here"
-    yield Line("string gain", "holds" if used else "not needed", _KIND, number, text)
-
-
-def _verdict(holds: bool) -> str:
-    return "holds" if holds else "fails"
+    yield Line("string gain", Verdict.HOLDS if used else Verdict.NOT_NEEDED, _KIND, number, text)

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.certificate import Kind
 from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import has_constant_input_map
 from echelon.core.types import Array, States
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.models.model import ControlAffine
 from echelon.promises.certified_set import CertifiedSet
 from echelon.promises.closed_loop import CheckedLoop
@@ -33,29 +33,22 @@ def _region_line(loop: CheckedLoop) -> Line:
     region = loop.region
     if region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
-        return Line("region of the gain", "not needed", "proof", "none", text)
-    what = {
-        "T1": "T1: errors of all sizes shrink while all agents stay in",
-        "T2": "T2, local: small errors shrink while the leader stays in",
-        "A5": "Assumption 5: the drift does not expand P while all agents stay in",
-    }[region.theorem]
-    holds = region.rate > 0.0 or region.theorem == "A5"
-    text = f"{what} {region.domain.in_words(loop.parts.model)}"
+        return Line("region of the gain", Verdict.NOT_NEEDED, Kind.PROOF, "none", text)
+    theorem, number = region.theorem, f"{region.rate:.3g} 1/s"
+    holds = region.rate > 0.0 or theorem is Theorem.A5
+    text = f"{theorem}: {theorem.value} {region.domain.in_words(loop.parts.model)}"
     text += "" if holds else "; shrink the `domain`"
-    verdict = "holds" if holds else "fails"
-    return Line("region of the gain", verdict, region.kind, f"{region.rate:.3g} 1/s", text)
+    return Line("region of the gain", Verdict.of(holds), region.kind, number, text)
 
 
 def _set_line(loop: CheckedLoop, found: CertifiedSet | None) -> Line:
     statement = "certified set"
     if found is None:
-        local = loop.region is not None and loop.region.theorem == "T2"
+        local = loop.region is not None and loop.region.theorem is Theorem.T2
         text = "T2 is local and certifies no set" if local else "needs a region"
-        return Line(statement, "not needed", "proof", "", text)
-    verdict, number = (
-        ("holds", f"radius {found.radius:.3g}") if found.radius else ("fails", "empty")
-    )
-    return Line(statement, verdict, found.kind, number, found.why)
+        return Line(statement, Verdict.NOT_NEEDED, Kind.PROOF, "", text)
+    number = f"radius {found.radius:.3g}" if found.radius else "empty"
+    return Line(statement, Verdict.of(found.radius > 0.0), found.kind, number, found.why)
 
 
 def _killing_line(loop: CheckedLoop) -> Line:
@@ -66,12 +59,12 @@ def _killing_line(loop: CheckedLoop) -> Line:
     residual, kind = killing_residual(model, loop.closed.P, domain)
     number = f"{residual:.3g} 1/s"
     statement = "Killing residual of g"
-    if kind == "proof":
+    if kind is Kind.PROOF:
         text = f"g is constant {where}: a region is nonlocal (T1)"
-        return Line(statement, "holds", kind, number, text)
+        return Line(statement, Verdict.HOLDS, kind, number, text)
     text = f"per unit of input, {where}: g varies, so a region is local (T2)"
     text += "; a model with its inputs as states has constant g"
-    return Line(statement, "fails", kind, number, text)
+    return Line(statement, Verdict.FAILS, kind, number, text)
 
 
 def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[float, Kind]:
@@ -87,11 +80,11 @@ def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[fl
     slopes = np.asarray(_input_slopes(model, jnp.asarray(base + states)))
     # A hull takes a second, and one slope that is not zero says what it would.
     if not slopes.any() and has_constant_input_map(model, domain):
-        return 0.0, "proof"
+        return 0.0, Kind.PROOF
     weighted = P @ np.moveaxis(slopes, 2, 1)
     root = np.linalg.inv(np.linalg.cholesky(P))
     values = np.linalg.eigvalsh(root @ (weighted + weighted.swapaxes(-1, -2)) @ root.T)
-    return 0.5 * float(np.abs(values).max()), "samples"
+    return 0.5 * float(np.abs(values).max()), Kind.SAMPLES
 
 
 @eqx.filter_jit

@@ -71,6 +71,7 @@ def time_constant(model: ControlAffine, graph: Graph, gain: Gain) -> float:
 
     In it the slowest disagreement falls to 1/e; it is infinite where one does not decay.
     """
-    linear = linearize(model).with_inner(gain.inner)
-    abscissa = certify(linear, graph, gain.P, gain.R, gain.coupling, None).abscissa
+    closed = linearize(model).with_inner(gain.inner)
+    spectrum = graph.spectrum()
+    abscissa = certify(closed, spectrum, gain.P, gain.R, gain.coupling, None).abscissa
     return -1.0 / abscissa if abscissa < 0.0 else float("inf")
