@@ -293,7 +293,7 @@ def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
 def test_one_fault_does_not_make_others_up(refused):
     """An edge that cannot be read leaves the number of agents open, so offsets are not blamed."""
     lines = refused(graph="graph: {edges: [[0, 1], [1, 2], [1, x]]}")
-    assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2: got `[1, x]`")
+    assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2.1: got `x`")
 
 
 def spoiled(data, random):
@@ -513,6 +513,7 @@ def conforms(value, schema, whole):
 def contents_conform(value, schema, whole):
     if isinstance(value, dict):
         fields, other = schema.get("properties", {}), schema.get("additionalProperties", {})
+        other = {} if other is True else other
         value = {str(key): item for key, item in value.items()}
         return set(schema.get("required", [])) <= set(value) and all(
             key in fields or other is not False and conforms(item, other, whole)

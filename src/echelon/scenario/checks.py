@@ -6,6 +6,7 @@ that), so one fault never hides another. Each check yields the path of a fault a
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 from echelon.core.errors import did_you_mean
 from echelon.scenario.registry import DEFAULT_METHOD, GAIN_KEYS, LEADER_LAWS, METHODS
@@ -48,7 +49,7 @@ _GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in METHOD
 _GAIN_KEYS["file"] = ((), ())
 
 
-def _section(data: Part, *path: str) -> Part:
+def section(data: Part, *path: str) -> Part:
     """Return the mapping at `path`; an empty one where there is none."""
     for key in path:
         inner = data.get(key)
@@ -118,11 +119,11 @@ def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator
 
 
 def _choices(data: Part) -> Iterator[Fault]:
-    graph, formation = _section(data, "graph"), _section(data, "formation")
+    graph, formation = section(data, "graph"), section(data, "formation")
     yield from _taken(("graph",), graph, _choice(graph, "edges"), _GRAPH_KEYS)
     yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
     for role in ("leader", "follower"):
-        gain = _section(data, role, "gain")
+        gain = section(data, role, "gain")
         if gain.get("file") is not None and gain.get("method") is not None:
             yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
         made_by = "file" if gain.get("file") is not None else gain.get("method", DEFAULT_METHOD)
@@ -145,7 +146,7 @@ def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
 
 
 def _edges(document: Document) -> Iterator[Fault]:
-    graph = _section(document.data, "graph")
+    graph = section(document.data, "graph")
     agents = _whole(graph.get("agents"))
     first: dict[tuple[int, int], int] = {}
     for index, pair in _pairs(graph):
@@ -185,7 +186,7 @@ def _agents(graph: Part) -> int | None:
 
 
 def _grid(data: Part) -> Iterator[Fault]:
-    graph = _section(data, "graph")
+    graph = section(data, "graph")
     agents, size = _whole(graph.get("agents")), _agents(graph)
     if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
         said = f"got `{agents}`, allowed is rows times columns, `{size}`"
@@ -193,7 +194,7 @@ def _grid(data: Part) -> Iterator[Fault]:
 
 
 def _unknown(
-    path: KeyPath, what: str, numbers: Iterable[tuple[str | int, object]], agents: int
+    path: KeyPath, what: str, numbers: Iterable[tuple[Any, object]], agents: int
 ) -> Iterator[Fault]:
     """Yield every one of `numbers` (the key it stands at, and its value) that is no agent."""
     for key, value in numbers:
@@ -204,11 +205,9 @@ def _unknown(
 
 def _members(data: Part) -> Iterator[Fault]:
     """Yield leaders, offsets and starts of agents that the graph does not have."""
-    agents = _agents(_section(data, "graph"))
-    leaders = _section(data, "graph").get("leaders", [0])
+    graph = section(data, "graph")
+    agents, leaders = _agents(graph), graph.get("leaders")
     leaders = leaders if isinstance(leaders, list) else [0]
-    if not leaders:
-        yield ("graph", "leaders"), "got no leader, allowed is a list of at least one agent."
     for index, leader in enumerate(leaders):
         if _whole(leader) is not None and leader in leaders[:index]:
             yield (
@@ -218,18 +217,17 @@ def _members(data: Part) -> Iterator[Fault]:
     if agents is None:
         return
     yield from _unknown(("graph", "leaders"), "leader", enumerate(leaders), agents)
-    for section, key, what in (
+    for place, key, what in (
         ("formation", "offsets", "an offset for agent"),
         ("initial", "states", "a state for agent"),
     ):
-        given = _section(data, section, key)
-        numbers = ((number, number) for number in given if isinstance(number, int))
-        yield from _unknown((section, key), what, numbers, agents)
+        numbered = ((number, number) for number in section(data, place, key))
+        yield from _unknown((place, key), what, numbered, agents)
 
 
 def _following(data: Part) -> Iterator[Fault]:
     """Yield a leader that tracks nothing, and a reference that nobody tracks."""
-    law, given = _section(data, "leader").get("law"), data.get("reference") is not None
+    law, given = section(data, "leader").get("law"), data.get("reference") is not None
     if law in _TRACKS and not given:
         yield (
             ("leader", "law"),
@@ -243,14 +241,14 @@ def _following(data: Part) -> Iterator[Fault]:
 
 def _changed(data: Part) -> Iterator[Fault]:
     """Yield parameters of the plant that are both given and scaled."""
-    given, scaled = (_section(data, "plant", key) for key in ("parameters", "scale"))
+    given, scaled = (section(data, "plant", key) for key in ("parameters", "scale"))
     for name in (name for name in scaled if isinstance(name, str) and name in given):
         said = "got a factor on a parameter that `plant.parameters` gives"
         yield ("plant", "scale", name), f"{said}, allowed is one of them."
 
 
 def _durations(data: Part) -> Iterator[Fault]:
-    simulation = _section(data, "simulation")
+    simulation = section(data, "simulation")
     horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
     if horizon is not None and dt is not None and 0 < horizon < dt:
         said = f"got {shown(simulation['horizon'])}, allowed is at least one step"

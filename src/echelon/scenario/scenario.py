@@ -4,8 +4,9 @@ Every fault of a file is reported at once, a line each: `file:line: field: what 
 allowed`.
 """
 
+import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, NoReturn, final, get_args
 
@@ -13,7 +14,7 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
-from echelon.scenario.checks import cross_faults, number_of
+from echelon.scenario.checks import cross_faults, number_of, section
 from echelon.scenario.sections import (
     STRICT,
     DisturbanceSpec,
@@ -43,12 +44,11 @@ _BUNDLED = Path(__file__).parent / "bundled"
 
 
 @final
-class Scenario(BaseModel):
+class Scenario(BaseModel, **STRICT):
     """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
 
-    model_config = STRICT
-
-    name: Annotated[str, Field(pattern=FOLDER_NAME)] = Field(description="Name of its folder.")
+    name: Annotated[str, Field(pattern=FOLDER_NAME)]
+    """Name of its folder."""
     model: ModelSpec
     plant: PlantSpec | None = None
     graph: GraphSpec
@@ -60,7 +60,8 @@ class Scenario(BaseModel):
     disturbance: DisturbanceSpec | None = None
     simulation: SimulationSpec
     report: ReportSpec = Field(default_factory=ReportSpec)
-    seed: Seed = Field(default=0, description="Seed of everything random in the run.")
+    seed: Seed = 0
+    """Seed of everything random in the run."""
 
     _document: Document = PrivateAttr(Document({}, {(): "scenario"}))
     _text: str = PrivateAttr("")
@@ -121,17 +122,20 @@ def _keys(path: KeyPath) -> list[str]:
     return list(part.model_fields)
 
 
-def _allowed(kind: str, got: object, context: Mapping[str, Any]) -> str | None:
-    if kind == "literal_error":
-        names = re.findall("'([^']*)'", context["expected"])
-        return are(names) + did_you_mean(got, names)
+def _allowed(error: ErrorDetails) -> str | None:
+    """Return what a value that the schema refused may be; None where the schema says it itself."""
+    kind, got, context = error["type"], error["input"], error.get("ctx", {})
     if kind == "string_pattern_mismatch":
         return _PATTERNS[context["pattern"]]
-    phrase = _ALLOWED.get(kind)
-    return phrase and phrase.format(**context)
+    if kind not in ("literal_error", "allowed"):
+        return _ALLOWED[kind].format(**context) if kind in _ALLOWED else None
+    listed = re.findall("'([^']*)'", context.get("expected", ""))
+    phrase = are(listed) if listed else error["msg"]
+    close = did_you_mean(got, re.findall("`([^`]*)`", phrase)) if isinstance(got, str) else ""
+    return phrase + close
 
 
-def _told(error: ErrorDetails) -> tuple[KeyPath, str]:
+def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     """Return the path of a fault that the schema found, and its sentence."""
     path, kind, got = error["loc"], error["type"], error["input"]
     if path and path[-1] == "[key]":
@@ -142,7 +146,7 @@ def _told(error: ErrorDetails) -> tuple[KeyPath, str]:
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
         return path, f"got an unknown key, allowed {are(keys)}{did_you_mean(path[-1], keys)}."
-    allowed = _allowed(kind, got, error.get("ctx", {}))
+    allowed = _allowed(error)
     return path, f"got {shown(got)}, allowed {allowed}." if allowed else error["msg"]
 
 
@@ -153,22 +157,20 @@ def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
     if isinstance(leader, dict):
         law = "tracking" if "reference" in filled else "passive"
         filled["leader"] = {"law": law, **leader}
-    simulation = filled.get("simulation")
-    horizon = number_of(simulation.get("horizon")) if isinstance(simulation, dict) else None
-    if horizon is not None and horizon > 0 and isinstance(report, dict):
-        window = report.get("steady_window", horizon / 5)
-        asked = number_of(window)
-        # A window as long as the run would count its transient as steady.
-        fitting = horizon / 5 if asked is not None and asked >= horizon else window
-        filled["report"] = {**report, "steady_window": fitting}
+    horizon = number_of(section(data, "simulation").get("horizon")) or 0.0
+    window = number_of(section(data, "report").get("steady_window", math.inf))
+    # A window as long as the run would count its transient as steady.
+    if isinstance(report, dict) and window is not None and window >= horizon > 0:
+        filled["report"] = {**report, "steady_window": horizon / 5}
     return filled
 
 
-def _schema_faults(data: Mapping[Any, Any]) -> Iterator[tuple[KeyPath, str]]:
+def _validated(data: Mapping[Any, Any]) -> tuple[Scenario | None, list[tuple[KeyPath, str]]]:
+    """Return the scenario, or the faults that the schema finds."""
     try:
-        Scenario.model_validate(_filled(data))
+        return Scenario.model_validate(_filled(data)), []
     except ValidationError as error:
-        yield from map(_told, error.errors(include_url=False))
+        return None, list(map(_describe, error.errors(include_url=False)))
 
 
 def by_line(fault: Fault) -> tuple[bool, int]:
@@ -178,22 +180,10 @@ def by_line(fault: Fault) -> tuple[bool, int]:
     return overridden, int(line) if line.isdigit() and not overridden else 0
 
 
-def _faults(document: Document) -> list[Fault]:
-    """Return all faults, at most one for each path from the schema and the checks together."""
-    found: dict[KeyPath, str] = {}
-    for path, message in (*cross_faults(document), *_schema_faults(document.data)):
-        found.setdefault(path, message)
-    faults = [(path, document.place(path), message) for path, message in found.items()]
-    listed = (
-        Fault(place, ".".join(map(str, path)), message)
-        for path, place, message in (*document.problems, *faults)
-    )
-    return sorted(listed, key=by_line)
-
-
-def _refuse(faults: Sequence[Fault]) -> NoReturn:
-    error = ScenarioError("\n".join(map(str, faults)))
-    setattr(error, "faults", tuple(faults))
+def _refuse(faults: Iterable[Fault]) -> NoReturn:
+    ordered = sorted(faults, key=by_line)
+    error = ScenarioError("\n".join(map(str, ordered)))
+    setattr(error, "faults", tuple(ordered))
     raise error
 
 
@@ -203,10 +193,14 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
         said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
         _refuse([Fault(document.place(()), "", said)])
     document = document._replace(data=data)
-    faults = _faults(document)
-    if faults:
-        _refuse(faults)
-    scenario = Scenario.model_validate(_filled(data))
+    scenario, faults = _validated(data)
+    # One for each path: what a check says of it goes before what the schema says.
+    found: dict[KeyPath, str] = {}
+    for path, said in (*cross_faults(document), *faults):
+        found.setdefault(path, said)
+    problems = [*document.problems, *((at, document.place(at), found[at]) for at in found)]
+    if scenario is None or problems:
+        _refuse(Fault(place, ".".join(map(str, path)), said) for path, place, said in problems)
     scenario._document, scenario._text, scenario._folder = document, text, folder
     return scenario
 
