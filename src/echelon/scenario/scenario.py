@@ -8,34 +8,23 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, NoReturn, final, get_args
+from typing import Annotated, Any, NoReturn, final, get_args
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
+from echelon.scenario import sections
 from echelon.scenario.checks import cross_faults, number_of, section
-from echelon.scenario.sections import (
-    STRICT,
-    DisturbanceSpec,
-    FollowerSpec,
-    FormationSpec,
-    GraphSpec,
-    InitialSpec,
-    LeaderSpec,
-    ModelSpec,
-    PlantSpec,
-    ReferenceSpec,
-    ReportSpec,
-    SimulationSpec,
-)
 from echelon.scenario.values import CLASS_IN_FILE, FOLDER_NAME, Seed
 from echelon.scenario.yaml import (
     Document,
+    Fault,
     KeyPath,
     apply_overrides,
     are,
     dump_yaml,
+    joined,
     read_yaml,
     shown,
 )
@@ -44,22 +33,22 @@ _BUNDLED = Path(__file__).parent / "bundled"
 
 
 @final
-class Scenario(BaseModel, **STRICT):
+class Scenario(BaseModel, **sections.STRICT):
     """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
 
     name: Annotated[str, Field(pattern=FOLDER_NAME)]
     """Name of its folder."""
-    model: ModelSpec
-    plant: PlantSpec | None = None
-    graph: GraphSpec
-    formation: FormationSpec = Field(default_factory=FormationSpec)
-    reference: ReferenceSpec | None = None
-    leader: LeaderSpec = Field(default_factory=LeaderSpec)
-    follower: FollowerSpec = Field(default_factory=FollowerSpec)
-    initial: InitialSpec = Field(default_factory=InitialSpec)
-    disturbance: DisturbanceSpec | None = None
-    simulation: SimulationSpec
-    report: ReportSpec = Field(default_factory=ReportSpec)
+    model: sections.ModelSpec
+    plant: sections.PlantSpec | None = None
+    graph: sections.GraphSpec
+    formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
+    reference: sections.ReferenceSpec | None = None
+    leader: sections.LeaderSpec = Field(default_factory=sections.LeaderSpec)
+    follower: sections.FollowerSpec = Field(default_factory=sections.FollowerSpec)
+    initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
+    disturbance: sections.DisturbanceSpec | None = None
+    simulation: sections.SimulationSpec
+    report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
     seed: Seed = 0
     """Seed of everything random in the run."""
 
@@ -80,17 +69,6 @@ class Scenario(BaseModel, **STRICT):
     def place(self, *path: str | int) -> str:
         """Return where a key stands, as in `paper.yaml:4`; else its parent's place."""
         return self._document.place(path)
-
-
-class Fault(NamedTuple):
-    """One fault of a scenario: where it stands, its key (joined by dots), and a sentence."""
-
-    place: str
-    field: str
-    message: str
-
-    def __str__(self) -> str:
-        return ": ".join(part for part in self if part)
 
 
 _ALLOWED = {
@@ -193,14 +171,14 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
         said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
         _refuse([Fault(document.place(()), "", said)])
     document = document._replace(data=data)
-    scenario, faults = _validated(data)
+    scenario, refused = _validated(data)
     # One for each path: what a check says of it goes before what the schema says.
     found: dict[KeyPath, str] = {}
-    for path, said in (*cross_faults(document), *faults):
+    for path, said in (*cross_faults(document), *refused):
         found.setdefault(path, said)
-    problems = [*document.problems, *((at, document.place(at), found[at]) for at in found)]
-    if scenario is None or problems:
-        _refuse(Fault(place, ".".join(map(str, path)), said) for path, place, said in problems)
+    faults = [Fault(document.place(path), joined(path), said) for path, said in found.items()]
+    if scenario is None or faults or document.faults:
+        _refuse([*document.faults, *faults])
     scenario._document, scenario._text, scenario._folder = document, text, folder
     return scenario
 

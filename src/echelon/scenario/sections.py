@@ -10,18 +10,7 @@ from typing import Annotated, Any, Literal, final
 from pydantic import BaseModel, ConfigDict, Field
 
 from echelon.core.words import Feedforward
-from echelon.scenario.registry import (
-    DEFAULT_METHOD,
-    FOLLOWER_LAWS,
-    FORMATIONS,
-    GAIN_KEYS,
-    GRAPHS,
-    INTEGRATORS,
-    LEADER_LAWS,
-    METHODS,
-    MODELS,
-    REFERENCES,
-)
+from echelon.scenario import registry
 from echelon.scenario.values import (
     CLASS_IN_FILE,
     Agents,
@@ -51,7 +40,7 @@ def _either(*keys: str) -> ConfigDict:
 class ModelSpec(BaseModel, **_either("name", "python")):
     """The agents' model: a name of the registry, or a class in a file of the user's."""
 
-    name: Annotated[str, OneOf(MODELS)] | None = None
+    name: Annotated[str, OneOf(registry.MODELS)] | None = None
     """Name of a model."""
     python: Annotated[str, Field(pattern=CLASS_IN_FILE)] | None = None
     """`file.py:Class`, the file relative to the scenario file."""
@@ -77,7 +66,7 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
 
     edges: Edges | None = None
     """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1."""
-    name: Annotated[str, OneOf(GRAPHS)] | None = None
+    name: Annotated[str, OneOf(registry.GRAPHS)] | None = None
     """Name of a generator."""
     agents: Count | None = None
     """Number of agents; with `edges` the default is the largest number + 1."""
@@ -99,7 +88,7 @@ class FormationSpec(BaseModel, **STRICT):
 
     offsets: dict[int, Numbers] | None = None
     """Offset of an agent, in the model's units of position, usually m."""
-    name: Annotated[str, OneOf(FORMATIONS)] | None = None
+    name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
     """Name of a shape."""
     spacing: Positive = 1.0
     """Distance between neighbours in the shape, m."""
@@ -115,7 +104,7 @@ class ReferenceSpec(BaseModel):
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
-    name: Annotated[str, OneOf(REFERENCES)]
+    name: Annotated[str, OneOf(registry.REFERENCES)]
     """Name of a reference."""
 
     @property
@@ -131,13 +120,13 @@ class GainSpec(BaseModel):
     # Arguments that deserve a description, or are no numbers, have their keys here; so that a new
     # method needs no more than its line in the registry, further ones may be numbers.
     model_config = STRICT | ConfigDict(
-        extra="allow", json_schema_extra={"propertyNames": {"enum": list(GAIN_KEYS)}}
+        extra="allow", json_schema_extra={"propertyNames": {"enum": list(registry.GAIN_KEYS)}}
     )
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
-    method: Annotated[str, OneOf(METHODS)] = Field(
-        default=DEFAULT_METHOD, description="Name of a method."
+    method: Annotated[str, OneOf(registry.METHODS)] = Field(
+        default=registry.DEFAULT_METHOD, description="Name of a method."
     )
     Q: Array | None = Field(
         default=None, description="Weight of the states: its diagonal or rows; default the model's."
@@ -180,7 +169,7 @@ class GainSpec(BaseModel):
 class LeaderSpec(BaseModel, **STRICT):
     """What the leader does."""
 
-    law: Annotated[str, OneOf(LEADER_LAWS)] = Field(default_factory=lambda: "passive")
+    law: Annotated[str, OneOf(registry.LEADER_LAWS)] = Field(default_factory=lambda: "passive")
     """Name of a law; default `tracking` with a reference, `passive` without."""
     reacts: bool = False
     """Whether the leader answers to its neighbours."""
@@ -194,7 +183,7 @@ class LeaderSpec(BaseModel, **STRICT):
 class FollowerSpec(BaseModel, **STRICT):
     """What every follower does."""
 
-    law: Annotated[str, OneOf(FOLLOWER_LAWS)] = "consensus"
+    law: Annotated[str, OneOf(registry.FOLLOWER_LAWS)] = "consensus"
     """Name of a law."""
     gain: GainSpec = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
@@ -243,7 +232,7 @@ class SimulationSpec(BaseModel, **STRICT):
     """Length of the run, s."""
     dt: Positive
     """Length of a step, s; at most the horizon."""
-    integrator: Annotated[str, OneOf(INTEGRATORS)] = "rk4"
+    integrator: Annotated[str, OneOf(registry.INTEGRATORS)] = "rk4"
     """Name of the method."""
     limits: bool = True
     """Whether the actuators' limits hold."""
