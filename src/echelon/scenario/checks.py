@@ -9,7 +9,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from echelon.core.errors import did_you_mean
-from echelon.scenario.registry import DEFAULT_METHOD, GAIN_KEYS, LEADER_LAWS, METHODS
+from echelon.scenario.registry import (
+    DEFAULT_METHOD,
+    FORMATIONS,
+    GAIN_KEYS,
+    GRAPHS,
+    LEADER_LAWS,
+    METHODS,
+)
 from echelon.scenario.yaml import Document, KeyPath, are, shown
 
 Fault = tuple[KeyPath, str]
@@ -28,21 +35,13 @@ _SOURCES: dict[str, tuple[str, str, bool]] = {
 
 # What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
 _Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
-_GRAPH_KEYS: _Taken = {
+_GRAPH_KEYS: _Taken = dict.fromkeys(GRAPHS, (("agents",), ())) | {
     "edges": ((), ("agents",)),
-    "path": (("agents",), ()),
-    "ring": (("agents",), ()),
-    "star": (("agents",), ()),
-    "complete": (("agents",), ()),
     "grid": (("rows", "columns"), ("agents",)),
     "geometric": (("agents", "radius"), ("seed",)),
 }
-_FORMATION_KEYS: _Taken = {
+_FORMATION_KEYS: _Taken = dict.fromkeys(FORMATIONS, ((), ("spacing",))) | {
     "offsets": ((), ()),
-    "triangle": ((), ("spacing",)),
-    "line": ((), ("spacing",)),
-    "wedge": ((), ("spacing",)),
-    "circle": ((), ("spacing",)),
     "grid": ((), ("spacing", "columns")),
 }
 _GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in METHODS.items()}

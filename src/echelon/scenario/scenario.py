@@ -5,10 +5,9 @@ allowed`.
 """
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, final, get_args
+from typing import Any, NoReturn, final, get_args
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
@@ -16,7 +15,7 @@ from pydantic_core import ErrorDetails
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.scenario import sections
 from echelon.scenario.checks import cross_faults, number_of, section
-from echelon.scenario.values import CLASS_IN_FILE, FOLDER_NAME, Seed
+from echelon.scenario.values import FolderName, Seed
 from echelon.scenario.yaml import (
     Document,
     Fault,
@@ -36,7 +35,7 @@ _BUNDLED = Path(__file__).parent / "bundled"
 class Scenario(BaseModel, **sections.STRICT):
     """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
 
-    name: Annotated[str, Field(pattern=FOLDER_NAME)]
+    name: FolderName
     """Name of its folder."""
     model: sections.ModelSpec
     plant: sections.PlantSpec | None = None
@@ -84,10 +83,6 @@ _ALLOWED = {
     "less_than": "is a number below {lt}",
     "too_short": "is a list of at least {min_length} number",
 }
-_PATTERNS = {
-    FOLDER_NAME: "are up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit",
-    CLASS_IN_FILE: "is a file and a class in it, as in `pendulum.py:Pendulum`",
-}
 
 
 def _keys(path: KeyPath) -> list[str]:
@@ -100,22 +95,9 @@ def _keys(path: KeyPath) -> list[str]:
     return list(part.model_fields)
 
 
-def _allowed(error: ErrorDetails) -> str | None:
-    """Return what a value that the schema refused may be; None where the schema says it itself."""
-    kind, got, context = error["type"], error["input"], error.get("ctx", {})
-    if kind == "string_pattern_mismatch":
-        return _PATTERNS[context["pattern"]]
-    if kind not in ("literal_error", "allowed"):
-        return _ALLOWED[kind].format(**context) if kind in _ALLOWED else None
-    listed = re.findall("'([^']*)'", context.get("expected", ""))
-    phrase = are(listed) if listed else error["msg"]
-    close = did_you_mean(got, re.findall("`([^`]*)`", phrase)) if isinstance(got, str) else ""
-    return phrase + close
-
-
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     """Return the path of a fault that the schema found, and its sentence."""
-    path, kind, got = error["loc"], error["type"], error["input"]
+    path, kind, context = error["loc"], error["type"], error.get("ctx", {})
     if path and path[-1] == "[key]":
         kind = "a whole number, an agent's" if kind == "int_type" else "a name"
         return path[:-1], f"got the key {shown(path[-2])}, allowed is {kind}."
@@ -124,8 +106,10 @@ def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
         return path, f"got an unknown key, allowed {are(keys)}{did_you_mean(path[-1], keys)}."
-    allowed = _allowed(error)
-    return path, f"got {shown(got)}, allowed {allowed}." if allowed else error["msg"]
+    got = context.get("got", error["input"])
+    allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
+    close = did_you_mean(got, context.get("names", "").split())
+    return path, f"got {shown(got)}, allowed {allowed}{close}."
 
 
 def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:

@@ -5,16 +5,16 @@ where the number is declared.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from echelon.core.words import Feedforward
 from echelon.scenario import registry
 from echelon.scenario.values import (
-    CLASS_IN_FILE,
     Agents,
     Array,
+    ClassInFile,
     Count,
     Edges,
     MatrixOrIdentity,
@@ -42,7 +42,7 @@ class ModelSpec(BaseModel, **_either("name", "python")):
 
     name: Annotated[str, OneOf(registry.MODELS)] | None = None
     """Name of a model."""
-    python: Annotated[str, Field(pattern=CLASS_IN_FILE)] | None = None
+    python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
     parameters: Parameters = None
     """Name of a set of parameters, or the parameters, in the model's units."""
@@ -238,7 +238,7 @@ class SimulationSpec(BaseModel, **STRICT):
     """Whether the actuators' limits hold."""
     store_every: Count = 1
     """Steps from one stored sample to the next."""
-    precision: Literal["float64", "float32"] = "float64"
+    precision: Annotated[str, OneOf(("float64", "float32"))] = "float64"
     """Arithmetic used."""
 
 

@@ -4,7 +4,7 @@ Numbers are real numbers only: neither truth values nor text that looks like a n
 are not finite pass here; they are refused for the whole file at once.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, final
 
 from pydantic import (
@@ -17,36 +17,37 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from echelon.scenario.yaml import shown
-
-
-@final
-class OneOf:
-    """Marks text that must be one of the names of a registry table."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self.names = list(names)
-
-    def __get_pydantic_core_schema__(
-        self, source: type, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        # `Literal[*names]` says the same, and no type checker reads it
-        return core_schema.literal_schema(self.names)
+from echelon.scenario.yaml import are
 
 
 @final
 class Allowed:
-    """Marks a type of which one sentence says what is allowed, whichever part of it fails."""
+    """Marks a type of which one phrase says what is allowed, whichever part of it fails.
 
-    def __init__(self, phrase: str) -> None:
-        self.phrase = phrase
+    The names are what a misspelt word may have meant; the schema replaces the type's own.
+    """
+
+    def __init__(
+        self, phrase: str, names: Sequence[str] = (), schema: CoreSchema | None = None
+    ) -> None:
+        self.phrase, self.names, self.schema = phrase, names, schema
 
     def __get_pydantic_core_schema__(
         self, source: type, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         return core_schema.custom_error_schema(
-            handler(source), "allowed", custom_error_message=self.phrase
+            self.schema or handler(source),
+            "allowed",
+            custom_error_message=self.phrase,
+            custom_error_context={"names": " ".join(self.names)},
         )
+
+
+def OneOf(names: Iterable[str]) -> Allowed:
+    """Mark text that must be one of the names of a registry table."""
+    listed = list(names)
+    # `Literal[*names]` makes the same schema, and no type checker reads it
+    return Allowed(are(listed), listed, core_schema.literal_schema(listed))
 
 
 def _weighted(edge: object) -> object:
@@ -79,15 +80,22 @@ def _numeric(value: object) -> object:
     if isinstance(value, list):
         return tuple(map(_numeric, value))
     if isinstance(value, bool) or not isinstance(value, int | float):
-        # names the one number in question: its place inside a long list stays unknown otherwise
-        said = f"got {shown(value)}, allowed is a number or a nested list of numbers."
-        raise PydanticCustomError("sentence", "{said}", {"said": said})
+        # the list may be long, so the message shows what is no number and not the whole list
+        allowed = "is a number or a nested list of numbers"
+        raise PydanticCustomError("allowed", allowed, {"got": value})
     return value
 
 
-FOLDER_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
-CLASS_IN_FILE = r"^.+\.py:[A-Za-z_][A-Za-z0-9_]*$"
-
+FolderName = Annotated[
+    str,
+    Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"),
+    Allowed("is text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"),
+]
+ClassInFile = Annotated[
+    str,
+    Field(pattern=r"^.+\.py:[A-Za-z_][A-Za-z0-9_]*$"),
+    Allowed("is a file and a class in it, as in `pendulum.py:Pendulum`"),
+]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
@@ -112,7 +120,7 @@ Array = Annotated[
 ]
 MatrixOrIdentity = Annotated[
     Literal["identity"] | Matrix,
-    Allowed("is `identity`, a list of numbers (the diagonal) or a square matrix"),
+    Allowed("is `identity`, a list of numbers (the diagonal) or a square matrix", ["identity"]),
 ]
 Numeric = Annotated[Any, PlainValidator(_numeric), WithJsonSchema({"type": ["number", "array"]})]
 Parameters = Annotated[
