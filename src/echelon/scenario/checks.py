@@ -19,13 +19,13 @@ from echelon.scenario.registry import (
 )
 from echelon.scenario.yaml import Document, KeyPath, are, shown
 
-Fault = tuple[KeyPath, str]
+Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
-# Of these two keys a section has one at most; True where it must have one.
 _TRACKS = ("tracking", "optimal-tracking")
 """The leader laws that follow a reference."""
 
+# Of these two keys a section has one at most; True where it must have one.
 _SOURCES: dict[str, tuple[str, str, bool]] = {
     "model": ("name", "python", True),
     "graph": ("edges", "name", True),
@@ -70,7 +70,7 @@ def _whole(value: object) -> int | None:
     return value if type(value) is int else None
 
 
-def _infinite(value: object, path: KeyPath) -> Iterator[Fault]:
+def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _infinite(item, (*path, key))
@@ -80,7 +80,7 @@ def _infinite(value: object, path: KeyPath) -> Iterator[Fault]:
         yield path, f"got {shown(value)}, allowed is a finite number."
 
 
-def _sources(data: Part) -> Iterator[Fault]:
+def _sources(data: Part) -> Iterator[Finding]:
     for name, (one, other, required) in _SOURCES.items():
         part = data.get(name)
         if not isinstance(part, dict):
@@ -99,7 +99,7 @@ def _choice(part: Part, free: str) -> object:
     return free if part.get("name") is None else None
 
 
-def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator[Fault]:
+def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator[Finding]:
     """Yield keys that `choice` lacks, and keys that belong to another choice."""
     if not isinstance(choice, str) or choice not in table:
         return
@@ -117,7 +117,7 @@ def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator
             )
 
 
-def _choices(data: Part) -> Iterator[Fault]:
+def _choices(data: Part) -> Iterator[Finding]:
     graph, formation = section(data, "graph"), section(data, "formation")
     yield from _taken(("graph",), graph, _choice(graph, "edges"), _GRAPH_KEYS)
     yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
@@ -144,7 +144,7 @@ def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
             yield index, (min(i, j), max(i, j))
 
 
-def _edges(document: Document) -> Iterator[Fault]:
+def _edges(document: Document) -> Iterator[Finding]:
     graph = section(document.data, "graph")
     agents = _whole(graph.get("agents"))
     first: dict[tuple[int, int], int] = {}
@@ -184,7 +184,7 @@ def _agents(graph: Part) -> int | None:
     return agents if agents is not None and agents > 0 else None
 
 
-def _grid(data: Part) -> Iterator[Fault]:
+def _grid(data: Part) -> Iterator[Finding]:
     graph = section(data, "graph")
     agents, size = _whole(graph.get("agents")), _agents(graph)
     if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
@@ -194,7 +194,7 @@ def _grid(data: Part) -> Iterator[Fault]:
 
 def _unknown(
     path: KeyPath, what: str, numbers: Iterable[tuple[Any, object]], agents: int
-) -> Iterator[Fault]:
+) -> Iterator[Finding]:
     """Yield every one of `numbers` (the key it stands at, and its value) that is no agent."""
     for key, value in numbers:
         agent = _whole(value)
@@ -202,7 +202,7 @@ def _unknown(
             yield (*path, key), f"got {what} `{agent}`, {_range(agents)}."
 
 
-def _members(data: Part) -> Iterator[Fault]:
+def _members(data: Part) -> Iterator[Finding]:
     """Yield leaders, offsets and starts of agents that the graph does not have."""
     graph = section(data, "graph")
     agents, leaders = _agents(graph), graph.get("leaders")
@@ -224,7 +224,7 @@ def _members(data: Part) -> Iterator[Fault]:
         yield from _unknown((place, key), what, numbered, agents)
 
 
-def _following(data: Part) -> Iterator[Fault]:
+def _following(data: Part) -> Iterator[Finding]:
     """Yield a leader that tracks nothing, and a reference that nobody tracks."""
     law, given = section(data, "leader").get("law"), data.get("reference") is not None
     if law in _TRACKS and not given:
@@ -238,7 +238,7 @@ def _following(data: Part) -> Iterator[Fault]:
         yield ("reference",), f"{said}, allowed is one only with the law {allowed}."
 
 
-def _changed(data: Part) -> Iterator[Fault]:
+def _changed(data: Part) -> Iterator[Finding]:
     """Yield parameters of the plant that are both given and scaled."""
     given, scaled = (section(data, "plant", key) for key in ("parameters", "scale"))
     for name in (name for name in scaled if isinstance(name, str) and name in given):
@@ -246,7 +246,7 @@ def _changed(data: Part) -> Iterator[Fault]:
         yield ("plant", "scale", name), f"{said}, allowed is one of them."
 
 
-def _durations(data: Part) -> Iterator[Fault]:
+def _durations(data: Part) -> Iterator[Finding]:
     simulation = section(data, "simulation")
     horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
     if horizon is not None and dt is not None and 0 < horizon < dt:
@@ -257,7 +257,7 @@ def _durations(data: Part) -> Iterator[Fault]:
         )
 
 
-def cross_faults(document: Document) -> Iterator[Fault]:
+def cross_faults(document: Document) -> Iterator[Finding]:
     """Yield the path and the sentence of every fault that takes more than one key to see.
 
     Numbers that are not finite come first: where the schema stumbles over the same number, the

@@ -66,13 +66,13 @@ def _refuse_loop(edge: tuple[int, int, float]) -> tuple[int, int, float]:
 def _square(value: tuple[Any, ...]) -> tuple[tuple[float, ...], ...]:
     """Return a square matrix as rows; a list of numbers is its diagonal."""
     size = len(value)
-    rows = [
-        row if isinstance(row, tuple) else (0.0,) * i + (row,) + (0.0,) * (size - 1 - i)
-        for i, row in enumerate(value)
-    ]
-    if any(len(row) != size for row in rows):
-        raise ValueError(rows)
-    return tuple(rows)
+    if all(isinstance(number, float) for number in value):
+        return tuple(
+            tuple(number if i == j else 0.0 for j in range(size)) for i, number in enumerate(value)
+        )
+    if any(len(row) != size for row in value):
+        raise ValueError("not square")
+    return value
 
 
 def _numeric(value: object) -> object:
