@@ -272,15 +272,17 @@ def test_overrides_replace_and_add_in_their_order():
 def test_the_place_of_an_overridden_value_is_the_override():
     document = read_yaml("a:\n  b: [1, 2]\n  c: 3\n", "f.yaml")
     done = apply_overrides(document, ["a.b=[7]", "x.y=1"])
-    assert done.places == {
+    assert {path: done.place(path) for path in [*document.places, ("x",), ("x", "y")]} == {
         (): "f.yaml:1",
-        ("a",): "f.yaml:1",
-        ("a", "c"): "f.yaml:3",
+        ("a",): "--set a.b=[7]",
         ("a", "b"): "--set a.b=[7]",
         ("a", "b", 0): "--set a.b=[7]",
+        ("a", "b", 1): "--set a.b=[7]",
+        ("a", "c"): "f.yaml:3",
         ("x",): "--set x.y=1",
         ("x", "y"): "--set x.y=1",
     }
+    assert done.place(("a", "d")) == "--set a.b=[7]"
 
 
 @given(st.dictionaries(KEYS, DATA, max_size=3), DATA)

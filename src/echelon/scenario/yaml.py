@@ -37,25 +37,29 @@ class Fault(NamedTuple):
 
 
 class Document(NamedTuple):
-    """Plain data, the place (`file:line`) of every path in it, and what was wrong in reading it."""
+    """Plain data, the place (`file:line`) of every path read, the faults of reading, the overrides.
+
+    `overrides` are paths that the command line has set, each with its `--set a.b=3`.
+    """
 
     data: Any
     places: dict[KeyPath, str]
     faults: tuple[Fault, ...] = ()
+    overrides: tuple[tuple[KeyPath, str], ...] = ()
 
     def place(self, path: KeyPath) -> str:
         """Return the place of `path`, or of the nearest part above it that stands somewhere.
 
-        Where the command line changed something inside, that is the place.
+        Where the command line set it, something inside or something around, that is the place.
         """
-        while path and path not in self.places:
+        while path:
+            for exact, place in reversed(self.overrides):
+                if exact[: len(path)] == path[: len(exact)]:
+                    return place
+            if path in self.places:
+                break
             path = path[:-1]
-        changed = [
-            place
-            for inside, place in self.places.items()
-            if path and inside[: len(path)] == path and place.startswith("--set ")
-        ]
-        return changed[-1] if changed else self.places[path]
+        return self.places[path]
 
 
 def joined(path: KeyPath) -> str:
@@ -175,7 +179,8 @@ def read_yaml(text: str, file: str) -> Document:
     return _read(text, lambda line: f"{file}:{line}")
 
 
-def _override(text: str) -> tuple[KeyPath, Document]:
+def _override(text: str) -> tuple[KeyPath, object, str]:
+    """Return the path, the value and the place of `a.b=3`."""
     place = "--set " + " ".join(text.split())
     name, equals, value = text.partition("=")
     if not equals:
@@ -187,7 +192,8 @@ def _override(text: str) -> tuple[KeyPath, Document]:
     document = _read(value, lambda line: place)
     if document.faults:
         raise ScenarioError(f"{place}: {document.faults[0].message}")
-    return tuple(int(p) if re.fullmatch("[0-9]{1,9}", p) else p for p in parts), document
+    path = tuple(int(part) if re.fullmatch("[0-9]{1,9}", part) else part for part in parts)
+    return path, document.data, place
 
 
 def _replace(
@@ -221,16 +227,11 @@ def apply_overrides(document: Document, overrides: Iterable[str]) -> Document:
     Raises:
         ScenarioError: An override is malformed, or leads into something that is no mapping or list.
     """
-    data, places = document.data, dict(document.places)
     for text in overrides:
-        path, given = _override(text)
-        place = given.places[()]
-        data, exact = _replace(data, path, given.data, (), place)
-        places = {at: old for at, old in places.items() if at[: len(exact)] != exact}
-        places.update({exact + below: place for below in given.places})
-        for depth in range(len(exact)):
-            places.setdefault(exact[:depth], place)
-    return Document(data, places, document.faults)
+        path, value, place = _override(text)
+        data, exact = _replace(document.data, path, value, (), place)
+        document = document._replace(data=data, overrides=(*document.overrides, (exact, place)))
+    return document
 
 
 @final
