@@ -9,14 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from echelon.core.errors import did_you_mean
-from echelon.scenario.registry import (
-    DEFAULT_METHOD,
-    FORMATIONS,
-    GAIN_KEYS,
-    GRAPHS,
-    LEADER_LAWS,
-    METHODS,
-)
+from echelon.scenario import registry
 from echelon.scenario.yaml import Document, KeyPath, are, shown
 
 Finding = tuple[KeyPath, str]
@@ -35,16 +28,16 @@ _SOURCES: dict[str, tuple[str, str, bool]] = {
 
 # What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
 _Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
-_GRAPH_KEYS: _Taken = dict.fromkeys(GRAPHS, (("agents",), ())) | {
+_GRAPH_KEYS: _Taken = dict.fromkeys(registry.GRAPHS, (("agents",), ())) | {
     "edges": ((), ("agents",)),
     "grid": (("rows", "columns"), ("agents",)),
     "geometric": (("agents", "radius"), ("seed",)),
 }
-_FORMATION_KEYS: _Taken = dict.fromkeys(FORMATIONS, ((), ("spacing",))) | {
+_FORMATION_KEYS: _Taken = dict.fromkeys(registry.FORMATIONS, ((), ("spacing",))) | {
     "offsets": ((), ()),
     "grid": ((), ("spacing", "columns")),
 }
-_GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in METHODS.items()}
+_GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in registry.METHODS.items()}
 _GAIN_KEYS["file"] = ((), ())
 
 
@@ -125,12 +118,13 @@ def _choices(data: Part) -> Iterator[Finding]:
         gain = section(data, role, "gain")
         if gain.get("file") is not None and gain.get("method") is not None:
             yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
-        made_by = "file" if gain.get("file") is not None else gain.get("method", DEFAULT_METHOD)
+        method = gain.get("method", registry.DEFAULT_METHOD)
+        made_by = "file" if gain.get("file") is not None else method
         yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
         # The schema leaves open which further keys a method has.
-        for key in (key for key in gain if isinstance(key, str) and key not in GAIN_KEYS):
-            said = f"got an unknown key, allowed {are(GAIN_KEYS)}"
-            yield (role, "gain", key), f"{said}{did_you_mean(key, GAIN_KEYS)}."
+        for key in (key for key in gain if isinstance(key, str) and key not in registry.GAIN_KEYS):
+            said = f"got an unknown key, allowed {are(registry.GAIN_KEYS)}"
+            yield (role, "gain", key), f"{said}{did_you_mean(key, registry.GAIN_KEYS)}."
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -232,7 +226,7 @@ def _following(data: Part) -> Iterator[Finding]:
             ("leader", "law"),
             f"got `{law}` without a `reference`, a leader that tracks needs one.",
         )
-    if given and isinstance(law, str) and law in LEADER_LAWS and law not in _TRACKS:
+    if given and isinstance(law, str) and law in registry.LEADER_LAWS and law not in _TRACKS:
         said = f"got a reference for a leader whose law is `{law}`"
         allowed = " or ".join(f"`{name}`" for name in _TRACKS)
         yield ("reference",), f"{said}, allowed is one only with the law {allowed}."

@@ -125,39 +125,26 @@ class GainSpec(BaseModel):
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
-    method: Annotated[str, OneOf(registry.METHODS)] = Field(
-        default=registry.DEFAULT_METHOD, description="Name of a method."
-    )
-    Q: Array | None = Field(
-        default=None, description="Weight of the states: its diagonal or rows; default the model's."
-    )
-    R: Array | None = Field(
-        default=None,
-        description="Weight of the normalised inputs: its diagonal or rows; default the model's.",
-    )
-    P: MatrixOrIdentity | None = Field(
-        default=None,
-        description="The gain of the method `given`: `identity`, its diagonal or rows.",
-    )
-    coupling: Positive | None = Field(
-        default=None, description="Coupling strength, without unit; default what the method finds."
-    )
-    domain: dict[str, Numeric] | None = Field(
-        default=None,
-        description="Half-width, or `[lower, upper]`, by state, group or normalised input.",
-    )
-    rate: Positive | None = Field(
-        default=None, description="Rate that the method `contraction` is asked for, 1/s."
-    )
-    exact: bool | None = Field(
-        default=None, description="Whether a rate is proved in exact arithmetic where it can be."
-    )
-    symmetry_weight: Numeric | None = Field(
-        default=None, description="Weight of the symmetric states in the P of `inner-loop`."
-    )
-    file: str | None = Field(
-        default=None, description="Gain file of `echelon design`, relative to the scenario file."
-    )
+    method: Annotated[str, OneOf(registry.METHODS)] = registry.DEFAULT_METHOD
+    """Name of a method."""
+    Q: Array | None = None
+    """Weight of the states: its diagonal or rows; default the model's."""
+    R: Array | None = None
+    """Weight of the normalised inputs: its diagonal or rows; default the model's."""
+    P: MatrixOrIdentity | None = None
+    """The gain of the method `given`: `identity`, its diagonal or rows."""
+    coupling: Positive | None = None
+    """Coupling strength, without unit; default what the method finds."""
+    domain: dict[str, Numeric] | None = None
+    """Half-width, or `[lower, upper]`, by state, group or normalised input."""
+    rate: Positive | None = None
+    """Rate that the method `contraction` is asked for, 1/s."""
+    exact: bool | None = None
+    """Whether a rate is proved in exact arithmetic where it can be."""
+    symmetry_weight: Numeric | None = None
+    """Weight of the symmetric states in the P of `inner-loop`."""
+    file: str | None = None
+    """Gain file of `echelon design`, relative to the scenario file."""
 
     @property
     def arguments(self) -> dict[str, Any]:
