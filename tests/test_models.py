@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 import echelon.models
 from echelon.core import numerics
+from echelon.core.errors import ModelError
 from echelon.core.numerics import precision
 from echelon.models import (
     ControlAffine,
@@ -271,6 +272,21 @@ def test_states_are_found_by_name_and_by_group(model):
             assert model.states_called(name) == (k,)
     for group, members in model.state_groups.items():
         assert tuple(model.state_names[k] for k in model.states_called(group)) == tuple(members)
+
+
+@every_model
+@settings(max_examples=20)
+@given(data=st.data())
+def test_a_state_has_its_own_number_else_its_group_s_else_the_default(model, data):
+    names = sorted({*model.state_names, *model.state_groups})
+    named = data.draw(st.dictionaries(st.sampled_from(names), st.floats(-9, 9)))
+    named = dict(data.draw(st.permutations(list(named.items()))))
+    for name, value in zip(model.state_names, model.per_state(named, np.inf), strict=True):
+        groups = [group for group, members in model.state_groups.items() if name in members]
+        own = [named[name]] if name in named else [named[g] for g in groups if g in named]
+        assert value in (own or [np.inf])
+    with pytest.raises(ModelError, match="`nothing` is no state or group"):
+        model.per_state({"nothing": 1.0})
 
 
 @every_model

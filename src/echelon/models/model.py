@@ -213,6 +213,20 @@ class ControlAffine(eqx.Module):
             f"which has {listing(allowed)}{did_you_mean(name, allowed)}."
         )
 
+    def per_state(self, named: Mapping[str, float], otherwise: float = 0.0) -> np.ndarray:
+        """Return a number for each state, (n,), from numbers by state or group of states.
+
+        A state's own number wins over its group's. States that are not named have `otherwise`.
+
+        Raises:
+            ModelError: the model has neither a state nor a group of a name.
+        """
+        values = np.full(len(self.state_names), float(otherwise))
+        # Groups come first, whatever the order of the mapping, and states write over them.
+        for name in sorted(named, key=lambda name: name in self.state_names):
+            values[list(self.states_called(name))] = named[name]
+        return values
+
 
 def _rest(model: ControlAffine, u: _Inputs) -> _Inputs:
     """Return u* in the shape (..., m) and precision of u."""

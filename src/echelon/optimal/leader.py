@@ -90,10 +90,7 @@ class OptimalTracking(Law):
         check_gain_fits(self, model, gain.P.shape, gain.R.shape)
         times = grid(self.horizon, _STEP, self.planning.interval)
         targets = reference_targets(model, self.reference, times.times)
-        start = np.array(targets.states[0])
-        for name, error in sorted(self.start_error, key=lambda e: e[0] in model.state_names):
-            places = list(model.states_called(name))
-            start[places] = targets.states[0][places] + error
+        start = targets.states[0] + model.per_state(dict(self.start_error))
         plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
         unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
         return eqx.tree_at(
