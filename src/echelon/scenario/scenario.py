@@ -135,15 +135,20 @@ def _validated(data: Mapping[Any, Any]) -> tuple[Scenario | None, list[tuple[Key
         return None, list(map(_describe, error.errors(include_url=False)))
 
 
-def by_line(fault: Fault) -> tuple[bool, int]:
+def _by_line(fault: Fault) -> tuple[bool, int]:
     """Sort by line, what the command line set last."""
     line = fault.place.rpartition(":")[2]
     overridden = fault.place.startswith("--set ")
     return overridden, int(line) if line.isdigit() and not overridden else 0
 
 
-def _refuse(faults: Iterable[Fault]) -> NoReturn:
-    ordered = sorted(faults, key=by_line)
+def refuse(faults: Iterable[Fault]) -> NoReturn:
+    """Raise all faults as one error, a line each in the order of the file.
+
+    Raises:
+        ScenarioError: always; its `faults` are the single ones.
+    """
+    ordered = sorted(faults, key=_by_line)
     error = ScenarioError("\n".join(map(str, ordered)))
     setattr(error, "faults", tuple(ordered))
     raise error
@@ -153,7 +158,7 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
         said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
-        _refuse([Fault(document.place(()), "", said)])
+        refuse([Fault(document.place(()), "", said)])
     document = document._replace(data=data)
     scenario, refused = _validated(data)
     # One for each path: what a check says of it goes before what the schema says.
@@ -162,7 +167,7 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
         found.setdefault(path, said)
     faults = [Fault(document.place(path), joined(path), said) for path, said in found.items()]
     if scenario is None or faults or document.faults:
-        _refuse([*document.faults, *faults])
+        refuse([*document.faults, *faults])
     scenario._document, scenario._text, scenario._folder = document, text, folder
     return scenario
 
