@@ -212,20 +212,21 @@ def inner_loops(lengths: Sequence[tuple[int, float]]) -> list[Row]:
         graph = ech.Graph.path(followers + 1)
         gain = ech.synthesize(model, graph, ech.gains.InnerLoop())
         result = ech.simulate(
-            model,
-            graph,
-            ech.Formation.line(model, graph, 0.5),
-            leader=ech.laws.Tracking(ech.references.FigureEight()),
-            follower=ech.laws.Consensus(gain, feedforward="relay"),
-            initial={"position": 1.0, "attitude": 0.3},
-            horizon=horizon,
-            dt=0.005,
-            store_every=100,
+            ech.Parts(
+                model,
+                graph,
+                ech.Formation.line(model, graph, 0.5),
+                ech.Laws(
+                    ech.laws.Tracking(ech.references.FigureEight()),
+                    ech.laws.Consensus(gain, feedforward="relay"),
+                ),
+                initial={"position": 1.0, "attitude": 0.3},
+            ),
+            ech.Settings(horizon=horizon, dt=0.005, store_every=100, steady_window=0.1 * horizon),
         )
         errors = formation_errors(result)[:, 1:]
         above = np.flatnonzero(errors.max(axis=1) > 1e-9)
-        last = errors[result.times > 0.9 * horizon]
-        steady = float(np.sqrt((last**2).mean(axis=0)).max())
+        steady = ech.metrics(result).worst_steady
         reached = result.times[min(above[-1] + 1, len(errors) - 1)] if len(above) else 0.0
         rows.append(
             (
@@ -372,15 +373,14 @@ def _comes_back(model: ech.ControlAffine, gain: ech.Gain, name: str, size: float
         states = formation.offsets + np.asarray(model.trim[0])
         states[1, model.state_names.index(name)] += sign * size
         result = ech.simulate(
-            model,
-            LINE,
-            formation,
-            leader=ech.laws.TrimInput(),
-            follower=ech.laws.Consensus(gain, feedforward="relay"),
-            initial=states,
-            horizon=60.0,
-            dt=0.002,
-            store_every=500,
+            ech.Parts(
+                model,
+                LINE,
+                formation,
+                ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay")),
+                initial=states,
+            ),
+            ech.Settings(horizon=60.0, dt=0.002, store_every=500),
         )
         end = np.abs(result.errors[-1]).max()
         if result.outcome is not ech.Outcome.COMPLETED or not end < 1e-3 * size:

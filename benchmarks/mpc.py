@@ -15,7 +15,6 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.errors import PlanError
-from echelon.models.inputs import normalized, physical
 from echelon.optimal.horizon import Course, Horizon
 from echelon.references.flatness import reference_targets
 
@@ -62,11 +61,9 @@ def nonlinear(solver: str) -> Step:
     """Return the same problem solved as a nonlinear program from the shifted solution."""
     Q, R = (jnp.asarray(w) for w in ech.optimal.MPC().weights(MODEL))
     weight = Horizon(MODEL, ech.optimal.MPC(), 1, DT, limits=False)._weight.toarray()[-12:, -12:]
-    inverse = jnp.linalg.inv(jnp.asarray(np.array(MODEL.input_scale)))
-    trim = jnp.asarray(np.array(MODEL.trim[1]))
 
     def stage(x: Any, u: Any, p: Any) -> Any:
-        e, w = x - p[:12], inverse @ (u - trim) - p[12:]
+        e, w = x - p[:12], MODEL.normalized(u) - p[12:]
         return jnp.sum(Q * e * e) + jnp.sum(R * w * w)
 
     problem = ech.optimal.OptimalControl(
@@ -81,11 +78,11 @@ def nonlinear(solver: str) -> Step:
 
     def step(start: np.ndarray, targets: Course, near: Course) -> tuple[Course | None, int]:
         v = np.vstack([targets.inputs, targets.inputs[-1:]])
-        guess = (np.vstack([start, near.states[1:]]), physical(MODEL, near.inputs))
+        guess = (np.vstack([start, near.states[1:]]), MODEL.physical(near.inputs))
         plan = planner.solve(start, np.hstack([targets.states, v]), guess)
         if plan.violations and max(v.amount for v in plan.violations) > 1e-2:
             return None, plan.iterations
-        return Course(plan.states, normalized(MODEL, plan.inputs)), plan.iterations
+        return Course(plan.states, MODEL.normalized(plan.inputs)), plan.iterations
 
     return step
 

@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 
 import echelon as ech
-from echelon.models.inputs import physical
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import Grid, TrackingOptions, coarse, grid, tracking
 from echelon.optimal.problem import OptimalControl
@@ -21,7 +20,7 @@ MODEL, LOOP = ech.models.Quadrotor.crazyflie(), ech.references.Lemniscate()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])
 OFFSETS = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
 DRAWN = ech.Formation.from_offsets(MODEL, TREE, OFFSETS)
-FLIGHT = {"reference": LOOP, "horizon": 10.0, "dt": 0.005}
+FLIGHT = ech.Settings(horizon=10.0, dt=0.005)
 SHARP = TrackingOptions(interval=0.02, input_weight=3e-6)
 """For followers without limits, whose error shall be gone within a sample of the paper."""
 
@@ -81,7 +80,7 @@ def least(start: np.ndarray, targets: Targets, times: Grid, seeds: Sequence[int]
     p = np.hstack([targets.outputs, targets.inputs, np.zeros((len(targets.inputs), 1))])
     found = []
     for seed in seeds:
-        states, inputs = targets.states.copy(), physical(MODEL, targets.inputs[:-1])
+        states, inputs = targets.states.copy(), MODEL.physical(targets.inputs[:-1])
         if seed:
             rng = np.random.default_rng(seed)
             fade = np.exp(-times.times / rng.uniform(0.2, 1.0))[:, None]
@@ -187,10 +186,11 @@ def times_and_mpc() -> Iterator[Row]:
         "5 s",
     )
     for limits in (True, False):
-        result = ech.optimal.simulate_mpc(
-            MODEL, TREE, DRAWN, initial=starts(), limits=limits, **FLIGHT
+        result = ech.simulate(
+            ech.Parts(MODEL, TREE, DRAWN, ech.optimal.RecedingHorizon(LOOP), initial=starts()),
+            FLIGHT._replace(limits=limits),
         )
-        figures, numbers = ech.optimal.solver_stats(result), ech.metrics(result)
+        figures, numbers = result.work, ech.metrics(result)
         assert figures is not None and numbers.worst_steady is not None
         name = "MPC, motor limits" if limits else "MPC, inputs unconstrained"
         e = off_reference(result)
@@ -215,10 +215,16 @@ def times_and_mpc() -> Iterator[Row]:
 def rows() -> Iterator[Row]:
     """Yield all rows of the table."""
     initial = starts()
-    within = ech.optimal.simulate_plans(MODEL, TREE, DRAWN, initial=initial, **FLIGHT)
-    free = ech.optimal.simulate_plans(MODEL, TREE, DRAWN, initial=initial, limits=False, **FLIGHT)
-    sharp = ech.optimal.simulate_plans(
-        MODEL, TREE, DRAWN, planning=SHARP, initial=initial, limits=False, **FLIGHT
+    within = ech.simulate(
+        ech.Parts(MODEL, TREE, DRAWN, ech.optimal.Plans(LOOP), initial=initial), FLIGHT
+    )
+    free = ech.simulate(
+        ech.Parts(MODEL, TREE, DRAWN, ech.optimal.Plans(LOOP), initial=initial),
+        FLIGHT._replace(limits=False),
+    )
+    sharp = ech.simulate(
+        ech.Parts(MODEL, TREE, DRAWN, ech.optimal.Plans(LOOP, options=SHARP), initial=initial),
+        FLIGHT._replace(limits=False),
     )
     yield from leader(free, within)
     yield from followers(sharp, within)

@@ -10,7 +10,6 @@ import numpy as np
 
 import echelon as ech
 from echelon.certificates.margins import ClosedLoop, string_gain
-from echelon.core.numerics import precision
 from echelon.models.linearization import linearize
 from echelon.results.metrics import formation_errors
 
@@ -25,16 +24,17 @@ def converged(followers: int, feedforward: str, coupling: float | None, seeds: i
     count = 0
     for seed in range(seeds):
         run = ech.simulate(
-            MODEL,
-            graph,
-            ech.Formation.line(MODEL, graph),
-            leader=ech.laws.Tracking(ech.references.Lemniscate()),
-            follower=ech.laws.Consensus(gain, feedforward=feedforward),  # pyright: ignore
-            initial={"position": 1.0, "attitude": 0.3},
-            horizon=60.0,
-            dt=0.005,
-            store_every=200,
-            seed=seed,
+            ech.Parts(
+                MODEL,
+                graph,
+                ech.Formation.line(MODEL, graph),
+                ech.Laws(
+                    ech.laws.Tracking(ech.references.Lemniscate()),
+                    ech.laws.Consensus(gain, feedforward=feedforward),
+                ),
+                initial={"position": 1.0, "attitude": 0.3},
+            ),
+            ech.Settings(horizon=60.0, dt=0.005, store_every=200, seed=seed),
         )
         done = run.outcome is ech.Outcome.COMPLETED
         count += bool(done and np.all(formation_errors(run)[-1] < 0.01))
@@ -47,8 +47,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     seeds = parser.parse_args().seeds
     gain = ech.synthesize(MODEL, ech.Graph.path(2), ech.gains.Riccati(coupling=1.0))
-    with precision("float64"):
-        A, B = linearize(MODEL)
+    A, B = linearize(MODEL)
     lines = (3, 10, 20)
     print("| feed-forward | c | ‖T‖ |", " | ".join(f"N = {n}" for n in lines), "|")
     print("|---" * (3 + len(lines)) + "|")

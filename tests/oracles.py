@@ -74,6 +74,13 @@ def laplacian(agents, edges, weights=None):
     return np.diag(A.sum(axis=1)) - A
 
 
+def relabelled(graph, order):
+    """The same graph with agent i renamed to order[i]."""
+    order = np.asarray(order)
+    edges = np.column_stack([order[graph.edges], graph.weights])
+    return type(graph)(edges.tolist(), order[list(graph.leaders)].tolist(), graph.agents)
+
+
 def disagreements(A, x, offsets):
     """z_i = sum_j A_ij (x_i - x_j) + A_ij d_ij with d_ij = xi_j - xi_i, entry by entry."""
     z = np.zeros_like(x)

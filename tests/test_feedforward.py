@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from oracles import laplacian
+from oracles import laplacian, relabelled
 from runs import simulate
 
 from echelon.core.errors import EchelonError, ScenarioError
@@ -269,7 +269,7 @@ def test_renaming_agents_permutes_a_run_with_parents():
             dt=0.01,
         )
 
-    first, second = run(TREE, start), run(TREE.relabelled(order), there)
+    first, second = run(TREE, start), run(relabelled(TREE, order), there)
     assert np.abs(second.states[:, order] - first.states).max() <= 1e-11
 
 

@@ -75,16 +75,14 @@ def modes(gain, A, B, eigenvalue, coupling=None):
 
 @pytest.mark.parametrize("model", STABILIZABLE, ids=lambda m: type(m).__name__)
 def test_linearization_is_the_slope_of_the_velocity_at_the_trim(model):
-    with numerics.precision("float64"):
-        A, B = linearize(model)
+    A, B = linearize(model)
     wanted = near_trim(model)
     assert A == pytest.approx(wanted[0], abs=1e-8) and B == pytest.approx(wanted[1], abs=1e-8)
     assert A.dtype == B.dtype == np.float64
 
 
 def test_a_hovering_quadrotor_is_four_chains_of_integrators():
-    with numerics.precision("float64"):
-        A, B = linearize(QUAD)
+    A, B = linearize(QUAD)
     wanted = np.zeros((12, 12))
     wanted[0:3, 3:6] = wanted[6:9, 9:12] = np.eye(3)
     # Pitching forward by 1 rad pushes along x with g, rolling right pushes along -y.

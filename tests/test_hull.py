@@ -610,6 +610,6 @@ def test_other_faults_of_a_call_are_refused(monkeypatch):
         jacobian_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
     with pytest.raises(GainError, match="one matrix of floats"):
         jacobian_hull(lambda x, v: x, box, NO_INPUTS)
-    monkeypatch.setattr(_hull_algebra, "MOST_VERTICES", 100)
+    monkeypatch.setattr("echelon.enclosure.polynomial.MOST_VERTICES", 100)
     with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
         jacobian_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)

@@ -22,8 +22,7 @@ AGENTS = {
 
 def closed(model, gain):
     """A - B K and B, in normalized inputs."""
-    with precision("float64"):
-        A, B = linearize(model)
+    A, B = linearize(model)
     return A - B @ gain.inner, B
 
 

@@ -84,7 +84,6 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
     x, xi = rng.uniform(-1.0, 1.0, (2, agents, n))
     P, R, c = spd(rng, n), spd(rng, m), rng.uniform(0.5, 3.0)
     law = Consensus(synthesize(model, graph, FixedGain(P=P, R=R, coupling=c)))
-    formation = Formation(xi)
 
     # The block form over followers: u = -c (I kron R^-1) G^T (I kron P) (e + d), in normalized
     # inputs, with e from the follower rows of the Laplacian and d from the displacements.
@@ -92,7 +91,7 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
     rows = [k for k in range(agents) if k not in leaders]
     L = laplacian(agents, pairs, weights)[rows]
     e = np.kron(L, np.eye(n)) @ x.ravel()
-    d = formation.local_displacements(graph)[rows].ravel()
+    d = -(L @ xi).ravel()
     S, trim = np.array(model.input_scale), np.array(model.trim[1])
     G = scipy.linalg.block_diag(*[input_map_of(model, x[k]) @ S for k in rows])
     blocks = np.kron(np.eye(len(rows)), np.linalg.inv(R)) @ G.T @ np.kron(np.eye(len(rows)), P)

@@ -2,6 +2,7 @@
 
 import importlib
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +14,12 @@ from scipy.integrate import solve_ivp
 
 import echelon.models
 from echelon.core import numerics
+from echelon.core.errors import ModelError
 from echelon.core.numerics import precision
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
+    Limits,
     Linear,
     Pendulum,
     PlanarQuadrotor,
@@ -29,8 +32,7 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
-from echelon.models.quadrotor_euler import computed_torque
-from echelon.models.rigid_body import euler_rates
+from echelon.models.rigid_body import body_rates, euler_rates, free_spin
 from echelon.scenario import registry
 
 rng = np.random.default_rng(7)
@@ -134,7 +136,7 @@ def test_drift_and_input_map_are_the_textbook_equations(model, seed):
 
 
 def test_the_family_of_these_tests_is_the_whole_family():
-    members = {getattr(echelon.models, name) for name in echelon.models.__all__}
+    members = {getattr(echelon.models, name) for name in echelon.models.__all__} - {Limits}
     assert {type(model) for model in FAMILY.values()} == members - {ControlAffine}
     registered = set()
     for entry in registry.MODELS.values():
@@ -216,8 +218,35 @@ def test_normalized_inputs_are_deviations_from_the_trim(model):
     assert numpy(model.physical, v) == pytest.approx(u, rel=1e-12, abs=1e-18)
     without = numpy(lambda v: model.physical(v, trim=False), v)
     assert without == pytest.approx(u - trim, rel=1e-12, abs=1e-18)
+    assert numpy(model.normalized, u) == pytest.approx(v, rel=1e-12, abs=1e-12)
     about = numpy(model.normalized_drift, x) + numpy(model.normalized_input_map, x) @ v
     assert about == pytest.approx(numpy(model.velocity, x, u), rel=1e-12, abs=1e-11)
+
+
+@every_model
+def test_many_inputs_change_as_one_does_in_numpy_and_in_jax(model):
+    v = np.random.default_rng(3).normal(size=(2, 5, len(model.input_names)))
+    for change in (model.physical, model.normalized, lambda v: model.physical(v, trim=False)):
+        one_by_one = [[numpy(change, row) for row in rows] for rows in v]
+        assert isinstance(change(v), np.ndarray)
+        assert change(v) == pytest.approx(np.array(one_by_one), rel=1e-14)
+        assert numpy(change, v) == pytest.approx(change(v), rel=1e-14)
+    assert model.physical(v[0].astype(np.float32)).dtype == np.float32
+
+
+def test_a_scale_that_depends_on_an_array_is_traced_with_it():
+    class Weighed(ControlAffine):
+        mass: np.ndarray
+        state_names, input_names = ("speed",), ("push",)
+        drift, input_map = SingleIntegrator.drift, SingleIntegrator.input_map
+
+        @property
+        def input_scale(self):
+            return ((self.mass[0],),)
+
+    change = eqx.filter_jit(lambda model, u: model.normalized(u))
+    for mass in (2.0, 4.0):
+        assert change(Weighed(np.array([mass])), jnp.array([8.0])) == 8.0 / mass
 
 
 @every_model
@@ -227,7 +256,12 @@ def test_agents_compute_in_the_precision_that_is_asked_for(model, name):
     with numerics.precision(name):
         a, b = jnp.asarray(x), jnp.asarray(u)
         values = [model.drift(a), model.input_map(a), model.output(a), model.limit(b)]
-        values += [model.physical(b), model.normalized_input_map(a), model.difference(a, a)]
+        values += [
+            model.physical(b),
+            model.normalized(b),
+            model.normalized_input_map(a),
+            model.difference(a, a),
+        ]
         assert {str(value.dtype) for value in values} == {name}
 
 
@@ -238,6 +272,21 @@ def test_states_are_found_by_name_and_by_group(model):
             assert model.states_called(name) == (k,)
     for group, members in model.state_groups.items():
         assert tuple(model.state_names[k] for k in model.states_called(group)) == tuple(members)
+
+
+@every_model
+@settings(max_examples=20)
+@given(data=st.data())
+def test_a_state_has_its_own_number_else_its_group_s_else_the_default(model, data):
+    names = sorted({*model.state_names, *model.state_groups})
+    named = data.draw(st.dictionaries(st.sampled_from(names), st.floats(-9, 9)))
+    named = dict(data.draw(st.permutations(list(named.items()))))
+    for name, value in zip(model.state_names, model.per_state(named, np.inf), strict=True):
+        groups = [group for group, members in model.state_groups.items() if name in members]
+        own = [named[name]] if name in named else [named[g] for g in groups if g in named]
+        assert value in (own or [np.inf])
+    with pytest.raises(ModelError, match="`nothing` is no state or group"):
+        model.per_state({"nothing": 1.0})
 
 
 @every_model
@@ -523,6 +572,16 @@ def test_an_agent_of_ones_own_may_replace_any_default_by_attribute_property_or_m
     assert model.input_scale == ((0.4,),) and model.state_units == ("K", "K")
     assert numpy(model.difference, np.ones(2), np.zeros(2)) == pytest.approx([2.0, 2.0])
     assert numpy(model.physical, np.array([2.0])) == pytest.approx([1.2])
+
+
+def computed_torque(model, x, v):
+    """The thrust and torques of a quadrotor that realize an input of `QuadrotorEuler`."""
+    zeta, omega = x[6:9], x[9:12]
+    zeta_dot = euler_rates(zeta, omega)
+    # omega = W(zeta)^-1 zetadot, differentiated along (zetadot, zetaddot).
+    _, omega_dot = jax.jvp(body_rates, (zeta, zeta_dot), (zeta_dot, v[1:]))
+    torque = jnp.asarray(model.inertia) * (omega_dot - free_spin(model.inertia, omega))
+    return jnp.append(model.mass * (model.gravity + v[0]), torque)
 
 
 def test_computed_torque_turns_the_quadrotor_into_its_euler_form():

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 import scipy.linalg
+from oracles import relabelled
 from runs import simulate, simulate_mpc, simulate_plans
 
 import echelon as ech
@@ -110,7 +111,7 @@ def test_wind_does_not_add_up_as_it_does_open_loop():
 
 def test_agents_renamed_fly_the_same():
     order = [0, 3, 1, 2]
-    renamed = TREE.relabelled(order)
+    renamed = relabelled(TREE, order)
     rows = np.zeros_like(DRAWN.offsets)
     rows[order] = DRAWN.offsets
     states = swarm().states[0]

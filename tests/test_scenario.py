@@ -43,6 +43,7 @@ LINES = {
     "report": "report: {steady_window: 10.0}",
     "seed": "seed: 0",
 }
+FOLDER_NAME = "text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"
 NUMBER = {name: number for number, name in enumerate(LINES, start=1)}
 
 
@@ -293,7 +294,7 @@ def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
 def test_one_fault_does_not_make_others_up(refused):
     """An edge that cannot be read leaves the number of agents open, so offsets are not blamed."""
     lines = refused(graph="graph: {edges: [[0, 1], [1, 2], [1, x]]}")
-    assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2: got `[1, x]`")
+    assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2.1: got `x`")
 
 
 def spoiled(data, random):
@@ -327,7 +328,7 @@ def test_the_error_carries_its_faults(load):
     with pytest.raises(ScenarioError) as caught:
         load(seed="seed: -1", name="name: 3")
     assert caught.value.faults == (
-        Fault("s.yaml:1", "name", "got `3`, allowed is text."),
+        Fault("s.yaml:1", "name", f"got `3`, allowed is {FOLDER_NAME}."),
         Fault("s.yaml:11", "seed", "got `-1`, allowed is a number from 0 on."),
     )
     assert str(caught.value) == "\n".join(map(str, caught.value.faults))
@@ -336,7 +337,7 @@ def test_the_error_carries_its_faults(load):
 
 def test_overrides_meet_the_same_rules_and_come_last(refused):
     assert refused("simulation.dt=0", "graph.edges.1=[1, 1]", "graph.agents=4", name="name: 3") == [
-        "s.yaml:1: name: got `3`, allowed is text.",
+        f"s.yaml:1: name: got `3`, allowed is {FOLDER_NAME}.",
         "--set graph.edges.1=[1, 1]: graph.edges.1: got `[1, 1]`, allowed is an edge between two"
         " different agents.",
         "--set simulation.dt=0: simulation.dt: got `0`, allowed is a number above 0.",
@@ -513,6 +514,7 @@ def conforms(value, schema, whole):
 def contents_conform(value, schema, whole):
     if isinstance(value, dict):
         fields, other = schema.get("properties", {}), schema.get("additionalProperties", {})
+        other = {} if other is True else other
         value = {str(key): item for key, item in value.items()}
         return set(schema.get("required", [])) <= set(value) and all(
             key in fields or other is not False and conforms(item, other, whole)

@@ -16,6 +16,7 @@ from oracles import (
     laplacian,
     newton_euler,
     quadrotor_input_map,
+    relabelled,
 )
 from runs import simulate
 from scipy.integrate import solve_ivp
@@ -119,7 +120,7 @@ def test_renaming_agents_permutes_the_run(flight):
     offsets, there = np.empty_like(start), np.empty_like(start)
     offsets[order], there[order] = DRAWN.offsets, start
     first = fly()
-    second = fly(graph.relabelled(order), there, Formation(offsets))
+    second = fly(relabelled(graph, order), there, Formation(offsets))
     assert second.graph.leaders == (2,)
     assert np.abs(second.states[:, order] - first.states).max() <= 1e-12
     assert second.errors[:, order] == pytest.approx(first.errors, abs=1e-12)

@@ -1,5 +1,6 @@
 """YAML 1.2 in, plain data and places out; overrides laid over it."""
 
+import itertools
 import math
 
 import pytest
@@ -11,7 +12,6 @@ from echelon.scenario.yaml import (
     apply_overrides,
     dump_yaml,
     inline_yaml,
-    parse_override,
     read_yaml,
 )
 
@@ -36,7 +36,7 @@ DATA = st.recursive(
 
 def read(text):
     document = read_yaml(text, "f.yaml")
-    assert not document.problems
+    assert not document.faults
     return document.data
 
 
@@ -96,6 +96,7 @@ def test_any_text_is_read_or_refused_in_one_sentence(text):
         ("1e-3", 0.001),
         ("-1E+3", -1000.0),
         (".5", 0.5),
+        ("-.5e3", -500.0),
         ("2.", 2.0),
         ("012", 12),
         ("0o14", 12),
@@ -110,6 +111,9 @@ def test_any_text_is_read_or_refused_in_one_sentence(text):
         ("'1'", "1"),
         ("~", None),
         ("", None),
+        ("=", "="),
+        ("<<", "<<"),
+        ("9" * 5000, "9" * 5000),
         ("-.inf", -math.inf),
         ("inf", "inf"),
     ],
@@ -141,17 +145,18 @@ def test_a_path_that_does_not_exist_has_the_place_of_its_parent():
 
 def test_repeated_keys_are_told_with_both_lines():
     document = read_yaml("a: 1\nb: {c: 1,\n  c: 2}\na: 3\n", "f.yaml")
-    assert [tuple(problem) for problem in document.problems] == [
-        (("b", "c"), "f.yaml:3", "got this key twice, it stands at f.yaml:2 already."),
-        (("a",), "f.yaml:4", "got this key twice, it stands at f.yaml:1 already."),
+    assert [tuple(fault) for fault in document.faults] == [
+        ("f.yaml:3", "b.c", "got this key twice, it stands at f.yaml:2 already."),
+        ("f.yaml:4", "a", "got this key twice, it stands at f.yaml:1 already."),
     ]
 
 
 def test_tags_and_keys_that_are_no_words_are_told():
-    document = read_yaml("a: !!str 3\n? [1]\n: 2\n", "f.yaml")
-    assert [tuple(problem) for problem in document.problems] == [
-        (("a",), "f.yaml:1", "got the tag `!!str`, allowed are values without a tag."),
-        ((), "f.yaml:2", "got a list or mapping as a key, allowed is a word or a number."),
+    document = read_yaml("a: !!str 3\n? [1]\n: 2\nb: !!int x\n", "f.yaml")
+    assert [tuple(fault) for fault in document.faults] == [
+        ("f.yaml:1", "a", "got the tag `!!str`, allowed are values without a tag."),
+        ("f.yaml:2", "", "got a list or mapping as a key, allowed is a word or a number."),
+        ("f.yaml:4", "b", "got the tag `!!int`, allowed are values without a tag."),
     ]
 
 
@@ -179,6 +184,13 @@ def test_tags_and_keys_that_are_no_words_are_told():
             "[" * 5000,
             "f.yaml:1: got values nested too deep or within themselves, allowed is a plain tree.",
         ),
+        (
+            "- &a [1, 1]\n"
+            + "".join(
+                f"- &{c} [{', '.join([f'*{b}'] * 9)}]\n" for b, c in itertools.pairwise("abcdefgh")
+            ),
+            "f.yaml:1: got aliases for more than 10000 values, allowed is a plain tree.",
+        ),
     ],
 )
 def test_what_is_not_yaml_is_refused_with_its_line(text, sentence):
@@ -188,19 +200,19 @@ def test_what_is_not_yaml_is_refused_with_its_line(text, sentence):
 
 
 @pytest.mark.parametrize(
-    ("text", "path", "value"),
+    ("text", "data"),
     [
-        ("a.b=3", ("a", "b"), 3),
-        ("dt=1e-3", ("dt",), 0.001),
-        ("a = no", ("a",), "no"),
-        ("a=", ("a",), None),
-        ("a=b=c", ("a",), "b=c"),
-        ("graph.edges.0=[0, 1]", ("graph", "edges", 0), [0, 1]),
-        ("formation.offsets={1: [1,0,0]}", ("formation", "offsets"), {1: [1, 0, 0]}),
+        ("a.b=3", {"a": {"b": 3}}),
+        ("dt=1e-3", {"dt": 0.001}),
+        ("a = no", {"a": "no"}),
+        ("a=", {"a": None}),
+        ("a=b=c", {"a": "b=c"}),
+        ("graph.edges.0=[0, 1]", {"graph": {"edges": {0: [0, 1]}}}),
+        ("formation.offsets={1: [1,0,0]}", {"formation": {"offsets": {1: [1, 0, 0]}}}),
     ],
 )
-def test_an_override_is_a_path_and_a_value(text, path, value):
-    assert parse_override(text) == (path, value)
+def test_an_override_is_a_path_and_a_value(text, data):
+    assert same(apply_overrides(read_yaml("", "f.yaml"), [text]).data, data)
 
 
 @pytest.mark.parametrize(
@@ -260,15 +272,17 @@ def test_overrides_replace_and_add_in_their_order():
 def test_the_place_of_an_overridden_value_is_the_override():
     document = read_yaml("a:\n  b: [1, 2]\n  c: 3\n", "f.yaml")
     done = apply_overrides(document, ["a.b=[7]", "x.y=1"])
-    assert done.places == {
+    assert {path: done.place(path) for path in [*document.places, ("x",), ("x", "y")]} == {
         (): "f.yaml:1",
-        ("a",): "f.yaml:1",
-        ("a", "c"): "f.yaml:3",
+        ("a",): "--set a.b=[7]",
         ("a", "b"): "--set a.b=[7]",
         ("a", "b", 0): "--set a.b=[7]",
+        ("a", "b", 1): "--set a.b=[7]",
+        ("a", "c"): "f.yaml:3",
         ("x",): "--set x.y=1",
         ("x", "y"): "--set x.y=1",
     }
+    assert done.place(("a", "d")) == "--set a.b=[7]"
 
 
 @given(st.dictionaries(KEYS, DATA, max_size=3), DATA)

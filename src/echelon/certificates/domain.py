@@ -45,18 +45,17 @@ class Domain:
         Raises:
             GainError: a name is unknown, a bound is empty, inverted or leaves the model's chart.
         """
-        n, m = len(model.state_names), len(model.input_names)
-        box = cls(np.full(n, -np.inf), np.full(n, np.inf), np.zeros(m), np.zeros(m))
-        state, given = np.array([box.lower, box.upper]), np.zeros((2, m))
-        # A state's own bound wins over its group's.
-        for name in sorted(bounds, key=lambda name: name in model.state_names):
-            low, high = _interval(name, bounds[name])
+        inputs, lower, upper = np.zeros((2, len(model.input_names))), {}, {}
+        for name, bound in bounds.items():
+            low, high = _interval(name, bound)
             if name in model.input_names:
-                given[:, model.input_names.index(name)] = low, high
+                inputs[:, model.input_names.index(name)] = low, high
             else:
-                state[:, _places(model, name)] = np.array([[low], [high]])
+                _check_name(model, name)
+                lower[name], upper[name] = low, high
+        state = np.array([model.per_state(lower, -np.inf), model.per_state(upper, np.inf)])
         _check_chart(model, state)
-        return cls(*state, *given)
+        return cls(*state, *inputs)
 
     def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Array, Array]:
         """Return random deviations (count, n) and inputs (count, m); unbounded states in +-free."""
@@ -111,14 +110,13 @@ def _interval(name: str, bound: Bound) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _places(model: ControlAffine, name: str) -> list[int]:
+def _check_name(model: ControlAffine, name: str) -> None:
     if name not in model.state_names and name not in model.state_groups:
         allowed = [*model.state_groups, *model.state_names, *model.input_names]
         raise GainError(
             f"the domain names `{name}`, and `{type(model).__name__}` has {listing(allowed)}"
             f"{did_you_mean(name, allowed)}."
         )
-    return list(model.states_called(name))
 
 
 def _check_chart(model: ControlAffine, state: Array) -> None:

@@ -21,9 +21,9 @@ _ASYMMETRY = 1e-9  # relative; more than rounding can explain
 
 
 class Definiteness(NamedTuple):
-    """Whether a matrix is negative (semi)definite, and the smallest pivot d of -M = L diag(d) L'.
+    """Whether a matrix is positive definite, and the smallest pivot d of M = L diag(d) L'.
 
-    Elimination ends at the first pivot that fails, which then counts as the smallest. `pivot` is
+    Elimination ends at the first pivot that fails, which then is the smallest one told. `pivot` is
     rounded to a float, `holds` is exact.
     """
 
@@ -68,11 +68,11 @@ class _Scaled(NamedTuple):
         """Return the difference."""
         return self.plus(_Scaled(-other.integers, other.bits))
 
-    def transpose(self) -> "_Scaled":
+    def transposed(self) -> "_Scaled":
         """Return the transpose."""
         return _Scaled(self.integers.T, self.bits)
 
-    def magnitudes(self) -> "_Scaled":
+    def sized(self) -> "_Scaled":
         """Return the absolute values."""
         return _Scaled(abs(self.integers), self.bits)
 
@@ -81,7 +81,7 @@ class _Scaled(NamedTuple):
         return _Scaled(np.diag(self.integers.sum(axis=1)), self.bits)
 
 
-def _to_integers(values: object, name: str) -> _Scaled:
+def _scaled(values: object, name: str) -> _Scaled:
     """Return floats (or dyadic fractions) as integers over one power of two.
 
     Raises:
@@ -100,86 +100,37 @@ def _to_integers(values: object, name: str) -> _Scaled:
     return _Scaled(integers.reshape(array.shape), bits)
 
 
-def _symmetrize(values: object, name: str) -> _Scaled:
-    """Return the symmetric part, exactly.
+def _symmetrized(values: object, name: str) -> _Scaled:
+    """Return the symmetric part of a square matrix, exactly.
 
     Raises:
-        GainError: the matrix is not square, or is asymmetric by more than rounding.
+        GainError: the matrix is asymmetric by more than rounding.
     """
-    matrix = _to_integers(values, name)
-    if matrix.integers.ndim != 2 or matrix.integers.shape[0] != matrix.integers.shape[1]:
-        raise GainError(f"`{name}` has shape {matrix.integers.shape}, and must be square.")
-    skew = matrix.minus(matrix.transpose()).magnitudes().integers
-    if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.magnitudes().integers.max()):
+    matrix = _scaled(values, name)
+    skew = matrix.minus(matrix.transposed()).sized().integers
+    if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.sized().integers.max()):
         raise GainError(f"`{name}` is not symmetric, and must be.")
-    both = matrix.plus(matrix.transpose())
+    both = matrix.plus(matrix.transposed())
     return _Scaled(both.integers, both.bits + 1)
 
 
-def negative_definite(matrix: object, strict: bool = True) -> Definiteness:
-    """Say exactly whether a symmetric matrix is negative definite (semidefinite if not `strict`).
-
-    Args:
-        matrix: (n, n) floats or dyadic fractions, symmetrized exactly.
-        strict: whether a pivot of 0 is refused.
-
-    Raises:
-        GainError: the matrix is not square, not symmetric or not finite.
-    """
-    symmetric = _symmetrize(matrix, "matrix")
-    return _positive(_Scaled(-symmetric.integers, symmetric.bits), strict)
-
-
-def _positive(matrix: _Scaled, strict: bool = True) -> Definiteness:
-    """Say whether a symmetric matrix is positive definite, or semidefinite."""
+def _positive(matrix: _Scaled) -> Definiteness:
+    """Say whether a symmetric matrix is positive definite."""
     rest, previous, smallest = matrix.integers, 1, None
     while len(rest):
         pivot, row, rest = rest[0, 0], rest[0, 1:], rest[1:, 1:]
         size = Fraction(pivot, previous)
         smallest = size if smallest is None else min(smallest, size)
-        if pivot < 0 or pivot == 0 and (strict or row.any()):
-            # A zero before a row that is not zero hides a negative eigenvalue.
+        if pivot <= 0:
             return Definiteness(False, _real(smallest, matrix.bits))
-        if pivot > 0:
-            # Bareiss: every entry is a minor of the matrix, so the division leaves no remainder.
-            rest, previous = (rest * pivot - np.outer(row, row)) // previous, pivot
+        # Bareiss: every entry is a minor of the matrix, so the division leaves no remainder.
+        rest, previous = (rest * pivot - np.outer(row, row)) // previous, pivot
     return Definiteness(True, _real(smallest or Fraction(0), matrix.bits))
 
 
 def _real(x: Fraction, bits: int) -> float:
     """Return x / 2^bits as a float."""
     return float(x / (1 << bits))
-
-
-def rationalize(P: Array, bits: int = 24) -> Array:
-    """Return a symmetric matrix near P with short entries, for use in place of P ever after.
-
-    Entry (i, j) is rounded to a multiple of 2^-bits times a power of two close to
-    sqrt(P_ii P_jj), so that it changes by at most 2^-bits sqrt(P_ii P_jj) whatever the states'
-    units; exact arithmetic is faster on fewer bits, and an ill-conditioned P needs more.
-
-    Args:
-        P: (n, n) positive definite.
-        bits: from 4 to 48.
-
-    Raises:
-        GainError: `bits` is out of range, P is not symmetric and finite, or what is left of it is
-            not positive definite, in exact arithmetic.
-    """
-    if not 4 <= bits <= 48:
-        raise GainError(f"`bits` is {bits}, and must be from 4 to 48.")
-    exact = _symmetrize(P, "P")
-    matrix = (np.asarray(P, float) + np.asarray(P, float).T) / 2
-    if not _positive(exact).holds:
-        raise GainError("`P` is not positive definite, and must be.")
-    scale = np.exp2(np.round(np.log2(np.diagonal(matrix)) / 2))
-    unit = np.outer(scale, scale) * 2.0**-bits
-    rounded = np.round(matrix / unit) * unit
-    if not _positive(_to_integers(rounded, "P")).holds:
-        raise GainError(
-            f"`P` rounded to {bits} bits is not positive definite; allow more `bits`, up to 48."
-        )
-    return rounded
 
 
 @kept
@@ -208,16 +159,16 @@ def prove_contraction(
     """
     start = time.perf_counter()
     _check_shapes(vertices, error, B, P)
-    metric, slack = _symmetrize(P, "P"), _to_integers(error, "error")
-    weight, speed = _to_integers(rho, "rho"), _to_integers(rate, "rate")
+    metric, slack = _symmetrized(P, "P"), _scaled(error, "error")
+    weight, speed = _scaled(rho, "rho"), _scaled(rate, "rate")
     if weight.integers[()] < 0 or (slack.integers < 0).any():
         raise GainError("`rho` and `error` must not be negative.")
     found = _positive(metric)
     smallest, proved, failed = found.pivot, int(found.holds), None if found.holds else -1
-    constant = _constant_part(metric, slack, _to_integers(B, "B"), weight, speed)
+    constant = _constant_part(metric, slack, _scaled(B, "B"), weight, speed)
     for number, vertex in enumerate(vertices) if found.holds else ():
-        drift = metric.times(_to_integers(vertex, "vertices"))
-        found = _positive(constant.minus(drift.plus(drift.transpose())))
+        drift = metric.times(_scaled(vertex, "vertices"))
+        found = _positive(constant.minus(drift.plus(drift.transposed())))
         smallest = min(smallest, found.pivot)
         if not found.holds:
             failed = number
@@ -232,10 +183,10 @@ def _constant_part(
 ) -> _Scaled:
     """Return rho P B B'P - 2 rate P minus the diagonal that errors of A may add."""
     gain = metric.times(B)
-    feedback = gain.times(gain.transpose()).times(weight)
+    feedback = gain.times(gain.transposed()).times(weight)
     wanted = metric.times(speed)
-    spread = metric.magnitudes().times(slack)
-    lost = spread.plus(spread.transpose()).row_sums()
+    spread = metric.sized().times(slack)
+    lost = spread.plus(spread.transposed()).row_sums()
     return feedback.minus(wanted.plus(wanted)).minus(lost)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError
 from echelon.core.kept import kept
+from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.enclosure.hull import Box, Hull, jacobian_hull
@@ -69,13 +70,21 @@ def weighted_jacobians(model: ControlAffine, domain: Domain, R: Array) -> Jacobi
 def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians:
     """Return a matrix function of state and normalized input over a domain."""
     names = [*model.state_names, *model.input_names]
-    try:
-        hull = jacobian_hull(function, *_boxes(model, domain), names)
-    except GainError as error:
-        samples, why = _sample(function, model, domain), str(error).rstrip(".")
-        return Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES, why)
+    with precision("float64"):
+        try:
+            hull = jacobian_hull(function, *_boxes(model, domain), names)
+        except GainError as error:
+            samples, why = _sample(function, model, domain), str(error).rstrip(".")
+            return _freeze(Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES, why))
     _check_bounded(model, domain, hull)
-    return Jacobians(hull.vertices, hull.error, Kind.VERTICES)
+    return _freeze(Jacobians(hull.vertices, hull.error, Kind.VERTICES))
+
+
+def _freeze(found: Jacobians) -> Jacobians:
+    """Return Jacobians that nobody can write to, since many callers share them."""
+    for array in (found.matrices, found.error):
+        array.setflags(write=False)
+    return found
 
 
 @kept
@@ -87,7 +96,8 @@ def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
         return jax.jacfwd(model.normalized_input_map)(x).reshape(-1, n)
 
     try:
-        hull = jacobian_hull(slope, *_boxes(model, domain))
+        with precision("float64"):
+            hull = jacobian_hull(slope, *_boxes(model, domain))
     except GainError:
         return False
     return not (hull.vertices.any() or hull.error.any())

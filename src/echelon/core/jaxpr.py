@@ -1,19 +1,111 @@
-"""Equations of a trace by JAX that only call, move entries about or add them up.
+"""The one walk through a trace by JAX, for entries of any kind: polynomials, a solver's symbols.
 
-They mean the same for entries of any kind: numbers, polynomials, symbols of a solver. Entries that
-are no plain numbers stand in NumPy arrays of objects.
+What an equation means for them is the `Algebra`, an argument of the walk. Entries that are no plain
+numbers stand in NumPy arrays of objects; an array of another type holds numbers, on which JAX
+computes itself. Equations that only call, move entries about or add them up mean the same in every
+algebra, and are here.
 """
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-Move: TypeAlias = Callable[..., np.ndarray]
-"""(parameters of the primitive, operands) -> result."""
+from echelon.core.numerics import precision
+
+Rule: TypeAlias = Callable[..., np.ndarray]
+"""(parameters of the primitive, operands) -> result, of which operands may be plain numbers."""
+
+
+class Algebra(NamedTuple):
+    """What the entries are, and what equations mean for them.
+
+    Attributes:
+        rules: by the name of a primitive with one result. They go before the rules of `COMMON`, and
+            are used where an operand is no array of plain numbers.
+        constant: number -> the entry that it is.
+        lift: array of numbers -> what it is in the walk: itself, or an array of entries. Constants,
+            literals and results of numbers alone go through it.
+        outside: () -> the entry that is read from outside of an array; it may raise instead.
+        unknown: (equation, operands) -> results of a primitive without a rule; or it raises an
+            error that names `equation.primitive.name` and what is allowed.
+    """
+
+    rules: Mapping[str, Rule]
+    constant: Callable[[float], Any]
+    lift: Callable[[np.ndarray], np.ndarray]
+    outside: Callable[[], Any]
+    unknown: Callable[[Any, list[np.ndarray]], list[np.ndarray]]
+
+
+def evaluate(
+    function: Callable[..., Any], arguments: Sequence[np.ndarray], algebra: Algebra
+) -> list[np.ndarray]:
+    """Return the results of a function for JAX, traced in float64, for arrays of entries.
+
+    Args:
+        function: takes one float64 array of the shape of each argument.
+        arguments: arrays of entries.
+        algebra: what the function's equations mean for them.
+    """
+    with precision("float64"):
+        closed = jax.make_jaxpr(function)(*(jnp.zeros(a.shape) for a in arguments))
+        return walk(closed.jaxpr, closed.consts, arguments, algebra)
+
+
+def walk(
+    jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray], algebra: Algebra
+) -> list[np.ndarray]:
+    """Return the results of a jaxpr, each of its equations evaluated in an algebra.
+
+    JAX computes on plain numbers in the precision that holds here, which should be the trace's.
+
+    Args:
+        jaxpr: of a trace, such as `jax.make_jaxpr(f)(x).jaxpr`.
+        consts: values of its `constvars`.
+        arguments: values of its `invars`, arrays of entries or of numbers.
+        algebra: what its equations mean for entries.
+    """
+    values = dict(zip(jaxpr.constvars, (algebra.lift(np.asarray(c)) for c in consts), strict=True))
+    values |= dict(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(variable: Any) -> np.ndarray:
+        # A literal stands in the equation itself and bears its value.
+        literal = hasattr(variable, "val")
+        return algebra.lift(np.asarray(variable.val)) if literal else values[variable]
+
+    for equation in jaxpr.eqns:
+        results = _apply(equation, [read(v) for v in equation.invars], algebra)
+        values |= dict(zip(equation.outvars, results, strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
+    """Return the results of one equation."""
+    name = equation.primitive.name
+    if name in INLINED:
+        inner = _called(equation)
+        # What `checkpoint` calls is a jaxpr without constants of its own.
+        jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+        return walk(jaxpr, consts, operands, algebra)
+    if all(a.dtype != object for a in operands):
+        return [algebra.lift(a) for a in compute(equation, operands)]
+    if name == "optimization_barrier":
+        return operands
+    if name in PLACED:
+        return _place(equation, operands, algebra.outside)
+    if name in ADDED:
+        return [_add(equation, operands, algebra.constant)]
+    rule = algebra.rules.get(name, COMMON.get(name))
+    if rule is None:
+        return algebra.unknown(equation, operands)
+    return [rule(equation.params, *operands)]
+
 
 INLINED = {
     "jit",
@@ -27,6 +119,8 @@ INLINED = {
     "remat2",
     "checkpoint",
 }
+"""Primitives that only call; their derivatives by hand are of no use once JAX has traced."""
+
 PLACED = {
     "split",
     "rev",
@@ -38,14 +132,14 @@ PLACED = {
     "expand_dims",
     "tile",
 }
-"""What `placed` knows."""
+"""Primitives that copy entries to other places."""
 
 ADDED = {"scatter-add", "scatter_add", "cumsum"}
-"""What `added` knows."""
+"""Primitives that are linear in their entries, with weights of any kind."""
 
 
-def called(equation: Any) -> Any:
-    """Return what an equation of an `INLINED` primitive calls."""
+def _called(equation: Any) -> Any:
+    """Return the jaxpr, closed or not, that an equation of an `INLINED` primitive calls."""
     return next(
         equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
     )
@@ -56,45 +150,42 @@ def each(function: Callable[..., object], *arrays: np.ndarray) -> np.ndarray:
     return np.asarray(np.frompyfunc(function, len(arrays), 1)(*arrays), dtype=object)
 
 
-def bound(equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
-    """Return the results of a primitive for numbers."""
+def compute(equation: Any, operands: Sequence[Any]) -> list[np.ndarray]:
+    """Return the results of an equation for plain numbers."""
     results = equation.primitive.bind(*(jnp.asarray(a) for a in operands), **equation.params)
     return [np.asarray(r) for r in (results if equation.primitive.multiple_results else [results])]
 
 
-def placed(
-    equation: Any, operands: Sequence[np.ndarray], outside: Callable[[], object]
+def _place(
+    equation: Any, operands: Sequence[np.ndarray], outside: Callable[[], Any]
 ) -> list[np.ndarray]:
-    """Return the results of a primitive that copies entries: JAX moves their places about.
+    """Return the results of a primitive that copies entries: JAX moves their places about."""
+    pool, places = _label_entries(operands)
 
-    `outside` makes the entry that is read from outside of an array.
-    """
-    pool, places = _labelled(operands)
-
-    def entry(place: float) -> object:
+    def entry(place: float) -> Any:
         return pool[int(place)] if 0.0 <= place < len(pool) else outside()
 
-    return [each(entry, r) for r in bound(equation, places)]
+    return [each(entry, r) for r in compute(equation, places)]
 
 
-def added(
-    equation: Any, operands: Sequence[np.ndarray], number: Callable[[float], Any]
+def _add(
+    equation: Any, operands: Sequence[np.ndarray], constant: Callable[[float], Any]
 ) -> np.ndarray:
     """Return the result of a primitive that adds entries, by what it does to unit vectors."""
-    pool, places = _labelled(operands)
+    pool, places = _label_entries(operands)
 
     def result(unit: jax.Array) -> jax.Array:
         data = [unit[a.astype(int)] if a.dtype == float else jnp.asarray(a) for a in places]
         return equation.primitive.bind(*data, **equation.params)
 
     weights = np.asarray(jax.vmap(result)(jnp.eye(len(pool))))
-    total = np.full(weights.shape[1:], number(0.0), object)
+    total = np.full(weights.shape[1:], constant(0.0), object)
     for entry, weight in zip(pool, weights, strict=True):
-        total = total + each(lambda w, p=entry: number(w) * p if w else number(0.0), weight)
+        total = total + each(lambda w, p=entry: constant(w) * p if w else constant(0.0), weight)
     return total
 
 
-def _labelled(operands: Sequence[np.ndarray]) -> tuple[list[Any], list[np.ndarray]]:
+def _label_entries(operands: Sequence[np.ndarray]) -> tuple[list[Any], list[np.ndarray]]:
     """Return all data entries in a row, and the operands with each entry's place in that row."""
     pool: list[Any] = []
     places = []
@@ -107,7 +198,34 @@ def _labelled(operands: Sequence[np.ndarray]) -> tuple[list[Any], list[np.ndarra
     return pool, places
 
 
-def dot(params: Mapping[str, Any], a: np.ndarray, b: np.ndarray, zero: Any) -> np.ndarray:
+def entrywise(function: Callable[..., object]) -> Rule:
+    """Return the rule of a function of entries, which the primitive's parameters do not change."""
+    return lambda params, *arrays: each(function, *arrays)
+
+
+def reduction(join: Callable[[Any, Any], Any], of_none: Any) -> Rule:
+    """Return the rule that joins entries along axes two by two, the last axis first.
+
+    `of_none`, what no entries make, takes no part where there are some: a solver would carry it
+    along in every expression.
+    """
+    joined = np.frompyfunc(join, 2, 1)
+
+    def reduce(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+        for axis in sorted(params["axes"], reverse=True):
+            begin = {} if x.shape[axis] else {"initial": of_none}
+            x = np.asarray(joined.reduce(x, axis=axis, **begin), object)
+        return x
+
+    return reduce
+
+
+def dot(zero: Any) -> Rule:
+    """Return the rule of `dot_general`, sums of products that begin at `zero`."""
+    return functools.partial(_dot, zero)
+
+
+def _dot(zero: Any, params: Mapping[str, Any], a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the sum of products over contracted axes, batch axes first."""
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     left, batch, rows = _matrix_form(a, batch_a, contract_a)
@@ -148,7 +266,13 @@ def _slice(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     return x[tuple(slice(*cut) for cut in zip(starts, ends, steps, strict=True))]
 
 
-MOVES: dict[str, Move] = {
+COMMON: dict[str, Rule] = {
+    "add": entrywise(operator.add),
+    "add_any": entrywise(operator.add),
+    "sub": entrywise(operator.sub),
+    "mul": entrywise(operator.mul),
+    "neg": entrywise(operator.neg),
+    "square": entrywise(lambda entry: entry * entry),
     "broadcast_in_dim": _broadcast,
     "slice": _slice,
     "reshape": lambda params, x: x.reshape(params["new_sizes"]),
@@ -161,4 +285,4 @@ MOVES: dict[str, Move] = {
         for name in ("copy", "copy_p", "reduce_precision", "stop_gradient")
     },
 }
-"""What NumPy does to entries of any kind."""
+"""What Python's operators and NumPy's moves do to entries of any kind."""

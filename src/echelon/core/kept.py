@@ -1,60 +1,65 @@
-"""What was computed is kept for as long as the process lives: pure functions of plain values."""
+"""What is computed once and then kept, since JAX compiles for every new function."""
 
 import dataclasses
 import functools
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
-from typing import Any, ParamSpec, TypeVar
+from collections.abc import Callable, Hashable
+from typing import Any, ParamSpec, TypeVar, final
 
 import jax
 import numpy as np
 
-_MOST = 64
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
+_MOST = 256
+"""Answers remembered of each function: a sweep over parameters must not fill the memory."""
+
 
 def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Return a pure function that remembers its last 64 answers, which nobody may change.
+    """Return a function that computes once for all arguments of the same classes and values.
 
-    Arguments are compared by value, arrays and models to the bit; where one has no value that can
-    be compared, the answer is computed each time.
+    They are compared bit by bit, since arrays may be changed in place and their identity says
+    nothing. What cannot be hashed is computed for anew each time. What is returned is shared
+    between callers, so it must be read-only.
     """
-    answers: OrderedDict[Hashable, _R] = OrderedDict()
+
+    @functools.lru_cache(_MOST)
+    def answer(call: "_Call") -> _R:
+        return function(*call.args, **call.named)
 
     @functools.wraps(function)
-    def remember(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+    def once(*args: _P.args, **named: _P.kwargs) -> _R:
+        call = _Call(_identify((args, tuple(named.items()))), args, named)
         try:
-            # The precision decides what a traced function computes.
-            key = (jax.config.jax_enable_x64, value_of(args), value_of(kwargs))  # pyright: ignore
+            hash(call)
         except TypeError:
-            return function(*args, **kwargs)
-        if key not in answers:
-            answers[key] = function(*args, **kwargs)
-        answers.move_to_end(key)
-        while len(answers) > _MOST:
-            answers.popitem(last=False)
-        return answers[key]
+            return function(*args, **named)
+        return answer(call)
 
-    return remember
+    return once
 
 
-def value_of(thing: Any) -> Hashable:
-    """Return what stands for a value in a comparison: equal keys are of equal values.
+@final
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """Arguments, equal to others where the class and the value of each part are."""
 
-    Raises:
-        TypeError: it holds something that cannot be compared by value.
-    """
-    if isinstance(thing, np.ndarray | jax.Array):
-        array = np.asarray(thing)
-        return (array.shape, array.dtype.str, array.tobytes())
-    if isinstance(thing, Mapping):
-        return tuple((key, value_of(value)) for key, value in thing.items())
-    if isinstance(thing, tuple | list):
-        return (type(thing), *map(value_of, thing))
-    if dataclasses.is_dataclass(thing) and not isinstance(thing, type):
-        fields = dataclasses.fields(thing)
-        return (type(thing), *(value_of(getattr(thing, field.name)) for field in fields))
-    hash(thing)
-    # In hexadecimal -0.0 is not 0.0; the type keeps 1 apart from True.
-    return (type(thing), thing.hex() if isinstance(thing, float) else thing)
+    value: Hashable
+    args: tuple[Any, ...] = dataclasses.field(compare=False)
+    named: dict[str, Any] = dataclasses.field(compare=False)
+
+
+def _identify(value: Any) -> Any:
+    """Return what is equal, and hashable, for values of the same types and bits alone."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return type(value), tuple(_identify(getattr(value, field.name)) for field in fields)
+    if isinstance(value, tuple | list):
+        return type(value), tuple(map(_identify, value))
+    # Numbers by their bytes too, since 0.0 equals -0.0, and NaN not itself.
+    if isinstance(value, float | complex | np.ndarray | jax.Array):
+        array = np.asarray(value)
+        # Those of objects would be addresses, which say nothing of what stands there.
+        if not array.dtype.hasobject:
+            return type(value), array.dtype.str, array.shape, array.tobytes()
+    return type(value), value

@@ -1,9 +1,9 @@
 """A polytope of matrices that provably contains every Jacobian of a model on a box.
 
-The Jacobian is traced and evaluated in exact polynomial arithmetic (`_hull_trace`, `_hull_rules`,
-`_hull_algebra`); each entry is affine in the coordinates of every atom (a variable's powers, an
-angle's waves), each atom lies in a polygon with rational vertices (`_hull_curves`), and so the
-products of these vertices hold every value.
+The Jacobian is traced and evaluated in exact polynomial arithmetic (`rules`, `polynomial`); each
+entry is affine in the coordinates of every atom (a variable's powers, an angle's waves), each atom
+lies in a polygon with rational vertices (`curves`), and so the products of these vertices hold
+every value.
 """
 
 import math
@@ -12,11 +12,10 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import GainError
-from echelon.core.numerics import precision
+from echelon.core.jaxpr import evaluate
 from echelon.core.types import Array
 from echelon.enclosure.interval import Interval
 from echelon.enclosure.polynomial import (
@@ -27,7 +26,7 @@ from echelon.enclosure.polynomial import (
     check_count,
     corner_values,
 )
-from echelon.enclosure.trace import evaluate
+from echelon.enclosure.rules import polynomials
 
 
 class Box(NamedTuple):
@@ -96,9 +95,7 @@ def jacobian_hull(
     for k, (low, high) in enumerate(bounds):
         interval = Interval(Fraction(float(low)), Fraction(float(high)))
         variables[k] = atoms.variable(called[k], interval)
-    with precision("float64"):
-        closed = jax.make_jaxpr(jacobian)(jnp.zeros(n), jnp.zeros(m))
-        results = evaluate(closed, [variables[:n], variables[n:]], atoms)
+    results = evaluate(jacobian, [variables[:n], variables[n:]], polynomials(atoms))
     if len(results) != 1 or results[0].ndim != 2 or results[0].dtype != object:
         raise GainError("`jacobian` must return one matrix of floats.")
     return _hull_of(results[0], atoms)

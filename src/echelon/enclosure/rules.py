@@ -1,6 +1,7 @@
 """What JAX's primitives mean for arrays of polynomials: one rule each.
 
-A comparison that the box does not decide is None.
+An array of floats is an array of `Polynomial`, integers and booleans stay numbers, and a comparison
+that the box does not decide is None.
 """
 
 import functools
@@ -13,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import dot, each
+from echelon.core.jaxpr import Algebra, compute, dot, each, reduction
 from echelon.enclosure.interval import ELEMENTARY, Interval
 from echelon.enclosure.polynomial import Atoms, Polynomial, constant
 
@@ -21,13 +22,51 @@ Rule: TypeAlias = Callable[..., np.ndarray]
 """(atoms, parameters of the primitive, operands) -> result."""
 
 
+def polynomials(atoms: Atoms) -> Algebra:
+    """Return the algebra of polynomials in atoms; the walk adds to these what it needs.
+
+    Evaluating in it raises `GainError` at a primitive that has no rule, or is outside of its
+    domain, and at a constant that is complex or not finite.
+    """
+    bound = {name: functools.partial(rule, atoms) for name, rule in RULES.items()}
+    return Algebra({**bound, **_SUMS}, constant, _lift, _outside, _fold)
+
+
+def _lift(array: np.ndarray) -> np.ndarray:
+    """Return floats as constant polynomials, each taken exactly, and anything else as it is."""
+    if array.dtype.kind in "biu":
+        return array
+    if array.dtype.kind == "c":
+        raise GainError("the Jacobian of the model is complex, and must be real.")
+    numbers = array.astype(np.float64)
+    if not np.isfinite(numbers).all():
+        raise GainError("the Jacobian of the model holds a constant that is not finite.")
+    return each(constant, numbers)
+
+
+def _outside() -> object:
+    raise GainError("the Jacobian of the model reads outside of an array.")
+
+
+def _fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+    """Return what an unknown primitive makes of parameters alone, in float64: parameters again."""
+    values = [each(number, a) if a.dtype == object else a for a in operands]
+    if any(v is None for a in values for v in a.flat):
+        raise GainError(
+            f"the Jacobian of the model uses `{equation.primitive.name}`, which the hull of "
+            "Jacobians does not know; allowed are arithmetic, powers, trigonometric and hyperbolic "
+            "functions, exponentials, logarithms, absolute values and choices by `where`."
+        )
+    numbers = [np.asarray(a, np.float64) if a.dtype == object else a for a in values]
+    return [_lift(a) for a in compute(equation, numbers)]
+
+
+# ---- the rules -----------------------------------------------------------------------------------
+
+
 def number(p: object) -> Fraction | None:
     """Return the number that an entry is, else None."""
     return p.value() if isinstance(p, Polynomial) else None
-
-
-def _arithmetic(function: Callable[..., object]) -> Rule:
-    return lambda atoms, params, *arrays: each(function, *arrays)
 
 
 def _function(function: Callable[..., object]) -> Rule:
@@ -179,20 +218,8 @@ def _as_number(atoms: Atoms, answer: bool | None) -> Polynomial:
     return constant(int(answer))
 
 
-def _reduction(function: np.ufunc, start: int) -> Rule:
-    return lambda atoms, params, x: np.asarray(
-        function.reduce(x, axis=tuple(params["axes"]), initial=constant(start)), object
-    )
-
-
 RULES: dict[str, Rule] = {
     **{name: _elementary(name) for name in ELEMENTARY if name not in ("reciprocal", "abs")},
-    "add": _arithmetic(operator.add),
-    "add_any": _arithmetic(operator.add),
-    "sub": _arithmetic(operator.sub),
-    "mul": _arithmetic(operator.mul),
-    "neg": _arithmetic(operator.neg),
-    "square": _arithmetic(lambda p: p * p),
     "div": _function(_quotient),
     "integer_pow": lambda atoms, params, x: each(lambda p: _whole_power(atoms, p, params["y"]), x),
     "pow": _function(_power),
@@ -215,8 +242,11 @@ RULES: dict[str, Rule] = {
     "not": _logic(_not),
     "select_n": _function(_chosen),
     "convert_element_type": _convert,
-    "dot_general": lambda atoms, params, a, b: dot(params, a, b, constant(0)),
-    "reduce_sum": _reduction(np.add, 0),
-    "reduce_prod": _reduction(np.multiply, 1),
 }
-"""What each primitive of JAX means for polynomials."""
+"""What each primitive of JAX means for polynomials, beyond what the walk itself knows."""
+
+_SUMS = {
+    "dot_general": dot(constant(0)),
+    "reduce_sum": reduction(operator.add, constant(0)),
+    "reduce_prod": reduction(operator.mul, constant(1)),
+}

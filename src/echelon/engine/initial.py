@@ -73,13 +73,8 @@ def _checked(values: object, shape: tuple[int, ...], what: str, meaning: str) ->
 
 
 def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
-    """Return one number a state, (n,), from numbers by state or group.
-
-    A state's own number wins over its group's.
-    """
-    values = np.zeros(len(model.state_names))
-    for name in sorted(named, key=lambda name: name in model.state_names):
-        if not np.isfinite(named[name]):
-            raise SimulationError(f"the {what} of `{name}` is {named[name]}, and must be finite.")
-        values[list(model.states_called(name))] = named[name]
-    return values
+    """Return one finite number a state, (n,), from numbers by state or group."""
+    for name, value in named.items():
+        if not np.isfinite(value):
+            raise SimulationError(f"the {what} of `{name}` is {value}, and must be finite.")
+    return model.per_state(named)

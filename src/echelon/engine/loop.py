@@ -177,9 +177,8 @@ def _broadcast(loop: Loop, x: States, u: Inputs) -> jax.Array:
     """Return what agents at x (K, n) with delivered inputs u (K, m) send to followers."""
     if loop.follower.feedforward is Feedforward.NONE:
         return jnp.zeros_like(u)
-    return jax.vmap(loop.follower.broadcast, in_axes=(None, 0, 0))(
-        loop.model, x, loop.meter.normalize(u)
-    )
+    v = loop.model.normalized(u)
+    return jax.vmap(loop.follower.broadcast, in_axes=(None, 0, 0))(loop.model, x, v)
 
 
 def step(loop: Loop, now: Moment, acted: Control) -> Moment:

@@ -68,7 +68,6 @@ class Meter(eqx.Module):
     leaders: Array
     edges: Array
     spacings: Array
-    normalizer: Array
     first_steady: Array
     measured: tuple[int, ...] = eqx.field(static=True)
 
@@ -87,7 +86,6 @@ class Meter(eqx.Module):
             leaders=np.array(graph.leaders),
             edges=graph.edges,
             spacings=np.linalg.norm(goals[i] - goals[j], axis=1),
-            normalizer=np.linalg.inv(np.asarray(model.input_scale, float)),
             first_steady=np.asarray(settings.first_steady, np.int32),
             measured=measured,
         )
@@ -128,7 +126,7 @@ class Meter(eqx.Module):
         y = states - jnp.asarray(self.offsets, states.dtype)
         squares = self._lengths(y - y[self.nearest])
         tracking, outputs = self._tracking(y[self.leaders], reference)
-        v = self.normalize(inputs)
+        v = self.model.normalized(inputs)
         last = jnp.where(jnp.sqrt(squares) <= SETTLED, -1, step)
         return Sums(
             steps=twice.astype(jnp.int32),
@@ -160,11 +158,6 @@ class Meter(eqx.Module):
         wanted = reference[None] + offsets
         away = jax.vmap(lambda x, r: output_error(self.model, x, r))(states + offsets, wanted)
         return self._lengths(states - reference[None]), away * away
-
-    def normalize(self, inputs: Inputs) -> jax.Array:
-        """Return the normalized inputs (K, m) of physical ones."""
-        trim = jnp.asarray(np.asarray(self.model.trim[1], float), inputs.dtype)
-        return (inputs - trim[None]) @ jnp.asarray(self.normalizer, inputs.dtype).T
 
     def _spacing(self, states: States) -> jax.Array:
         """Return the squared errors of the distances along the edges, (E,)."""

@@ -11,7 +11,6 @@ import numpy as np
 from echelon.certificates.certificate import Certificate, RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError, OutputError
-from echelon.core.numerics import precision
 from echelon.core.types import Array, PathLike
 from echelon.core.words import Kind, Theorem
 from echelon.gains.gain import Gain
@@ -54,8 +53,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
 
 
 def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
-    with precision("float64"):
-        linear = linearize(model)
+    linear = linearize(model)
     return {
         "class": f"{type(model).__module__}:{type(model).__qualname__}",
         "parameters": _parameters(model),
@@ -213,8 +211,7 @@ def _region(stored: Mapping[str, Any]) -> RegionCertificate:
 
 def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine) -> None:
     """Check that the model is the one that the gain was made for, near its trim."""
-    with precision("float64"):
-        linear = linearize(model)
+    linear = linearize(model)
     name, made_for = f"`{type(model).__name__}`", str(stored["class"]).rpartition(":")[2]
     for what, ours in (("state_names", model.state_names), ("input_names", model.input_names)):
         if tuple(stored[what]) != tuple(ours):

@@ -142,7 +142,7 @@ class Method(eqx.Module):
         edge = None if rho is None else rho / (2.0 * spectrum.low)
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
         promised = None if region is None else region(coupling, spectrum)
-        closed = linear.closed(inner)
+        closed = linear.with_inner(inner)
         certificate = certify(closed, spectrum, P, R, coupling, edge, promised)
         return Gain(P, R, coupling, self.name, certificate, inner)
 

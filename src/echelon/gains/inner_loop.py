@@ -55,7 +55,7 @@ class InnerLoop(Method):
                 "has nothing to leave alone; use `monotone` or `riccati`."
             )
         K = self._feedback(model, linear, fixed)
-        P = _monotone(model, linear.closed(K).A, fixed, self._weights(model, len(fixed)))
+        P = _monotone(model, linear.with_inner(K).A, fixed, self._weights(model, len(fixed)))
         return Feedback(P, np.eye(len(model.input_names)), rho=0.0, inner=K)
 
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:

@@ -12,7 +12,7 @@ from echelon.network.graph import Graph
 
 def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
     """Return a sentence on ||T||_inf along the branch that amplifies most (theory page, T4)."""
-    A, B = linearize(model).closed(gain.inner)
+    A, B = linearize(model).with_inner(gain.inner)
     depth, parents = graph.depths(), graph.parents()
     i, j = graph.edges.T
     weight = np.ones(graph.agents)

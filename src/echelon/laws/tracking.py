@@ -16,7 +16,7 @@ from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-from echelon.references.flatness import check_flat
+from echelon.references.flatness import check_flat, follow, follow_at
 from echelon.references.reference import Reference
 
 
@@ -53,7 +53,8 @@ class Tracking(Law):
         if gain is not self.gain or gain.coupling != 1.0:
             unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
             law = Tracking(self.reference, unit, self.reaction)
-        if not all(np.isfinite(part).all() for part in _targets(law, model, jnp.zeros(1))):
+        begin = follow_at(model, self.reference, jnp.zeros(1))
+        if not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
                 f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
@@ -62,15 +63,15 @@ class Tracking(Law):
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
-        return model.flat(self.reference.derivatives(t, model.flat_order, model.flat_outputs))
+        return follow(model, self.reference, t)
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""
-        return _targets(self, model, jnp.zeros(1))[0][0]
+        return follow_at(model, self.reference, jnp.zeros(1))[0][0]
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return x_r at each of `times`, (T, n)."""
-        return _targets(self, model, times)[0]
+        return follow_at(model, self.reference, times)[0]
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""
@@ -82,9 +83,3 @@ class Tracking(Law):
         if self.reaction is not None:
             v = v + feedback(self.reaction, model, view.x, view.disagreement)
         return u - model.physical(v, trim=False), memory
-
-
-@eqx.filter_jit
-def _targets(law: Tracking, model: ControlAffine, times: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return x_r (T, n) and u_r (T, m) at each of `times`."""
-    return jax.vmap(lambda t: law.target(model, t))(times)

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.kept import kept
+from echelon.core.numerics import precision
 from echelon.core.types import Array, State
 from echelon.models.model import ControlAffine
 
@@ -17,16 +19,24 @@ class Linearization(NamedTuple):
     A: Array
     B: Array
 
-    def closed(self, K: Array | None) -> "Linearization":
-        """Return the same with an inner loop v = -K (x - x*) closed, K (m, n); None is none."""
+    def with_inner(self, K: Array | None) -> "Linearization":
+        """Return A - B K and B, the system with the inner loop v = -K (x - x*) + w closed.
+
+        Args:
+            K: (m, n); None where there is no inner loop.
+        """
         return self if K is None else Linearization(self.A - self.B @ K, self.B)
 
 
+@kept
 def linearize(model: ControlAffine) -> Linearization:
-    """Return A = d(f + g u*)/dx and B = g S at the trim."""
-    x = jnp.asarray(np.asarray(model.trim[0], float))
-    A, B = _slopes(model, x)
-    return Linearization(np.asarray(A, np.float64), np.asarray(B, np.float64))
+    """Return A = d(f + g u*)/dx and B = g S at the trim, read-only.
+
+    They are computed once for a model, in float64 whatever the caller's precision.
+    """
+    with precision("float64"):
+        A, B = _slopes(model, jnp.asarray(np.asarray(model.trim[0], float)))
+    return Linearization(_freeze(A), _freeze(B))
 
 
 @eqx.filter_jit
@@ -34,14 +44,22 @@ def _slopes(model: ControlAffine, x: State) -> tuple[jax.Array, jax.Array]:
     return jax.jacfwd(model.normalized_drift)(x), model.normalized_input_map(x)
 
 
+@kept
 def trim_slopes(model: ControlAffine) -> Array:
-    """Return u*_k dg_k/dx at the trim, (m, n, n): what each trim input puts into A."""
-    x = jnp.asarray(np.asarray(model.trim[0], float))
+    """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: what each trim input puts into A."""
+    with precision("float64"):
+        slopes = _input_slopes(model, jnp.asarray(np.asarray(model.trim[0], float)))
     u = np.asarray(model.trim[1], np.float64)
-    slopes = np.moveaxis(np.asarray(_input_slopes(model, x), np.float64), 1, 0)
-    return u[:, None, None] * slopes
+    return _freeze(u[:, None, None] * np.moveaxis(np.asarray(slopes), 1, 0))
 
 
 @eqx.filter_jit
 def _input_slopes(model: ControlAffine, x: State) -> jax.Array:
     return jax.jacfwd(model.input_map)(x)
+
+
+def _freeze(values: jax.Array | Array) -> Array:
+    """Return a float64 copy that nobody can write to, since many callers share it."""
+    array = np.array(values, np.float64)
+    array.setflags(write=False)
+    return array

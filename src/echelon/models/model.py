@@ -11,7 +11,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
@@ -19,6 +21,7 @@ from echelon.core.types import Input, InputMap, Output, State
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
 _T = TypeVar("_T")
+_Inputs = TypeVar("_Inputs", jax.Array, np.ndarray)
 
 
 class _Default(Generic[_T]):
@@ -173,10 +176,22 @@ class ControlAffine(eqx.Module):
         """Return g(x) S, the input map of the normalized input."""
         return self.input_map(x) @ jnp.asarray(self.input_scale, x.dtype)
 
-    def physical(self, v: Input, trim: bool = True) -> Input:
-        """Return u = u* + S v, or S v without the trim."""
-        u = jnp.asarray(self.input_scale, v.dtype) @ v
-        return u + jnp.asarray(self.trim[1], v.dtype) if trim else u
+    def physical(self, v: _Inputs, trim: bool = True) -> _Inputs:
+        """Return u = u* + S v of normalized inputs (..., m), NumPy's or JAX's, in their precision.
+
+        Without the trim it is S v, what an input is changed by.
+        """
+        xp = v.__array_namespace__()
+        u = v @ xp.asarray(self.input_scale, v.dtype).T
+        return u + _rest(self, u) if trim else u
+
+    def normalized(self, u: _Inputs) -> _Inputs:
+        """Return v = S^-1 (u - u*) of physical inputs (..., m), NumPy's or JAX's."""
+        xp = u.__array_namespace__()
+        # A constant wherever S is one, so that neither a step nor a solver's expression inverts it.
+        with jax.ensure_compile_time_eval():
+            inverse = xp.linalg.inv(xp.asarray(self.input_scale, u.dtype))
+        return (u - _rest(self, u)) @ inverse.T
 
     def position_indices(self) -> tuple[int, ...]:
         """Return the places of `position` in the state."""
@@ -197,6 +212,26 @@ class ControlAffine(eqx.Module):
             f"`{name}` is no state or group of `{type(self).__name__}`, "
             f"which has {listing(allowed)}{did_you_mean(name, allowed)}."
         )
+
+    def per_state(self, named: Mapping[str, float], otherwise: float = 0.0) -> np.ndarray:
+        """Return a number for each state, (n,), from numbers by state or group of states.
+
+        A state's own number wins over its group's. States that are not named have `otherwise`.
+
+        Raises:
+            ModelError: the model has neither a state nor a group of a name.
+        """
+        values = np.full(len(self.state_names), float(otherwise))
+        # Groups come first, whatever the order of the mapping, and states write over them.
+        for name in sorted(named, key=lambda name: name in self.state_names):
+            values[list(self.states_called(name))] = named[name]
+        return values
+
+
+def _rest(model: ControlAffine, u: _Inputs) -> _Inputs:
+    """Return u* in the shape (..., m) and precision of u."""
+    xp = u.__array_namespace__()
+    return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
 
 
 def positive(owner: object, **values: float) -> None:

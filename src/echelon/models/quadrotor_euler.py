@@ -6,13 +6,11 @@ input. Gains made for these agents say what formation laws can promise above suc
 
 import math
 
-import jax
 import jax.numpy as jnp
 
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import InputMap, Output, State
 from echelon.models.model import ControlAffine, positive
-from echelon.models.quadrotor import Quadrotor
-from echelon.models.rigid_body import body_rates, euler_rates, free_spin, thrust_axis
+from echelon.models.rigid_body import thrust_axis
 
 _GROUPS = {
     "position": ("x", "y", "z"),
@@ -104,19 +102,3 @@ class QuadrotorThrust(ControlAffine):
     def output(self, x: State) -> Output:
         """Return position and yaw."""
         return jnp.concatenate([x[:3], x[8:9]])
-
-
-def computed_torque(model: Quadrotor, x: State, v: Input) -> Input:
-    """Return the thrust and torques of a quadrotor that realize an input of `QuadrotorEuler`.
-
-    Args:
-        model: the vehicle.
-        x: its state (12,), with body rates.
-        v: (thrust over mass minus gravity, Euler-angle accelerations), (4,).
-    """
-    zeta, omega = x[6:9], x[9:12]
-    zeta_dot = euler_rates(zeta, omega)
-    # omega = W(zeta)^-1 zetadot, differentiated along (zetadot, zetaddot).
-    _, omega_dot = jax.jvp(body_rates, (zeta, zeta_dot), (zeta_dot, v[1:]))
-    torque = jnp.asarray(model.inertia, x.dtype) * (omega_dot - free_spin(model.inertia, omega))
-    return jnp.concatenate([(model.mass * (model.gravity + v[0]))[None], torque])

@@ -149,10 +149,6 @@ class Formation:
         i, j = graph.edges.T
         return np.linalg.norm(self.offsets[j] - self.offsets[i], axis=1)
 
-    def local_displacements(self, graph: Graph) -> Array:
-        """Return d_i = sum_j A_ij d_ij for each agent, (N, n), so that z = e + d."""
-        return -(graph.laplacian() @ self.offsets)
-
     def rigidity_matrix(self, model: ControlAffine, graph: Graph) -> Array:
         """Return the rigidity matrix (E, N dim).
 

@@ -268,12 +268,6 @@ class Graph:
         """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""
         return self.exchange()(y, y)
 
-    def relabelled(self, order: Sequence[int]) -> "Graph":
-        """Return the same graph with agent i renamed to order[i]."""
-        renamed = np.asarray(order)
-        edges = np.column_stack([renamed[self.edges], self.weights])
-        return Graph(edges.tolist(), renamed[list(self.leaders)].tolist(), self.agents)
-
     def __eq__(self, other: object) -> bool:
         """Tell whether two graphs have the same agents, leaders and edges in the same order."""
         return (

@@ -15,13 +15,12 @@ from echelon.engine.drive import Drive, Information, Problem, Stepper
 from echelon.engine.host import HostStepper, Stopped
 from echelon.engine.settings import Settings
 from echelon.engine.work import SolverStats, solver_stats
-from echelon.models.inputs import physical
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph, shares
 from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import flat_states, reference_targets, reference_warnings
+from echelon.references.flatness import follow_at, reference_targets, reference_warnings
 from echelon.references.reference import Reference
 
 _SETTLING = 20
@@ -60,7 +59,7 @@ class _Optimized(Drive):
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
         """Return the reference's states (T, n); None without a reference."""
-        return None if self.reference is None else flat_states(model, self.reference, times)
+        return None if self.reference is None else follow_at(model, self.reference, times)[0]
 
 
 @final
@@ -184,7 +183,7 @@ class _Pilots:
             course = self._course(agent, states[agent], targets)
             self.courses[agent] = course
             inputs[agent] = course.inputs[0]
-        return physical(self.problem.model, inputs)
+        return self.problem.model.physical(inputs)
 
     def _targets(self, agent: int, earlier: tuple[int, ...], share: Array, period: int) -> Course:
         """Return what an agent follows: the reference, or the mean of what its neighbours plan."""

@@ -7,7 +7,6 @@ import numpy as np
 
 from echelon.core.errors import PlanError
 from echelon.core.types import Array
-from echelon.models.inputs import normalized, physical
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph, shares
@@ -127,7 +126,7 @@ def _beside(
 ) -> Targets:
     """Return the targets that the plans of earlier neighbours leave an agent."""
     states = np.stack([p.states - formation.displacement(agent, j) for j, p in plans.items()])
-    inputs = np.stack([normalized(model, p.inputs) for p in plans.values()])
+    inputs = np.stack([model.normalized(p.inputs) for p in plans.values()])
     last = np.concatenate([inputs, inputs[:, -1:]], axis=1)
     return mean_targets(model, states, last, shares(graph, agent, tuple(plans)))
 
@@ -212,7 +211,7 @@ class _Desk:
         # Standing where the targets are, but for the start, is near the solution.
         near = (
             np.vstack([start, targets.states[1:]]),
-            physical(self.model, targets.inputs[:-1]),
+            self.model.physical(targets.inputs[:-1]),
         )
         plan = self._attempt(agent, coarsely, start, known, targets, near, 1.0)
         for factor in () if plan.solved else _EASIER:

@@ -245,9 +245,10 @@ def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple
     """
     ca, n, m = casadi(), len(model.state_names), len(model.input_names)
     x, v = ca.SX.sym("x", n), ca.SX.sym("v", m)
-    field = casadi_function("velocity", model.velocity, n, m, owner=type(model).__name__)
-    trim, scale = ca.DM(np.array(model.trim[1])), ca.DM(np.array(model.input_scale))
-    after = rk4(field, x, trim + scale @ v, dt)
+    owner = type(model).__name__
+    field = casadi_function("velocity", model.velocity, n, m, owner=owner)
+    physical = casadi_function("physical", model.physical, m, owner=owner)
+    after = rk4(field, x, physical(v), dt)
     flow = ca.Function("flow", [x, v], [after])
     slopes = ca.Function("slopes", [x, v], [after, ca.jacobian(after, x), ca.jacobian(after, v)])
     X, V = ca.MX.sym("X", n, steps), ca.MX.sym("V", m, steps)

@@ -22,7 +22,7 @@ from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import flat_states, reference_targets, reference_warnings
+from echelon.references.flatness import follow, follow_at, reference_targets, reference_warnings
 from echelon.references.reference import Reference
 
 _STEP = 0.005
@@ -90,10 +90,7 @@ class OptimalTracking(Law):
         check_gain_fits(self, model, gain.P.shape, gain.R.shape)
         times = grid(self.horizon, _STEP, self.planning.interval)
         targets = reference_targets(model, self.reference, times.times)
-        start = np.array(targets.states[0])
-        for name, error in sorted(self.start_error, key=lambda e: e[0] in model.state_names):
-            places = list(model.states_called(name))
-            start[places] = targets.states[0][places] + error
+        start = targets.states[0] + model.per_state(dict(self.start_error))
         plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
         unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
         return eqx.tree_at(
@@ -117,8 +114,8 @@ class OptimalTracking(Law):
             raise LawError(
                 "`OptimalTracking` has no plan yet; call `prepared(model, graph)` first."
             )
-        follow = model.flat(self.reference.derivatives(t, model.flat_order, model.flat_outputs))
-        dtype, count = follow[0].dtype, len(self.inputs)
+        x_r, u_r = follow(model, self.reference, t)
+        dtype, count = x_r.dtype, len(self.inputs)
         span = grid(self.horizon, _STEP, self.planning.interval).interval
         # A time that rounding has left just before an interval belongs to it.
         k = jnp.floor(t / span + 1e-4).astype(jnp.int32)
@@ -129,7 +126,7 @@ class OptimalTracking(Law):
             0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
         )
         planned = k < count
-        return jnp.where(planned, x, follow[0]), jnp.where(planned, u, follow[1])
+        return jnp.where(planned, x, x_r), jnp.where(planned, u, u_r)
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""
@@ -137,7 +134,7 @@ class OptimalTracking(Law):
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return the reference's states (T, n), which the plan comes close to."""
-        return flat_states(model, self.reference, times)
+        return follow_at(model, self.reference, times)[0]
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""

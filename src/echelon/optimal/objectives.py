@@ -173,12 +173,10 @@ def spacing(
 
 def _spending(model: ControlAffine) -> Any:
     """Return the cost of an input u given (its target's normalized input, factor)."""
-    inverse, R = np.linalg.inv(np.asarray(model.input_scale, float)), np.asarray(model.weights[1])
-    trim = np.asarray(model.trim[1], float)
+    R = np.asarray(model.weights[1])
 
     def spent(u: jax.Array, p: jax.Array) -> jax.Array:
-        v = jnp.asarray(inverse, u.dtype) @ (u - jnp.asarray(trim, u.dtype))
-        d = v - p[:-1]
+        d = model.normalized(u) - p[:-1]
         return p[-1] * jnp.sum(jnp.asarray(R, u.dtype) * d * d)
 
     return spent

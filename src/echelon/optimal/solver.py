@@ -202,8 +202,7 @@ class Solver:
             states, inputs = guess
         states = _numbers("guess.states", states, shapes[0])
         inputs = _numbers("guess.inputs", inputs, shapes[1])
-        v = np.linalg.solve(_scale(problem), (inputs - np.array(problem.model.trim[1])).T).T
-        N = problem.steps
+        v, N = problem.model.normalized(inputs), problem.steps
         body = np.hstack([states[:N], v[:N]]).ravel()
         return {"x0": np.concatenate([body, states[N], v[N:].ravel()]), **multipliers}
 
@@ -222,7 +221,7 @@ class Solver:
         return Trajectory(
             times=problem.dt * np.arange(N + 1),
             states=np.vstack([body[:, :n], tail[:n]]),
-            inputs=np.array(problem.model.trim[1]) + v @ _scale(problem).T,
+            inputs=problem.model.physical(v),
             cost=float(solution["f"]),
             solved=solved,
             message=_message(self.solver, status, solved, least or missed, bool(least)),
@@ -259,10 +258,6 @@ def solve(
         EchelonError: the model, the problem or its data is malformed, or casadi is missing.
     """
     return Solver(problem, solver, options).solve(start, parameters, guess)
-
-
-def _scale(problem: OptimalControl) -> Array:
-    return np.array(problem.model.input_scale)
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...], repeat: bool = False) -> Array:

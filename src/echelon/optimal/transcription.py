@@ -12,7 +12,6 @@ import numpy as np
 from echelon.core.errors import PlanError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array
-from echelon.models.model import ControlAffine
 from echelon.optimal.casadi import casadi, casadi_function
 from echelon.optimal.problem import Constraint, OptimalControl
 
@@ -106,8 +105,9 @@ def _parts(problem: OptimalControl) -> _Parts:
     n, m, k = len(model.state_names), len(model.input_names), problem.parameters
     x, v, y, w = (ca.SX.sym(c, size) for c, size in (("x", n), ("v", m), ("y", n), ("w", m)))
     p = ca.SX.sym("p", k)
-    u = _physical(model, v)
     field = casadi_function("velocity", model.velocity, n, m, owner=owner)
+    physical = casadi_function("physical", model.physical, m, owner=owner)
+    u = physical(v)
     stage = _scalar("stage", casadi_function("stage", problem.stage, n, m, k))
     terminal = _scalar("terminal", casadi_function("terminal", problem.terminal, n, k))
     matrix = problem.bounds.matrix if problem.bounds else np.zeros((0, m))
@@ -120,7 +120,7 @@ def _parts(problem: OptimalControl) -> _Parts:
     if problem.transcription == "shooting":
         gap = y - _flow(field, problem.substeps, problem.dt)(x, u)
     else:
-        gap = y - x - 0.5 * problem.dt * (field(x, u) + field(y, _physical(model, w)))
+        gap = y - x - 0.5 * problem.dt * (field(x, u) + field(y, physical(w)))
     return _Parts(
         ca.Function("move", [x, v, y, w], [gap]),
         ca.Function("stage", [x, v, p], [stage(x, u, p)]),
@@ -138,11 +138,6 @@ def _constraints(problem: OptimalControl) -> list[tuple[Constraint, Any]]:
         (one, casadi_function(f"c{i}", one.function, n, k, owner=one.name))
         for i, one in enumerate(problem.constraints)
     ]
-
-
-def _physical(model: ControlAffine, v: Any) -> Any:
-    ca = casadi()
-    return ca.DM(np.array(model.trim[1])) + ca.DM(np.array(model.input_scale)) @ v
 
 
 def _flow(field: Any, substeps: int, dt: float) -> Callable[[Any, Any], Any]:

@@ -95,7 +95,7 @@ def loop_of(parts: Parts) -> Loop:
     P = np.eye(n) if P is None else P
     if gain is not None:
         R, c, inner = gain.R, gain.coupling, gain.inner
-    linear, modes = linearize(model).closed(inner), modes_of(parts)
+    linear, modes = linearize(model).with_inner(inner), modes_of(parts)
     edge = None if gain is None else _edge(gain, linear, modes.spectrum.low)
     certificate = certify(linear, modes.spectrum, P, R, c, edge)
     values, where = _representatives(modes)

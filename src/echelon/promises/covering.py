@@ -8,7 +8,6 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.engine.result import Result
-from echelon.models.inputs import normalized
 from echelon.promises.promise import Promise
 from echelon.promises.statement import Hypothesis
 
@@ -66,7 +65,7 @@ def first_exit(result: Result, promise: Promise) -> Exit | None:
     x = (result.states - result.formation.offsets)[:, who] - np.asarray(model.trim[0], float)
     found = [_outside(result, x, (domain.lower, domain.upper), who, model.state_names)]
     if local:
-        v = normalized(model, result.inputs[:, leads])
+        v = model.normalized(result.inputs[:, leads])
         box = (domain.input_lower, domain.input_upper)
         found.append(_outside(result, v, box, leads, model.input_names))
     return min((each for each in found if each is not None), default=None)

@@ -1,4 +1,4 @@
-"""What a reference asks of the actuators, before anything is planned or simulated."""
+"""A reference by a model's flatness map: the states and inputs that follow it, and their demand."""
 
 from typing import NamedTuple
 
@@ -9,10 +9,22 @@ import numpy as np
 
 from echelon.core.errors import LawError, PlanError, listing
 from echelon.core.numerics import precision
-from echelon.core.types import Array
-from echelon.models.inputs import normalized
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.models.model import ControlAffine
 from echelon.references.reference import COORDINATES, Reference
+
+
+def follow(model: ControlAffine, reference: Reference, t: Scalar) -> tuple[State, Input]:
+    """Return the state (n,) and input (m,) that follow a reference exactly, at time t (s)."""
+    return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
+
+
+@eqx.filter_jit
+def follow_at(
+    model: ControlAffine, reference: Reference, times: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
+    return jax.vmap(lambda t: follow(model, reference, t))(times)
 
 
 def reference_warnings(
@@ -48,13 +60,7 @@ def reference_warnings(
 def flat_inputs(model: ControlAffine, reference: Reference, times: Array) -> Array:
     """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
     with precision("float64"):
-        return np.asarray(_flat_inputs(model, reference, jnp.asarray(times)))
-
-
-@eqx.filter_jit
-def _flat_inputs(model: ControlAffine, reference: Reference, times: jax.Array) -> jax.Array:
-    order, names = model.flat_order, model.flat_outputs
-    return jax.vmap(lambda t: model.flat(reference.derivatives(t, order, names))[1])(times)
+        return np.asarray(follow_at(model, reference, jnp.asarray(times))[1])
 
 
 def demand(model: ControlAffine, inputs: Array) -> Array:
@@ -100,23 +106,13 @@ def reference_targets(model: ControlAffine, reference: Reference | None, times: 
             f"out of {listing(COORDINATES)}, `flat_order` and `flat`."
         )
     with precision("float64"):
-        x, u = (np.asarray(part) for part in _flat(model, reference, jnp.asarray(times)))
+        x, u = map(np.asarray, follow_at(model, reference, jnp.asarray(times)))
     if not (np.isfinite(x).all() and np.isfinite(u).all()):
         raise PlanError(
             f"the reference `{type(reference).__name__}` cannot be followed by "
             f"`{type(model).__name__}`: its flat state and input are not finite."
         )
-    return _targets(model, x, normalized(model, u))
-
-
-@eqx.filter_jit
-def _flat(
-    model: ControlAffine, reference: Reference, times: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    def at(t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
-
-    return jax.vmap(at)(times)
+    return _targets(model, x, model.normalized(u))
 
 
 def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Targets:
@@ -141,11 +137,6 @@ def _targets(model: ControlAffine, x: Array, v: Array) -> Targets:
 @eqx.filter_jit
 def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
     return jax.vmap(model.output)(states)
-
-
-def flat_states(model: ControlAffine, reference: Reference, times: jax.Array) -> jax.Array:
-    """Return the states (T, n) that follow a reference exactly; times (T,) may be traced."""
-    return _flat(model, reference, times)[0]
 
 
 def check_flat(model: ControlAffine) -> None:

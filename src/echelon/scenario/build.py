@@ -35,8 +35,9 @@ from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.scenario import registry
-from echelon.scenario.scenario import Fault, Scenario, by_line
+from echelon.scenario.scenario import Fault, Scenario, refuse
 from echelon.scenario.sections import GainSpec
+from echelon.scenario.yaml import joined
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import check_plant, varied
 from echelon.world.world import World
@@ -64,14 +65,12 @@ class _Faults:
         except MissingExtraError:
             raise
         except EchelonError as error:
-            self.found.append(
-                Fault(self.scenario.place(*path), ".".join(map(str, path)), str(error))
-            )
+            self.found.append(Fault(self.scenario.place(*path), joined(path), str(error)))
 
     def settle(self) -> None:
         """Raise all that was noted, a line each."""
         if self.found:
-            raise ScenarioError("\n".join(str(fault) for fault in sorted(self.found, key=by_line)))
+            refuse(self.found)
 
 
 def build(scenario: Scenario) -> Built:

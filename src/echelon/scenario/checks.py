@@ -6,18 +6,19 @@ that), so one fault never hides another. Each check yields the path of a fault a
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 from echelon.core.errors import did_you_mean
-from echelon.scenario.registry import DEFAULT_METHOD, GAIN_KEYS, LEADER_LAWS, METHODS
+from echelon.scenario import registry
 from echelon.scenario.yaml import Document, KeyPath, are, shown
 
-Fault = tuple[KeyPath, str]
+Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
-# Of these two keys a section has one at most; True where it must have one.
 _TRACKS = ("tracking", "optimal-tracking")
 """The leader laws that follow a reference."""
 
+# Of these two keys a section has one at most; True where it must have one.
 _SOURCES: dict[str, tuple[str, str, bool]] = {
     "model": ("name", "python", True),
     "graph": ("edges", "name", True),
@@ -27,28 +28,20 @@ _SOURCES: dict[str, tuple[str, str, bool]] = {
 
 # What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
 _Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
-_GRAPH_KEYS: _Taken = {
+_GRAPH_KEYS: _Taken = dict.fromkeys(registry.GRAPHS, (("agents",), ())) | {
     "edges": ((), ("agents",)),
-    "path": (("agents",), ()),
-    "ring": (("agents",), ()),
-    "star": (("agents",), ()),
-    "complete": (("agents",), ()),
     "grid": (("rows", "columns"), ("agents",)),
     "geometric": (("agents", "radius"), ("seed",)),
 }
-_FORMATION_KEYS: _Taken = {
+_FORMATION_KEYS: _Taken = dict.fromkeys(registry.FORMATIONS, ((), ("spacing",))) | {
     "offsets": ((), ()),
-    "triangle": ((), ("spacing",)),
-    "line": ((), ("spacing",)),
-    "wedge": ((), ("spacing",)),
-    "circle": ((), ("spacing",)),
     "grid": ((), ("spacing", "columns")),
 }
-_GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in METHODS.items()}
+_GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in registry.METHODS.items()}
 _GAIN_KEYS["file"] = ((), ())
 
 
-def _section(data: Part, *path: str) -> Part:
+def section(data: Part, *path: str) -> Part:
     """Return the mapping at `path`; an empty one where there is none."""
     for key in path:
         inner = data.get(key)
@@ -70,7 +63,7 @@ def _whole(value: object) -> int | None:
     return value if type(value) is int else None
 
 
-def _infinite(value: object, path: KeyPath) -> Iterator[Fault]:
+def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _infinite(item, (*path, key))
@@ -80,7 +73,7 @@ def _infinite(value: object, path: KeyPath) -> Iterator[Fault]:
         yield path, f"got {shown(value)}, allowed is a finite number."
 
 
-def _sources(data: Part) -> Iterator[Fault]:
+def _sources(data: Part) -> Iterator[Finding]:
     for name, (one, other, required) in _SOURCES.items():
         part = data.get(name)
         if not isinstance(part, dict):
@@ -99,7 +92,7 @@ def _choice(part: Part, free: str) -> object:
     return free if part.get("name") is None else None
 
 
-def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator[Fault]:
+def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator[Finding]:
     """Yield keys that `choice` lacks, and keys that belong to another choice."""
     if not isinstance(choice, str) or choice not in table:
         return
@@ -117,20 +110,21 @@ def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator
             )
 
 
-def _choices(data: Part) -> Iterator[Fault]:
-    graph, formation = _section(data, "graph"), _section(data, "formation")
+def _choices(data: Part) -> Iterator[Finding]:
+    graph, formation = section(data, "graph"), section(data, "formation")
     yield from _taken(("graph",), graph, _choice(graph, "edges"), _GRAPH_KEYS)
     yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
     for role in ("leader", "follower"):
-        gain = _section(data, role, "gain")
+        gain = section(data, role, "gain")
         if gain.get("file") is not None and gain.get("method") is not None:
             yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
-        made_by = "file" if gain.get("file") is not None else gain.get("method", DEFAULT_METHOD)
+        method = gain.get("method", registry.DEFAULT_METHOD)
+        made_by = "file" if gain.get("file") is not None else method
         yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
         # The schema leaves open which further keys a method has.
-        for key in (key for key in gain if isinstance(key, str) and key not in GAIN_KEYS):
-            said = f"got an unknown key, allowed {are(GAIN_KEYS)}"
-            yield (role, "gain", key), f"{said}{did_you_mean(key, GAIN_KEYS)}."
+        for key in (key for key in gain if isinstance(key, str) and key not in registry.GAIN_KEYS):
+            said = f"got an unknown key, allowed {are(registry.GAIN_KEYS)}"
+            yield (role, "gain", key), f"{said}{did_you_mean(key, registry.GAIN_KEYS)}."
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -144,8 +138,8 @@ def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
             yield index, (min(i, j), max(i, j))
 
 
-def _edges(document: Document) -> Iterator[Fault]:
-    graph = _section(document.data, "graph")
+def _edges(document: Document) -> Iterator[Finding]:
+    graph = section(document.data, "graph")
     agents = _whole(graph.get("agents"))
     first: dict[tuple[int, int], int] = {}
     for index, pair in _pairs(graph):
@@ -184,8 +178,8 @@ def _agents(graph: Part) -> int | None:
     return agents if agents is not None and agents > 0 else None
 
 
-def _grid(data: Part) -> Iterator[Fault]:
-    graph = _section(data, "graph")
+def _grid(data: Part) -> Iterator[Finding]:
+    graph = section(data, "graph")
     agents, size = _whole(graph.get("agents")), _agents(graph)
     if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
         said = f"got `{agents}`, allowed is rows times columns, `{size}`"
@@ -193,8 +187,8 @@ def _grid(data: Part) -> Iterator[Fault]:
 
 
 def _unknown(
-    path: KeyPath, what: str, numbers: Iterable[tuple[str | int, object]], agents: int
-) -> Iterator[Fault]:
+    path: KeyPath, what: str, numbers: Iterable[tuple[Any, object]], agents: int
+) -> Iterator[Finding]:
     """Yield every one of `numbers` (the key it stands at, and its value) that is no agent."""
     for key, value in numbers:
         agent = _whole(value)
@@ -202,13 +196,11 @@ def _unknown(
             yield (*path, key), f"got {what} `{agent}`, {_range(agents)}."
 
 
-def _members(data: Part) -> Iterator[Fault]:
+def _members(data: Part) -> Iterator[Finding]:
     """Yield leaders, offsets and starts of agents that the graph does not have."""
-    agents = _agents(_section(data, "graph"))
-    leaders = _section(data, "graph").get("leaders", [0])
+    graph = section(data, "graph")
+    agents, leaders = _agents(graph), graph.get("leaders")
     leaders = leaders if isinstance(leaders, list) else [0]
-    if not leaders:
-        yield ("graph", "leaders"), "got no leader, allowed is a list of at least one agent."
     for index, leader in enumerate(leaders):
         if _whole(leader) is not None and leader in leaders[:index]:
             yield (
@@ -218,39 +210,38 @@ def _members(data: Part) -> Iterator[Fault]:
     if agents is None:
         return
     yield from _unknown(("graph", "leaders"), "leader", enumerate(leaders), agents)
-    for section, key, what in (
+    for place, key, what in (
         ("formation", "offsets", "an offset for agent"),
         ("initial", "states", "a state for agent"),
     ):
-        given = _section(data, section, key)
-        numbers = ((number, number) for number in given if isinstance(number, int))
-        yield from _unknown((section, key), what, numbers, agents)
+        numbered = ((number, number) for number in section(data, place, key))
+        yield from _unknown((place, key), what, numbered, agents)
 
 
-def _following(data: Part) -> Iterator[Fault]:
+def _following(data: Part) -> Iterator[Finding]:
     """Yield a leader that tracks nothing, and a reference that nobody tracks."""
-    law, given = _section(data, "leader").get("law"), data.get("reference") is not None
+    law, given = section(data, "leader").get("law"), data.get("reference") is not None
     if law in _TRACKS and not given:
         yield (
             ("leader", "law"),
             f"got `{law}` without a `reference`, a leader that tracks needs one.",
         )
-    if given and isinstance(law, str) and law in LEADER_LAWS and law not in _TRACKS:
+    if given and isinstance(law, str) and law in registry.LEADER_LAWS and law not in _TRACKS:
         said = f"got a reference for a leader whose law is `{law}`"
         allowed = " or ".join(f"`{name}`" for name in _TRACKS)
         yield ("reference",), f"{said}, allowed is one only with the law {allowed}."
 
 
-def _changed(data: Part) -> Iterator[Fault]:
+def _changed(data: Part) -> Iterator[Finding]:
     """Yield parameters of the plant that are both given and scaled."""
-    given, scaled = (_section(data, "plant", key) for key in ("parameters", "scale"))
+    given, scaled = (section(data, "plant", key) for key in ("parameters", "scale"))
     for name in (name for name in scaled if isinstance(name, str) and name in given):
         said = "got a factor on a parameter that `plant.parameters` gives"
         yield ("plant", "scale", name), f"{said}, allowed is one of them."
 
 
-def _durations(data: Part) -> Iterator[Fault]:
-    simulation = _section(data, "simulation")
+def _durations(data: Part) -> Iterator[Finding]:
+    simulation = section(data, "simulation")
     horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
     if horizon is not None and dt is not None and 0 < horizon < dt:
         said = f"got {shown(simulation['horizon'])}, allowed is at least one step"
@@ -260,7 +251,7 @@ def _durations(data: Part) -> Iterator[Fault]:
         )
 
 
-def cross_faults(document: Document) -> Iterator[Fault]:
+def cross_faults(document: Document) -> Iterator[Finding]:
     """Yield the path and the sentence of every fault that takes more than one key to see.
 
     Numbers that are not finite come first: where the schema stumbles over the same number, the

@@ -4,37 +4,26 @@ Every fault of a file is reported at once, a line each: `file:line: field: what 
 allowed`.
 """
 
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, NoReturn, final, get_args
+from typing import Any, NoReturn, final, get_args
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
-from echelon.scenario.checks import cross_faults, number_of
-from echelon.scenario.sections import (
-    STRICT,
-    DisturbanceSpec,
-    FollowerSpec,
-    FormationSpec,
-    GraphSpec,
-    InitialSpec,
-    LeaderSpec,
-    ModelSpec,
-    PlantSpec,
-    ReferenceSpec,
-    ReportSpec,
-    SimulationSpec,
-)
-from echelon.scenario.values import CLASS_IN_FILE, FOLDER_NAME, Seed
+from echelon.scenario import sections
+from echelon.scenario.checks import cross_faults, number_of, section
+from echelon.scenario.values import FolderName, Seed
 from echelon.scenario.yaml import (
     Document,
+    Fault,
     KeyPath,
     apply_overrides,
     are,
     dump_yaml,
+    joined,
     read_yaml,
     shown,
 )
@@ -43,24 +32,24 @@ _BUNDLED = Path(__file__).parent / "bundled"
 
 
 @final
-class Scenario(BaseModel):
+class Scenario(BaseModel, **sections.STRICT):
     """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
 
-    model_config = STRICT
-
-    name: Annotated[str, Field(pattern=FOLDER_NAME)] = Field(description="Name of its folder.")
-    model: ModelSpec
-    plant: PlantSpec | None = None
-    graph: GraphSpec
-    formation: FormationSpec = Field(default_factory=FormationSpec)
-    reference: ReferenceSpec | None = None
-    leader: LeaderSpec = Field(default_factory=LeaderSpec)
-    follower: FollowerSpec = Field(default_factory=FollowerSpec)
-    initial: InitialSpec = Field(default_factory=InitialSpec)
-    disturbance: DisturbanceSpec | None = None
-    simulation: SimulationSpec
-    report: ReportSpec = Field(default_factory=ReportSpec)
-    seed: Seed = Field(default=0, description="Seed of everything random in the run.")
+    name: FolderName
+    """Name of its folder."""
+    model: sections.ModelSpec
+    plant: sections.PlantSpec | None = None
+    graph: sections.GraphSpec
+    formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
+    reference: sections.ReferenceSpec | None = None
+    leader: sections.LeaderSpec = Field(default_factory=sections.LeaderSpec)
+    follower: sections.FollowerSpec = Field(default_factory=sections.FollowerSpec)
+    initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
+    disturbance: sections.DisturbanceSpec | None = None
+    simulation: sections.SimulationSpec
+    report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
+    seed: Seed = 0
+    """Seed of everything random in the run."""
 
     _document: Document = PrivateAttr(Document({}, {(): "scenario"}))
     _text: str = PrivateAttr("")
@@ -81,17 +70,6 @@ class Scenario(BaseModel):
         return self._document.place(path)
 
 
-class Fault(NamedTuple):
-    """One fault of a scenario: where it stands, its key (joined by dots), and a sentence."""
-
-    place: str
-    field: str
-    message: str
-
-    def __str__(self) -> str:
-        return ": ".join(part for part in self if part)
-
-
 _ALLOWED = {
     "float_type": "is a number",
     "int_type": "is a whole number",
@@ -105,10 +83,6 @@ _ALLOWED = {
     "less_than": "is a number below {lt}",
     "too_short": "is a list of at least {min_length} number",
 }
-_PATTERNS = {
-    FOLDER_NAME: "are up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit",
-    CLASS_IN_FILE: "is a file and a class in it, as in `pendulum.py:Pendulum`",
-}
 
 
 def _keys(path: KeyPath) -> list[str]:
@@ -121,19 +95,9 @@ def _keys(path: KeyPath) -> list[str]:
     return list(part.model_fields)
 
 
-def _allowed(kind: str, got: object, context: Mapping[str, Any]) -> str | None:
-    if kind == "literal_error":
-        names = re.findall("'([^']*)'", context["expected"])
-        return are(names) + did_you_mean(got, names)
-    if kind == "string_pattern_mismatch":
-        return _PATTERNS[context["pattern"]]
-    phrase = _ALLOWED.get(kind)
-    return phrase and phrase.format(**context)
-
-
-def _told(error: ErrorDetails) -> tuple[KeyPath, str]:
+def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
     """Return the path of a fault that the schema found, and its sentence."""
-    path, kind, got = error["loc"], error["type"], error["input"]
+    path, kind, context = error["loc"], error["type"], error.get("ctx", {})
     if path and path[-1] == "[key]":
         kind = "a whole number, an agent's" if kind == "int_type" else "a name"
         return path[:-1], f"got the key {shown(path[-2])}, allowed is {kind}."
@@ -142,8 +106,10 @@ def _told(error: ErrorDetails) -> tuple[KeyPath, str]:
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
         return path, f"got an unknown key, allowed {are(keys)}{did_you_mean(path[-1], keys)}."
-    allowed = _allowed(kind, got, error.get("ctx", {}))
-    return path, f"got {shown(got)}, allowed {allowed}." if allowed else error["msg"]
+    got = context.get("got", error["input"])
+    allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
+    close = did_you_mean(got, context.get("names", "").split())
+    return path, f"got {shown(got)}, allowed {allowed}{close}."
 
 
 def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
@@ -153,47 +119,38 @@ def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
     if isinstance(leader, dict):
         law = "tracking" if "reference" in filled else "passive"
         filled["leader"] = {"law": law, **leader}
-    simulation = filled.get("simulation")
-    horizon = number_of(simulation.get("horizon")) if isinstance(simulation, dict) else None
-    if horizon is not None and horizon > 0 and isinstance(report, dict):
-        window = report.get("steady_window", horizon / 5)
-        asked = number_of(window)
-        # A window as long as the run would count its transient as steady.
-        fitting = horizon / 5 if asked is not None and asked >= horizon else window
-        filled["report"] = {**report, "steady_window": fitting}
+    horizon = number_of(section(data, "simulation").get("horizon")) or 0.0
+    window = number_of(section(data, "report").get("steady_window", math.inf))
+    # A window as long as the run would count its transient as steady.
+    if isinstance(report, dict) and window is not None and window >= horizon > 0:
+        filled["report"] = {**report, "steady_window": horizon / 5}
     return filled
 
 
-def _schema_faults(data: Mapping[Any, Any]) -> Iterator[tuple[KeyPath, str]]:
+def _validated(data: Mapping[Any, Any]) -> tuple[Scenario | None, list[tuple[KeyPath, str]]]:
+    """Return the scenario, or the faults that the schema finds."""
     try:
-        Scenario.model_validate(_filled(data))
+        return Scenario.model_validate(_filled(data)), []
     except ValidationError as error:
-        yield from map(_told, error.errors(include_url=False))
+        return None, list(map(_describe, error.errors(include_url=False)))
 
 
-def by_line(fault: Fault) -> tuple[bool, int]:
+def _by_line(fault: Fault) -> tuple[bool, int]:
     """Sort by line, what the command line set last."""
     line = fault.place.rpartition(":")[2]
     overridden = fault.place.startswith("--set ")
     return overridden, int(line) if line.isdigit() and not overridden else 0
 
 
-def _faults(document: Document) -> list[Fault]:
-    """Return all faults, at most one for each path from the schema and the checks together."""
-    found: dict[KeyPath, str] = {}
-    for path, message in (*cross_faults(document), *_schema_faults(document.data)):
-        found.setdefault(path, message)
-    faults = [(path, document.place(path), message) for path, message in found.items()]
-    listed = (
-        Fault(place, ".".join(map(str, path)), message)
-        for path, place, message in (*document.problems, *faults)
-    )
-    return sorted(listed, key=by_line)
+def refuse(faults: Iterable[Fault]) -> NoReturn:
+    """Raise all faults as one error, a line each in the order of the file.
 
-
-def _refuse(faults: Sequence[Fault]) -> NoReturn:
-    error = ScenarioError("\n".join(map(str, faults)))
-    setattr(error, "faults", tuple(faults))
+    Raises:
+        ScenarioError: always; its `faults` are the single ones.
+    """
+    ordered = sorted(faults, key=_by_line)
+    error = ScenarioError("\n".join(map(str, ordered)))
+    setattr(error, "faults", tuple(ordered))
     raise error
 
 
@@ -201,12 +158,16 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
         said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
-        _refuse([Fault(document.place(()), "", said)])
+        refuse([Fault(document.place(()), "", said)])
     document = document._replace(data=data)
-    faults = _faults(document)
-    if faults:
-        _refuse(faults)
-    scenario = Scenario.model_validate(_filled(data))
+    scenario, refused = _validated(data)
+    # One for each path: what a check says of it goes before what the schema says.
+    found: dict[KeyPath, str] = {}
+    for path, said in (*cross_faults(document), *refused):
+        found.setdefault(path, said)
+    faults = [Fault(document.place(path), joined(path), said) for path, said in found.items()]
+    if scenario is None or faults or document.faults:
+        refuse([*document.faults, *faults])
     scenario._document, scenario._text, scenario._folder = document, text, folder
     return scenario
 

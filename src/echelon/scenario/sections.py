@@ -1,30 +1,20 @@
 """The sections of a scenario file: their keys, units and defaults.
 
-Descriptions go to the JSON schema, so the unit of each number stands where the number is declared.
+The sentence below a key is its description in the JSON schema, so the unit of each number stands
+where the number is declared.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, final
+from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from echelon.core.words import Feedforward
-from echelon.scenario.registry import (
-    DEFAULT_METHOD,
-    FOLLOWER_LAWS,
-    FORMATIONS,
-    GAIN_KEYS,
-    GRAPHS,
-    INTEGRATORS,
-    LEADER_LAWS,
-    METHODS,
-    MODELS,
-    REFERENCES,
-)
+from echelon.scenario import registry
 from echelon.scenario.values import (
-    CLASS_IN_FILE,
     Agents,
     Array,
+    ClassInFile,
     Count,
     Edges,
     MatrixOrIdentity,
@@ -37,7 +27,7 @@ from echelon.scenario.values import (
     Seed,
 )
 
-STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
+STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 def _either(*keys: str) -> ConfigDict:
@@ -47,81 +37,63 @@ def _either(*keys: str) -> ConfigDict:
 
 
 @final
-class ModelSpec(BaseModel):
+class ModelSpec(BaseModel, **_either("name", "python")):
     """The agents' model: a name of the registry, or a class in a file of the user's."""
 
-    model_config = _either("name", "python")
-
-    name: Annotated[str, OneOf(MODELS)] | None = Field(default=None, description="Name of a model.")
-    python: Annotated[str, Field(pattern=CLASS_IN_FILE)] | None = Field(
-        default=None, description="`file.py:Class`, the file relative to the scenario file."
-    )
-    parameters: Parameters = Field(
-        default=None,
-        description="Name of a set of parameters, or the parameters, in the model's units.",
-    )
-    allow_unphysical: bool = Field(
-        default=False, description="Accept parameters that no body can have."
-    )
+    name: Annotated[str, OneOf(registry.MODELS)] | None = None
+    """Name of a model."""
+    python: ClassInFile | None = None
+    """`file.py:Class`, the file relative to the scenario file."""
+    parameters: Parameters = None
+    """Name of a set of parameters, or the parameters, in the model's units."""
+    allow_unphysical: bool = False
+    """Accept parameters that no body can have."""
 
 
 @final
-class PlantSpec(BaseModel):
+class PlantSpec(BaseModel, **STRICT):
     """The agents as they are, where they differ from the model that laws and gains know."""
 
-    model_config = STRICT
-
-    parameters: dict[str, Numeric] = Field(
-        default={}, description="Parameters that differ, in the model's units."
-    )
-    scale: dict[str, Positive] = Field(
-        default={},
-        description="Factors on the model's parameters, without unit; on each number of a list.",
-    )
+    parameters: dict[str, Numeric] = {}
+    """Parameters that differ, in the model's units."""
+    scale: dict[str, Positive] = {}
+    """Factors on the model's parameters, without unit; on each number of a list."""
 
 
 @final
-class GraphSpec(BaseModel):
+class GraphSpec(BaseModel, **_either("edges", "name")):
     """Who hears whom: an edge list, or a generator; undirected."""
 
-    model_config = _either("edges", "name")
-
-    edges: Edges | None = Field(
-        default=None,
-        description="Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1.",
-    )
-    name: Annotated[str, OneOf(GRAPHS)] | None = Field(
-        default=None, description="Name of a generator."
-    )
-    agents: Count | None = Field(
-        default=None,
-        description="Number of agents; with `edges` the default is the largest number + 1.",
-    )
-    rows: Count | None = Field(default=None, description="Rows of the generator `grid`.")
-    columns: Count | None = Field(default=None, description="Columns of the generator `grid`.")
-    radius: Positive | None = Field(
-        default=None, description="Reach in the generator `geometric`, in sides of its unit square."
-    )
-    seed: Seed = Field(default=0, description="Seed of the generator `geometric`.")
-    leaders: Agents = Field(default=(0,), min_length=1, description="Numbers of the leaders.")
+    edges: Edges | None = None
+    """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1."""
+    name: Annotated[str, OneOf(registry.GRAPHS)] | None = None
+    """Name of a generator."""
+    agents: Count | None = None
+    """Number of agents; with `edges` the default is the largest number + 1."""
+    rows: Count | None = None
+    """Rows of the generator `grid`."""
+    columns: Count | None = None
+    """Columns of the generator `grid`."""
+    radius: Positive | None = None
+    """Reach in the generator `geometric`, in sides of its unit square."""
+    seed: Seed = 0
+    """Seed of the generator `geometric`."""
+    leaders: Agents = Field(default=(0,), min_length=1)
+    """Numbers of the leaders."""
 
 
 @final
-class FormationSpec(BaseModel):
+class FormationSpec(BaseModel, **STRICT):
     """Each agent's goal relative to the leader's: offsets or a named shape; none means zero."""
 
-    model_config = STRICT
-
-    offsets: dict[int, Numbers] | None = Field(
-        default=None, description="Offset of an agent, in the model's units of position, usually m."
-    )
-    name: Annotated[str, OneOf(FORMATIONS)] | None = Field(
-        default=None, description="Name of a shape."
-    )
-    spacing: Positive = Field(
-        default=1.0, description="Distance between neighbours in the shape, m."
-    )
-    columns: Count | None = Field(default=None, description="Columns of the shape `grid`.")
+    offsets: dict[int, Numbers] | None = None
+    """Offset of an agent, in the model's units of position, usually m."""
+    name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
+    """Name of a shape."""
+    spacing: Positive = 1.0
+    """Distance between neighbours in the shape, m."""
+    columns: Count | None = None
+    """Columns of the shape `grid`."""
 
 
 @final
@@ -132,7 +104,8 @@ class ReferenceSpec(BaseModel):
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
-    name: Annotated[str, OneOf(REFERENCES)] = Field(description="Name of a reference.")
+    name: Annotated[str, OneOf(registry.REFERENCES)]
+    """Name of a reference."""
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -147,44 +120,31 @@ class GainSpec(BaseModel):
     # Arguments that deserve a description, or are no numbers, have their keys here; so that a new
     # method needs no more than its line in the registry, further ones may be numbers.
     model_config = STRICT | ConfigDict(
-        extra="allow", json_schema_extra={"propertyNames": {"enum": list(GAIN_KEYS)}}
+        extra="allow", json_schema_extra={"propertyNames": {"enum": list(registry.GAIN_KEYS)}}
     )
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
-    method: Annotated[str, OneOf(METHODS)] = Field(
-        default=DEFAULT_METHOD, description="Name of a method."
-    )
-    Q: Array | None = Field(
-        default=None, description="Weight of the states: its diagonal or rows; default the model's."
-    )
-    R: Array | None = Field(
-        default=None,
-        description="Weight of the normalised inputs: its diagonal or rows; default the model's.",
-    )
-    P: MatrixOrIdentity | None = Field(
-        default=None,
-        description="The gain of the method `given`: `identity`, its diagonal or rows.",
-    )
-    coupling: Positive | None = Field(
-        default=None, description="Coupling strength, without unit; default what the method finds."
-    )
-    domain: dict[str, Numeric] | None = Field(
-        default=None,
-        description="Half-width, or `[lower, upper]`, by state, group or normalised input.",
-    )
-    rate: Positive | None = Field(
-        default=None, description="Rate that the method `contraction` is asked for, 1/s."
-    )
-    exact: bool | None = Field(
-        default=None, description="Whether a rate is proved in exact arithmetic where it can be."
-    )
-    symmetry_weight: Numeric | None = Field(
-        default=None, description="Weight of the symmetric states in the P of `inner-loop`."
-    )
-    file: str | None = Field(
-        default=None, description="Gain file of `echelon design`, relative to the scenario file."
-    )
+    method: Annotated[str, OneOf(registry.METHODS)] = registry.DEFAULT_METHOD
+    """Name of a method."""
+    Q: Array | None = None
+    """Weight of the states: its diagonal or rows; default the model's."""
+    R: Array | None = None
+    """Weight of the normalised inputs: its diagonal or rows; default the model's."""
+    P: MatrixOrIdentity | None = None
+    """The gain of the method `given`: `identity`, its diagonal or rows."""
+    coupling: Positive | None = None
+    """Coupling strength, without unit; default what the method finds."""
+    domain: dict[str, Numeric] | None = None
+    """Half-width, or `[lower, upper]`, by state, group or normalised input."""
+    rate: Positive | None = None
+    """Rate that the method `contraction` is asked for, 1/s."""
+    exact: bool | None = None
+    """Whether a rate is proved in exact arithmetic where it can be."""
+    symmetry_weight: Numeric | None = None
+    """Weight of the symmetric states in the P of `inner-loop`."""
+    file: str | None = None
+    """Gain file of `echelon design`, relative to the scenario file."""
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -193,114 +153,86 @@ class GainSpec(BaseModel):
 
 
 @final
-class LeaderSpec(BaseModel):
+class LeaderSpec(BaseModel, **STRICT):
     """What the leader does."""
 
-    model_config = STRICT
-
-    law: Annotated[str, OneOf(LEADER_LAWS)] = Field(
-        default_factory=lambda: "passive",
-        description="Name of a law; default `tracking` with a reference, `passive` without.",
-    )
-    reacts: bool = Field(default=False, description="Whether the leader answers to its neighbours.")
-    start_error: dict[str, float] = Field(
-        default={},
-        description="Error of the start, by state or group of states, in the states' units.",
-    )
-    gain: GainSpec | None = Field(default=None, description="Gain of the leader's own tracking.")
+    law: Annotated[str, OneOf(registry.LEADER_LAWS)] = Field(default_factory=lambda: "passive")
+    """Name of a law; default `tracking` with a reference, `passive` without."""
+    reacts: bool = False
+    """Whether the leader answers to its neighbours."""
+    start_error: dict[str, float] = {}
+    """Error of the start, by state or group of states, in the states' units."""
+    gain: GainSpec | None = None
+    """Gain of the leader's own tracking."""
 
 
 @final
-class FollowerSpec(BaseModel):
+class FollowerSpec(BaseModel, **STRICT):
     """What every follower does."""
 
-    model_config = STRICT
-
-    law: Annotated[str, OneOf(FOLLOWER_LAWS)] = Field(
-        default="consensus", description="Name of a law."
-    )
-    gain: GainSpec = Field(default_factory=GainSpec, description="Gain of the law `consensus`.")
-    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = Field(
-        default="relay",
-        description="What every follower is told of the same step: `relay`, the leader's input; "
-        "`relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer "
-        "to the leader, on a tree.",
-    )
-    trim: bool = Field(
-        default=True, description="Whether the law starts from the trim input, or from zero."
-    )
+    law: Annotated[str, OneOf(registry.FOLLOWER_LAWS)] = "consensus"
+    """Name of a law."""
+    gain: GainSpec = Field(default_factory=GainSpec)
+    """Gain of the law `consensus`."""
+    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = "relay"
+    """What every follower is sent of the same step: `relay`, the leader's input; `relay-velocity`,
+    the velocity that it makes; `parent`, the input of the neighbour nearer to the leader, on a
+    tree."""
+    trim: bool = True
+    """Whether the law starts from the trim input, or from zero."""
 
 
 @final
-class InitialSpec(BaseModel):
+class InitialSpec(BaseModel, **STRICT):
     """Where the followers start: a random spread about their goals, or given states."""
 
-    model_config = STRICT
-
-    spread: dict[str, NotNegative] | None = Field(
-        default=None,
-        description="Half-width of the spread, by state or group, in the states' units.",
-    )
-    states: dict[int, Numbers] | None = Field(
-        default=None,
-        description="All states of an agent, in the states' units; the others start on goal.",
-    )
+    spread: dict[str, NotNegative] | None = None
+    """Half-width of the spread, by state or group, in the states' units."""
+    states: dict[int, Numbers] | None = None
+    """All states of an agent, in the states' units; the others start on goal."""
 
 
 @final
-class DisturbanceSpec(BaseModel):
+class DisturbanceSpec(BaseModel, **STRICT):
     """Wind and noise that act on all agents."""
 
-    model_config = STRICT
-
-    constant: dict[str, float] = Field(
-        default={},
-        description="Lasting wind by state or group, in the states' units per second: m/s^2 for a "
-        "velocity.",
-    )
-    rms: dict[str, NotNegative] = Field(
-        default={},
-        description="Root mean square of the random wind by state or group, for each state, in the "
-        "states' units per second.",
-    )
-    input_rms: dict[str, NotNegative] = Field(
-        default={},
-        description="Root mean square of the noise by input, in normalised inputs; no limit "
-        "touches it.",
-    )
-    hold: Positive = Field(default=0.5, description="How long a random draw lasts, s.")
-    common: bool = Field(default=False, description="Whether all agents feel the same random wind.")
-    seed: Seed | None = Field(
-        default=None, description="Seed of wind and noise; default the scenario's."
-    )
+    constant: dict[str, float] = {}
+    """Lasting wind by state or group, in the states' units per second: m/s^2 for a velocity."""
+    rms: dict[str, NotNegative] = {}
+    """Root mean square of the random wind by state or group, for each state, in the states' units
+    per second."""
+    input_rms: dict[str, NotNegative] = {}
+    """Root mean square of the noise by input, in normalised inputs; no limit touches it."""
+    hold: Positive = 0.5
+    """How long a random draw lasts, s."""
+    common: bool = False
+    """Whether all agents feel the same random wind."""
+    seed: Seed | None = None
+    """Seed of wind and noise; default the scenario's."""
 
 
 @final
-class SimulationSpec(BaseModel):
+class SimulationSpec(BaseModel, **STRICT):
     """How the run is computed."""
 
-    model_config = STRICT
-
-    horizon: Positive = Field(description="Length of the run, s.")
-    dt: Positive = Field(description="Length of a step, s; at most the horizon.")
-    integrator: Annotated[str, OneOf(INTEGRATORS)] = Field(
-        default="rk4", description="Name of the method."
-    )
-    limits: bool = Field(default=True, description="Whether the actuators' limits hold.")
-    store_every: Count = Field(default=1, description="Steps from one stored sample to the next.")
-    precision: Literal["float64", "float32"] = Field(
-        default="float64", description="Arithmetic used."
-    )
+    horizon: Positive
+    """Length of the run, s."""
+    dt: Positive
+    """Length of a step, s; at most the horizon."""
+    integrator: Annotated[str, OneOf(registry.INTEGRATORS)] = "rk4"
+    """Name of the method."""
+    limits: bool = True
+    """Whether the actuators' limits hold."""
+    store_every: Count = 1
+    """Steps from one stored sample to the next."""
+    precision: Annotated[str, OneOf(("float64", "float32"))] = "float64"
+    """Arithmetic used."""
 
 
 @final
-class ReportSpec(BaseModel):
+class ReportSpec(BaseModel, **STRICT):
     """What the report looks at."""
 
-    model_config = STRICT
-
-    steady_window: Positive = Field(
-        default_factory=lambda: 1.0,
-        description="The end of the run that counts as steady, s; a fifth of the horizon by "
-        "default, and where it would not be shorter than the run.",
-    )
+    steady_window: Positive = Field(default_factory=lambda: 1.0)
+    """The end of the run that counts as steady, s; a fifth of the horizon by default, and where it
+    would not be shorter than the run."""

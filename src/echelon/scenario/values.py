@@ -4,150 +4,126 @@ Numbers are real numbers only: neither truth values nor text that looks like a n
 are not finite pass here; they are refused for the whole file at once.
 """
 
-from collections.abc import Iterable
-from typing import Annotated, Any, Literal, NoReturn, final
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Literal, final
 
 from pydantic import (
+    AfterValidator,
+    BeforeValidator,
     Field,
     GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
     PlainValidator,
     WithJsonSchema,
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from echelon.core.errors import did_you_mean
-from echelon.scenario.yaml import are, shown
-
-
-def _refuse(value: object, allowed: str) -> NoReturn:
-    said = f"got {shown(value)}, allowed {allowed}."
-    raise PydanticCustomError("echelon", "{said}", {"said": said})
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _float(value: int | float) -> float:
-    try:
-        return float(value)
-    except OverflowError:  # refused elsewhere, as every number that is not finite
-        return float("inf")
+from echelon.scenario.yaml import are
 
 
 @final
-class OneOf:
-    """Marks text that must be one of the names of a registry table."""
+class Allowed:
+    """Marks a type of which one phrase says what is allowed, whichever part of it fails.
 
-    def __init__(self, names: Iterable[str]) -> None:
-        self.names = tuple(names)
+    The names are what a misspelt word may have meant; the schema replaces the type's own.
+    """
+
+    def __init__(
+        self, phrase: str, names: Sequence[str] = (), schema: CoreSchema | None = None
+    ) -> None:
+        self.phrase, self.names, self.schema = phrase, names, schema
 
     def __get_pydantic_core_schema__(
         self, source: type, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self.check, handler(source))
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        return {**handler(schema), "enum": list(self.names)}
-
-    def check(self, name: str) -> str:
-        """Return the name, or refuse it and say which are allowed."""
-        if name not in self.names:
-            _refuse(name, f"{are(self.names)}{did_you_mean(name, self.names)}")
-        return name
-
-
-def _edge(value: object) -> tuple[int, int, float]:
-    if not isinstance(value, list) or len(value) not in (2, 3):
-        _refuse(value, "is a pair `[i, j]` or a triple `[i, j, weight]`")
-    (i, j), weight = value[:2], value[2] if len(value) == 3 else 1.0
-    if not all(type(agent) is int and agent >= 0 for agent in (i, j)):
-        _refuse(value, "are two agents, whole numbers from 0, and a weight")
-    if i == j:
-        _refuse(value, "is an edge between two different agents")
-    if not _is_number(weight) or weight <= 0:
-        _refuse(value, "is a weight above 0")
-    return i, j, _float(weight)
-
-
-def _matrix(value: object) -> tuple[tuple[float, ...], ...]:
-    """Return a square matrix as rows; a list of numbers is its diagonal."""
-    rows = value if isinstance(value, list) else []
-    size = len(rows)
-    if rows and all(map(_is_number, rows)):
-        diagonal = [_float(number) for number in rows]
-        return tuple(
-            tuple(diagonal[i] if i == j else 0.0 for j in range(size)) for i in range(size)
+        return core_schema.custom_error_schema(
+            self.schema or handler(source),
+            "allowed",
+            custom_error_message=self.phrase,
+            custom_error_context={"names": " ".join(self.names)},
         )
-    square = all(
-        isinstance(row, list) and len(row) == size and all(map(_is_number, row)) for row in rows
-    )
-    if not rows or not square:
-        _refuse(value, "is a list of numbers (the diagonal) or a list of as many rows as columns")
-    return tuple(tuple(map(_float, row)) for row in rows)
 
 
-def _matrix_or_identity(value: object) -> Literal["identity"] | tuple[tuple[float, ...], ...]:
-    if isinstance(value, str):
-        if value != "identity":
-            said = "is `identity`, a list of numbers (the diagonal) or a square matrix"
-            _refuse(value, said + did_you_mean(value, ["identity"]))
-        return "identity"
-    return _matrix(value)
+def OneOf(names: Iterable[str]) -> Allowed:
+    """Mark text that must be one of the names of a registry table."""
+    listed = list(names)
+    # `Literal[*names]` makes the same schema, and no type checker reads it
+    return Allowed(are(listed), listed, core_schema.literal_schema(listed))
+
+
+def _weighted(edge: object) -> object:
+    """Return an edge with its weight, 1 unless it is given."""
+    if not isinstance(edge, list) or len(edge) not in (2, 3):
+        raise PydanticCustomError("allowed", "is a pair `[i, j]` or a triple `[i, j, weight]`")
+    return (*edge, 1.0)[:3]
+
+
+def _refuse_loop(edge: tuple[int, int, float]) -> tuple[int, int, float]:
+    if edge[0] == edge[1]:
+        raise PydanticCustomError("allowed", "is an edge between two different agents")
+    return edge
+
+
+def _square(value: tuple[Any, ...]) -> tuple[tuple[float, ...], ...]:
+    """Return a square matrix as rows; a list of numbers is its diagonal."""
+    size = len(value)
+    if all(isinstance(number, float) for number in value):
+        return tuple(
+            tuple(number if i == j else 0.0 for j in range(size)) for i, number in enumerate(value)
+        )
+    if any(len(row) != size for row in value):
+        raise ValueError("not square")
+    return value
 
 
 def _numeric(value: object) -> object:
     """Return a number or nested lists of numbers with lists as tuples."""
     if isinstance(value, list):
         return tuple(map(_numeric, value))
-    if not _is_number(value):
-        _refuse(value, "is a number or a nested list of numbers")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        # the list may be long, so the message shows what is no number and not the whole list
+        allowed = "is a number or a nested list of numbers"
+        raise PydanticCustomError("allowed", allowed, {"got": value})
     return value
 
 
-def _parameters(value: object) -> str | dict[str, Any] | None:
-    named = isinstance(value, dict) and all(isinstance(key, str) for key in value)
-    if value is not None and not isinstance(value, str) and not named:
-        _refuse(value, "is the name of a set of parameters or a mapping from names to values")
-    return value  # pyright: ignore[reportReturnType]
-
-
-FOLDER_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
-CLASS_IN_FILE = r"^.+\.py:[A-Za-z_][A-Za-z0-9_]*$"
-_ROWS = {"type": "array", "items": {"type": "array", "items": {"type": "number"}}}
-_DIAGONAL = {"type": "array", "items": {"type": "number"}, "minItems": 1}
-_EDGE = {
-    "type": "array",
-    "prefixItems": [{"type": "integer", "minimum": 0}] * 2
-    + [{"exclusiveMinimum": 0, "type": "number"}],
-    "minItems": 2,
-    "maxItems": 3,
-}
-
+FolderName = Annotated[
+    str,
+    Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"),
+    Allowed("is text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"),
+]
+ClassInFile = Annotated[
+    str,
+    Field(pattern=r"^.+\.py:[A-Za-z_][A-Za-z0-9_]*$"),
+    Allowed("is a file and a class in it, as in `pendulum.py:Pendulum`"),
+]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
-Agents = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)]
-Edge = Annotated[tuple[int, int, float], PlainValidator(_edge), WithJsonSchema(_EDGE)]
+Agent = Annotated[int, Field(ge=0)]
+Agents = Annotated[tuple[Agent, ...], Field(strict=False)]
+Edge = Annotated[
+    tuple[Agent, Agent, Positive],
+    BeforeValidator(
+        _weighted, json_schema_input_type=tuple[Agent, Agent] | tuple[Agent, Agent, Positive]
+    ),
+    AfterValidator(_refuse_loop),
+]
 Edges = Annotated[tuple[Edge, ...], Field(strict=False)]
+Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
+Matrix = Annotated[
+    Numbers | Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)],
+    AfterValidator(_square),
+]
 Array = Annotated[
-    tuple[tuple[float, ...], ...],
-    PlainValidator(_matrix),
-    WithJsonSchema({"anyOf": [_DIAGONAL, _ROWS]}),
+    Matrix, Allowed("is a list of numbers (the diagonal) or a list of as many rows as columns")
 ]
 MatrixOrIdentity = Annotated[
-    Literal["identity"] | tuple[tuple[float, ...], ...],
-    PlainValidator(_matrix_or_identity),
-    WithJsonSchema({"anyOf": [{"const": "identity"}, _DIAGONAL, _ROWS]}),
+    Literal["identity"] | Matrix,
+    Allowed("is `identity`, a list of numbers (the diagonal) or a square matrix", ["identity"]),
 ]
 Numeric = Annotated[Any, PlainValidator(_numeric), WithJsonSchema({"type": ["number", "array"]})]
 Parameters = Annotated[
     str | dict[str, Any] | None,
-    PlainValidator(_parameters),
-    WithJsonSchema({"type": ["string", "object", "null"]}),
+    Allowed("is the name of a set of parameters or a mapping from names to values"),
 ]

@@ -1,11 +1,14 @@
 """Reads YAML 1.2 into plain data, and remembers on which line each value stands.
 
-The text is only composed into nodes; what a plain word means is decided here, by the core schema
-of YAML 1.2: `1e-3` is a number, `no` is text. Values given on the command line (`--set a.b=3`) are
-read the same way and laid over the file's before anything is checked, so both meet the same rules.
+ruamel.yaml composes the text into nodes, says what a word means and writes. Its constructor would
+stop at the first repeated key and drop the lines, so the walk over the nodes is here. Values given
+on the command line (`--set a.b=3`) are read the same way and laid over the file's before anything
+is checked, so both meet the same rules.
 """
 
+import io
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, final
@@ -14,6 +17,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 from ruamel.yaml.reader import ReaderError
+from ruamel.yaml.representer import SafeRepresenter
 
 from echelon.core.errors import ScenarioError, listing
 
@@ -21,160 +25,153 @@ KeyPath = tuple[str | int, ...]
 Where = Callable[[int], str]
 
 
-class Problem(NamedTuple):
-    """Something that YAML permits and echelon does not, at a path and a place."""
+class Fault(NamedTuple):
+    """One fault of a scenario: where it stands, its key (joined by dots), and a sentence."""
 
-    path: KeyPath
     place: str
+    field: str
     message: str
+
+    def __str__(self) -> str:
+        return ": ".join(part for part in self if part)
 
 
 class Document(NamedTuple):
-    """Plain data, the place (`file:line`) of every path in it, and what was wrong in reading it."""
+    """Plain data, the place (`file:line`) of every path read, the faults of reading, the overrides.
+
+    `overrides` are paths that the command line has set, each with its `--set a.b=3`.
+    """
 
     data: Any
     places: dict[KeyPath, str]
-    problems: tuple[Problem, ...] = ()
+    faults: tuple[Fault, ...] = ()
+    overrides: tuple[tuple[KeyPath, str], ...] = ()
 
     def place(self, path: KeyPath) -> str:
         """Return the place of `path`, or of the nearest part above it that stands somewhere.
 
-        Where the command line changed something inside, that is the place.
+        Where the command line set it, something inside or something around, that is the place.
         """
-        while path and path not in self.places:
+        while path:
+            for exact, place in reversed(self.overrides):
+                if exact[: len(path)] == path[: len(exact)]:
+                    return place
+            if path in self.places:
+                break
             path = path[:-1]
-        changed = [
-            place
-            for inside, place in self.places.items()
-            if path and inside[: len(path)] == path and place.startswith("--set ")
-        ]
-        return changed[-1] if changed else self.places[path]
+        return self.places[path]
 
 
-def _infinite(text: str) -> float:
-    return float(text.replace(".", ""))
+def joined(path: KeyPath) -> str:
+    """Return the keys of a path joined by dots, as messages and the command line have them."""
+    return ".".join(map(str, path))
 
 
-# The core schema of YAML 1.2 (section 10.3.2), in the order in which it is tried. Whole numbers of
-# more than 4000 digits are read as floats: Python refuses to convert them.
-_CORE: tuple[tuple[re.Pattern[str], Callable[[str], object]], ...] = (
-    (re.compile(r"|~|null|Null|NULL"), lambda text: None),
-    (re.compile(r"true|True|TRUE|false|False|FALSE"), lambda text: text.lower() == "true"),
-    (re.compile(r"[-+]?[0-9]{1,4000}"), int),
-    (re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+"), lambda text: int(text, 0)),
-    (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
-    (re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"), _infinite),
-)
-
-
-def _plain(text: str) -> object:
-    """Return what an unquoted word means."""
-    for pattern, convert in _CORE:
-        if pattern.fullmatch(text):
-            return convert(text)
-    return text
-
-
-def _meaning(node: ScalarNode) -> object:
-    return node.value if node.style else _plain(node.value)
+_WORDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float")}
+"""What an unquoted word may be other than text."""
+_ALIASED = 10_000
+"""Values that aliases may add. Without them there is one for each character of the text at most;
+aliases of aliases multiply without end."""
 
 
 @final
 class _Reading:
-    """One walk over the composed nodes; collects places and problems on its way."""
+    """One walk over the composed nodes; collects places and faults on its way."""
 
-    def __init__(self, where: Where) -> None:
-        self.where = where
+    def __init__(self, where: Where, text: str) -> None:
+        self.where, self.most = where, len(text) + _ALIASED
+        self.yaml = YAML(typ="safe", pure=True)
         self.places: dict[KeyPath, str] = {}
-        self.problems: list[Problem] = []
+        self.faults: list[Fault] = []
 
     def line(self, node: Node) -> str:
         return self.where(node.start_mark.line + 1)
 
     def value(self, node: Node, path: KeyPath) -> object:
         self.places.setdefault(path, self.line(node))
+        if len(self.places) > self.most:
+            said = f"got aliases for more than {_ALIASED} values, allowed is a plain tree."
+            raise ScenarioError(f"{self.line(node)}: {said}")
         if node.ctag.handle is not None:
             tag = f"{node.ctag.handle}{node.ctag.suffix}"
             self.blame(node, path, f"got the tag `{tag}`, allowed are values without a tag.")
         if isinstance(node, ScalarNode):
-            return _meaning(node)
+            return self.meaning(node)
         if isinstance(node, MappingNode):
             return self.mapping(node, path)
         return [self.value(item, (*path, i)) for i, item in enumerate(node.value)]
 
+    def meaning(self, node: ScalarNode) -> object:
+        """Return what a word means by YAML 1.2; ruamel.yaml departs from it in two things."""
+        text = str(node.value)
+        if not node.style and re.fullmatch(r"[-+]?\.[0-9]+[eE][0-9]+", text):
+            return float(text)  # it wants a sign in the exponent of `.5e3`
+        if node.tag not in _WORDS or "_" in text:
+            return text  # it takes `1_000` for a number, dates and `<<` for more than text
+        try:
+            return self.yaml.constructor.construct_object(node)
+        except (ValueError, LookupError):  # more digits than Python reads, or a false tag
+            return text
+
     def mapping(self, node: MappingNode, path: KeyPath) -> dict[str | int, object]:
         data: dict[str | int, object] = {}
-        first: dict[str | int, str] = {}
         for key_node, value_node in node.value:
             key = self.key(key_node, path)
+            below = (*path, key)
             if key in data:
-                sentence = f"got this key twice, it stands at {first[key]} already."
-                self.blame(key_node, (*path, key), sentence)
+                sentence = f"got this key twice, it stands at {self.places[below]} already."
+                self.blame(key_node, below, sentence)
                 continue
-            first[key] = self.places[(*path, key)] = self.line(key_node)
-            data[key] = self.value(value_node, (*path, key))
+            self.places[below] = self.line(key_node)
+            data[key] = self.value(value_node, below)
         return data
 
     def key(self, node: Node, path: KeyPath) -> str | int:
         if not isinstance(node, ScalarNode):
             self.blame(node, path, "got a list or mapping as a key, allowed is a word or a number.")
             return "?"
-        key = _meaning(node)
+        key = self.meaning(node)
         return key if type(key) is int else str(node.value)
 
     def blame(self, node: Node, path: KeyPath, message: str) -> None:
-        self.problems.append(Problem(path, self.line(node), message))
+        self.faults.append(Fault(self.line(node), joined(path), message))
 
 
-def _line_of(error: YAMLError, text: str) -> int:
-    """Return the line, counted from 1, at which reading stopped."""
-    if isinstance(error, MarkedYAMLError):
-        mark = error.problem_mark or error.context_mark
-        return 1 if mark is None else mark.line + 1
-    return text.count("\n", 0, error.position) + 1 if isinstance(error, ReaderError) else 1
-
-
-def _reason(error: YAMLError) -> str:
-    if isinstance(error, MarkedYAMLError):
-        # some reasons of the reader begin with "but", as the second half of their context
-        said = str(error.problem or error.context)
-        said = f"{error.context}, {said}" if said.startswith("but ") else said
-        return " ".join(said.split())
+def _reason(error: Exception, text: str) -> tuple[int, str]:
+    """Return the line, counted from 1, at which reading stopped, and why it did."""
     if isinstance(error, ReaderError):
-        return f"the character {error.character:#x} is not allowed"
-    return " ".join(str(error).split())
-
-
-def _compose(text: str, where: Where) -> Node | None:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return YAML(typ="safe", pure=True).compose(text)
-    except YAMLError as error:
-        sentence = f"{where(_line_of(error, text))}: this is not YAML: {_reason(error)}."
-        raise ScenarioError(sentence) from error
-    except (ValueError, ArithmeticError, LookupError, AssertionError) as error:
+        line = text.count("\n", 0, error.position) + 1
+        return line, f"the character {error.character:#x} is not allowed"
+    if not isinstance(error, MarkedYAMLError) or error.problem_mark is None:
         # ruamel.yaml stumbles over a few texts, such as the escape of an impossible character
-        raise ScenarioError(f"{where(1)}: this is not YAML: it cannot be read.") from error
+        return 1, "it cannot be read"
+    # some problems begin with "but", as the second half of their context
+    context = f"{error.context}, " if error.problem.startswith("but ") else ""
+    return error.problem_mark.line + 1, " ".join(f"{context}{error.problem}".split())
 
 
 def _read(text: str, where: Where) -> Document:
-    reading = _Reading(where)
+    reading = _Reading(where, text)
     try:
-        node = _compose(text, where)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            node = reading.yaml.compose(text)
         data = None if node is None else reading.value(node, ())
     except RecursionError as error:
         said = "got values nested too deep or within themselves, allowed is a plain tree."
         raise ScenarioError(f"{where(1)}: {said}") from error
+    except (YAMLError, ValueError, ArithmeticError, LookupError, AssertionError) as error:
+        line, reason = _reason(error, text)
+        raise ScenarioError(f"{where(line)}: this is not YAML: {reason}.") from error
     reading.places.setdefault((), where(1))
-    return Document(data, reading.places, tuple(reading.problems))
+    return Document(data, reading.places, tuple(reading.faults))
 
 
 def read_yaml(text: str, file: str) -> Document:
     """Read one YAML 1.2 document; `file` is the name that places show.
 
     Mappings become dicts with keys of text or int, sequences lists. A repeated key, a tag, or a key
-    that is a list or a mapping becomes a `Problem`.
+    that is a list or a mapping becomes a `Fault`.
 
     Raises:
         ScenarioError: The text is no YAML; one sentence, `file:line: ...`.
@@ -182,12 +179,9 @@ def read_yaml(text: str, file: str) -> Document:
     return _read(text, lambda line: f"{file}:{line}")
 
 
-def _override_place(text: str) -> str:
-    return "--set " + " ".join(text.split())
-
-
-def _override(text: str) -> tuple[KeyPath, Document]:
-    place = _override_place(text)
+def _override(text: str) -> tuple[KeyPath, object, str]:
+    """Return the path, the value and the place of `a.b=3`."""
+    place = "--set " + " ".join(text.split())
     name, equals, value = text.partition("=")
     if not equals:
         raise ScenarioError(f"{place}: got no `=`, allowed is `key=value`, as in `seed=7`.")
@@ -196,49 +190,32 @@ def _override(text: str) -> tuple[KeyPath, Document]:
         said = "got an empty key, allowed are keys joined by dots, as in `simulation.dt=0.01`."
         raise ScenarioError(f"{place}: {said}")
     document = _read(value, lambda line: place)
-    if document.problems:
-        raise ScenarioError(f"{place}: {document.problems[0].message}")
-    return tuple(int(p) if re.fullmatch("[0-9]{1,9}", p) else p for p in parts), document
+    if document.faults:
+        raise ScenarioError(f"{place}: {document.faults[0].message}")
+    path = tuple(int(part) if re.fullmatch("[0-9]{1,9}", part) else part for part in parts)
+    return path, document.data, place
 
 
-def parse_override(text: str) -> tuple[KeyPath, object]:
-    """Split `a.b=3` into its path and its value; the value is read as YAML 1.2.
-
-    Raises:
-        ScenarioError: There is no `=`, a key is empty, or the value is no YAML; one sentence.
-    """
-    path, document = _override(text)
-    return path, document.data
-
-
-def _entered(
-    at: object, part: str | int, path: KeyPath, place: str
-) -> tuple[dict[Any, object] | list[object], Any]:
-    """Return a copy of the container `at`, found at `path`, and the key that `part` means."""
-    if at is None:
-        return {}, part
-    if isinstance(at, dict):
-        # a whole number means an int key (an agent), unless the mapping has it as text already
-        return dict(at), str(part) if str(part) in at else part
-    field = ".".join(map(str, path)) or "the file"
-    if not isinstance(at, list):
-        said = f"got `{part}` inside `{field}`, allowed is a key inside a mapping or a list, but"
-        raise ScenarioError(f"{place}: {said} `{field}` is `{inline_yaml(at)}`.")
-    if not isinstance(part, int) or part >= len(at):
-        said = f"got `{part}` inside `{field}`, allowed is an index of a list of {len(at)}, from 0."
-        raise ScenarioError(f"{place}: {said}")
-    return list(at), part
-
-
-def _replaced(
+def _replace(
     at: object, rest: KeyPath, value: object, done: KeyPath, place: str
 ) -> tuple[object, KeyPath]:
     """Return `at` with `value` set at `rest` below it, and the exact path at which it was set."""
     if not rest:
         return value, done
-    copy, key = _entered(at, rest[0], done, place)
-    old = copy.get(key) if isinstance(copy, dict) else copy[key]
-    copy[key], exact = _replaced(old, rest[1:], value, (*done, key), place)
+    copy: Any = dict(at or {}) if at is None or isinstance(at, dict) else at
+    key: Any = rest[0]
+    if isinstance(copy, dict):
+        # a whole number means an int key (an agent), unless the mapping has it as text already
+        key = str(key) if str(key) in copy else key
+        copy.setdefault(key)
+    elif isinstance(copy, list) and isinstance(key, int) and key < len(copy):
+        copy = list(copy)
+    else:
+        field = joined(done) or "the file"
+        other = f"a key inside a mapping or a list, but `{field}` is {shown(at)}"
+        allowed = f"an index of a list of {len(copy)}, from 0" if isinstance(at, list) else other
+        raise ScenarioError(f"{place}: got `{key}` inside `{field}`, allowed is {allowed}.")
+    copy[key], exact = _replace(copy[key], rest[1:], value, (*done, key), place)
     return copy, exact
 
 
@@ -250,44 +227,49 @@ def apply_overrides(document: Document, overrides: Iterable[str]) -> Document:
     Raises:
         ScenarioError: An override is malformed, or leads into something that is no mapping or list.
     """
-    data, places = document.data, dict(document.places)
     for text in overrides:
-        place = _override_place(text)
-        path, given = _override(text)
-        data, exact = _replaced(data, path, given.data, (), place)
-        places = {at: old for at, old in places.items() if at[: len(exact)] != exact}
-        places.update({exact + below: place for below in given.places})
-        for depth in range(len(exact)):
-            places.setdefault(exact[:depth], place)
-    return Document(data, places, document.problems)
+        path, value, place = _override(text)
+        data, exact = _replace(document.data, path, value, (), place)
+        document = document._replace(data=data, overrides=(*document.overrides, (exact, place)))
+    return document
 
 
-def _quoted(text: str) -> str:
-    if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", text) and _plain(text) is text:
-        return text
-    plain = {char: char for char in map(chr, range(32, 127))} | {'"': '\\"', "\\": "\\\\"}
-    return '"' + "".join(plain.get(char, f"\\U{ord(char):08x}") for char in text) + '"'
+@final
+class _Representer(SafeRepresenter):
+    """Writes every value in full, where ruamel.yaml would put an alias for one that it has met."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+    def text(self, data: object) -> ScalarNode:
+        text = data if isinstance(data, str) else str(data)
+        # Only double quotes keep every character: in the others ruamel.yaml folds U+0085 away.
+        style = None if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_./-]*", text) else '"'
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style)
+
+
+# A mapping may hold anything: what only Python has is written as text, and refused by the schema.
+for _kind in (str, bytes, set, None):
+    _Representer.add_representer(_kind, _Representer.text)
+
+
+def _written(data: object, flow: bool | None) -> str:
+    yaml: Any = YAML(typ="safe", pure=True)
+    yaml.Representer, yaml.default_flow_style = _Representer, flow
+    yaml.width, yaml.sort_base_mapping_type_on_output = sys.maxsize, False
+    stream = io.StringIO()
+    yaml.dump(data, stream)
+    return stream.getvalue().removesuffix("...\n")
 
 
 def inline_yaml(value: object) -> str:
     """Write plain data as YAML 1.2 on one line; `read_yaml` reads it back unchanged."""
-    if isinstance(value, dict):
-        pairs = (f"{inline_yaml(key)}: {inline_yaml(item)}" for key, item in value.items())
-        return "{" + ", ".join(pairs) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(inline_yaml, value)) + "]"
-    if isinstance(value, str):
-        return _quoted(value)
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return repr(value).replace("inf", ".inf").replace("nan", ".nan")
+    return _written(value, True).rstrip("\n")
 
 
 def dump_yaml(data: object) -> str:
-    """Write plain data as YAML 1.2, a line for each key of the outermost mapping."""
-    if not isinstance(data, dict) or not data:
-        return inline_yaml(data) + "\n"
-    return "".join(f"{inline_yaml(key)}: {inline_yaml(value)}\n" for key, value in data.items())
+    """Write plain data as YAML 1.2, the innermost lists and mappings on one line each."""
+    return _written(data, None)
 
 
 def shown(value: object) -> str:

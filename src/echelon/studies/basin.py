@@ -212,8 +212,7 @@ def _telling(model: ControlAffine) -> tuple[int, int]:
     groups = model.state_groups
     if "velocity" in groups and "attitude" in groups:
         moved, turned = model.states_called("velocity"), model.states_called("attitude")
-        with precision("float64"):
-            push = np.abs(linearize(model).A[np.ix_(moved, turned)])
+        push = np.abs(linearize(model).A[np.ix_(moved, turned)])
         row, column = np.unravel_index(int(push.argmax()), push.shape)
         return moved[row], turned[column]
     places = model.position_indices()

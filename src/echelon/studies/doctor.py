@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from echelon.models.check import check_model
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Lemniscate
+from echelon.references.flatness import follow
 from echelon.results.metrics import metrics
 from echelon.scenario import registry
 
@@ -119,11 +121,8 @@ def _flatness() -> Check:
     """Compare the rate of the quadrotor's flat state with its dynamics."""
     model, reference = Quadrotor.crazyflie(), Lemniscate()
 
-    def flat(t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
-
     t = jnp.asarray(1.3)
-    (x, u), (rate, _) = jax.jvp(flat, (t,), (jnp.ones_like(t),))
+    (x, u), (rate, _) = jax.jvp(partial(follow, model, reference), (t,), (jnp.ones_like(t),))
     off = float(jnp.abs(rate - model.velocity(x, u)).max())
     return Check(
         "the quadrotor's flatness map solves its equations", off < 1e-9, f"residual {off:.1g}"

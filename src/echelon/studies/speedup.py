@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 from echelon.certificates.certificate import certify
-from echelon.core.numerics import precision
 from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
@@ -72,8 +71,7 @@ def time_constant(model: ControlAffine, graph: Graph, gain: Gain) -> float:
 
     In it the slowest disagreement falls to 1/e; it is infinite where one does not decay.
     """
-    with precision("float64"):
-        closed = linearize(model).closed(gain.inner)
+    closed = linearize(model).with_inner(gain.inner)
     spectrum = graph.spectrum()
     abscissa = certify(closed, spectrum, gain.P, gain.R, gain.coupling, None).abscissa
     return -1.0 / abscissa if abscissa < 0.0 else float("inf")

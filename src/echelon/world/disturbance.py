@@ -95,10 +95,11 @@ class Disturbance:
             ModelError: a name is no state, group or input of the plant.
         """
         seed = seed if self.seed is None else self.seed
-        rms = _by_state(plant, self.rms)
-        noise = np.asarray(plant.input_scale, float) * _by_input(plant, self.input_rms)
+        rms = plant.per_state(self.rms)
+        # Column j is what noise of its rms on the normalized input j adds to the physical ones.
+        noise = plant.physical(np.diag(_by_input(plant, self.input_rms)), trim=False).T
         return Wind(
-            constant=_by_state(plant, self.constant),
+            constant=plant.per_state(self.constant),
             rms=rms if rms.any() else None,
             noise=noise if noise.any() else None,
             # The two halves of the seed, since a precision could cut it to its lower one.
@@ -150,14 +151,6 @@ def disturbed(plant: ControlAffine, wind: Wind | None, step: jax.Array, agent: j
         return plant.velocity
     push, noise = wind.on_state(step, agent), wind.on_input(step, agent)
     return lambda x, u: plant.velocity(x, u if noise is None else u + noise) + push
-
-
-def _by_state(model: ControlAffine, named: Mapping[str, float]) -> Array:
-    """Return a number for each state, (n,); a state's own wins over its group's."""
-    values = np.zeros(len(model.state_names))
-    for name in sorted(named, key=lambda name: name in model.state_names):
-        values[list(model.states_called(name))] = named[name]
-    return values
 
 
 def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Array:
