@@ -15,9 +15,9 @@ from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.gains.gain import Gain
-from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import feedback
-from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.tracking import tracking_gain
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
@@ -85,9 +85,7 @@ class OptimalTracking(Law):
         """
         if self.states is not None:
             return self
-        riccati, gain = Riccati(coupling=1.0), self.gain
-        gain = riccati.solve(model, graph.spectrum()) if gain is None else gain
-        check_gain_fits(self, model, gain.P.shape, gain.R.shape)
+        gain = tracking_gain(self, model, graph, self.gain)
         times = grid(self.horizon, _STEP, self.planning.interval)
         targets = reference_targets(model, self.reference, times.times)
         start = np.array(targets.states[0])
@@ -95,11 +93,10 @@ class OptimalTracking(Law):
             places = list(model.states_called(name))
             start[places] = targets.states[0][places] + error
         plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
-        unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
         return eqx.tree_at(
             lambda law: (law.gain, law.states, law.inputs),
             self,
-            (unit, plan.states, plan.inputs),
+            (gain, plan.states, plan.inputs),
             is_leaf=lambda leaf: leaf is None,
         )
 
