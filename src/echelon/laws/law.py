@@ -135,8 +135,8 @@ def without_certificates(law: Law) -> Law:
     def strip(node: Any) -> Any:
         if not isinstance(node, Gain):
             return node
-        # `filter_jit` takes floats for constants: this one's, and those of a certificate, would have
-        # every other graph compiled anew.
+        # `filter_jit` takes floats for constants: with this one, or those of a certificate, every
+        # other graph would be compiled anew.
         parts = (np.asarray(node.coupling), None)
         return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
 
