@@ -41,7 +41,7 @@ def initial_states(parts: Parts, seed: int) -> np.ndarray:
     deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
     deviations[list(graph.leaders)] = 0.0
     states = leaders + parts.formation.offsets + deviations
-    _place(states, {key: named[key] for key in named if key not in spreads}, graph)
+    _place(states, {key: value for key, value in named.items() if not isinstance(key, str)}, graph)
     states[[agent for agent in graph.leaders if agent in named]] += error
     return states
 
