@@ -35,6 +35,7 @@ class Motion(eqx.Module):
     @classmethod
     def of(cls, model: ControlAffine, world: World, settings: Settings) -> Self:
         """Return the motion of agents in a world."""
+        # Limits and disturbance are the plant's: a world may give other motors than the laws know.
         plant, disturbance = world.moved(model), world.disturbance
         wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
         return cls(plant, wind, settings.dt, settings.integrator, settings.limits)
@@ -48,6 +49,8 @@ class Motion(eqx.Module):
 
         The delivered inputs (N, m) are held over it, and so is the disturbance of this step.
         """
+        # Integrated with the input held, as a digital controller holds it: the order of the method
+        # stays, since u and the wind are constant within a step.
         integrate = INTEGRATORS[self.integrator]
 
         def one(x: State, u: Input, agent: jax.Array) -> State:
