@@ -1,4 +1,4 @@
-"""What is computed once for a model and then kept, since JAX compiles for every new function."""
+"""What is computed once for a model and then compute, since JAX compiles for every new function."""
 
 import dataclasses
 import functools
@@ -26,17 +26,18 @@ def once_per_model(function: Callable[[ControlAffine], _T]) -> Callable[[Control
     """
 
     @functools.lru_cache(_MOST)
-    def kept(key: "_Key") -> _T:
+    def compute(key: "_Key") -> _T:
         return function(key.model)
 
     @functools.wraps(function)
     def once(model: ControlAffine) -> _T:
         key = _Key(_identify(model), model)
         try:
+            # Here, since a TypeError out of the cache could as well be the function's own.
             hash(key)
         except TypeError:
             return function(model)
-        return kept(key)
+        return compute(key)
 
     return once
 
@@ -55,6 +56,7 @@ def _identify(value: Any) -> Any:
     if isinstance(value, eqx.Module):
         fields = dataclasses.fields(value)
         return type(value), tuple(_identify(getattr(value, field.name)) for field in fields)
+    # With the type, since 1, 1.0 and True are equal and are traced differently.
     if isinstance(value, tuple | list):
         return type(value), tuple(map(_identify, value))
     # Numbers by their bytes too, since 0.0 equals -0.0, and NaN not itself.
