@@ -15,7 +15,7 @@ from echelon.engine.drive import Drive
 from echelon.engine.motion import Motion
 from echelon.engine.result import Result
 from echelon.network.graph import Graph
-from echelon.world.disturbance import disturbed
+from echelon.world.disturbance import disturb
 
 # Below this fraction of its largest value V is made of rounding and its rises mean nothing.
 _ROUNDING = 1e-20
@@ -89,7 +89,7 @@ def _fields(
     """Return the drift under the drive and xdot for x (T, N, n), u (T, N, m) at steps (T,)."""
 
     def one(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> tuple[Any, Any]:
-        return drive.drift(motion.plant, x), disturbed(motion.plant, motion.wind, step, agent)(x, u)
+        return drive.drift(motion.plant, x), disturb(motion.plant, motion.wind, step, agent)(x, u)
 
     over = jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
     return over(x, u, jnp.arange(x.shape[1]), steps)

@@ -38,7 +38,7 @@ from echelon.scenario import registry
 from echelon.scenario.scenario import Fault, Scenario, by_line
 from echelon.scenario.sections import GainSpec
 from echelon.world.disturbance import Disturbance
-from echelon.world.plant import check_plant, varied
+from echelon.world.plant import check_plant, vary_parameters
 from echelon.world.world import World
 
 
@@ -248,7 +248,7 @@ def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
     spec = scenario.plant
     if spec is None:
         return None
-    plant = varied(model, spec.parameters, spec.scale)
+    plant = vary_parameters(model, spec.parameters, spec.scale)
     check_model(plant)
     check_plant(model, plant)
     return plant
