@@ -10,7 +10,7 @@ from echelon.core.numerics import INTEGRATORS
 from echelon.core.types import Input, Inputs, State, States
 from echelon.engine.settings import Settings
 from echelon.models.model import ControlAffine
-from echelon.world.disturbance import Wind, disturbed
+from echelon.world.disturbance import Wind, disturb
 from echelon.world.world import World
 
 
@@ -36,7 +36,7 @@ class Motion(eqx.Module):
     def of(cls, model: ControlAffine, world: World, settings: Settings) -> Self:
         """Return the motion of agents in a world."""
         # Limits and disturbance are the plant's: a world may give other motors than the laws know.
-        plant, disturbance = world.moved(model), world.disturbance
+        plant, disturbance = world.plant_for(model), world.disturbance
         wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
         return cls(plant, wind, settings.dt, settings.integrator, settings.limits)
 
@@ -54,6 +54,6 @@ class Motion(eqx.Module):
         integrate = INTEGRATORS[self.integrator]
 
         def one(x: State, u: Input, agent: jax.Array) -> State:
-            return integrate(disturbed(self.plant, self.wind, step, agent), x, u, self.dt)
+            return integrate(disturb(self.plant, self.wind, step, agent), x, u, self.dt)
 
         return jax.vmap(one)(states, inputs, jnp.arange(len(states)))

@@ -34,6 +34,7 @@ def linearize(model: ControlAffine) -> Linearization:
 
     They are computed once for a model, in float64 whatever the caller's precision.
     """
+    # Gains are kept in files, so they must not depend on the precision of the run that needs them.
     with precision("float64"):
         A, B = _slopes(model, jnp.asarray(np.asarray(model.trim[0], float)))
     return Linearization(_freeze(A), _freeze(B))
@@ -49,6 +50,7 @@ def trim_slopes(model: ControlAffine) -> Array:
     """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: what each trim input puts into A."""
     with precision("float64"):
         slopes = _input_slopes(model, jnp.asarray(np.asarray(model.trim[0], float)))
+    # d(g u*)/dx = sum_k u*_k dg_k/dx: an input scaled by s scales its own term alone.
     u = np.asarray(model.trim[1], np.float64)
     return _freeze(u[:, None, None] * np.moveaxis(np.asarray(slopes), 1, 0))
 
