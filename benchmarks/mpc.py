@@ -107,7 +107,7 @@ def fly(step: Step, periods: int) -> tuple[np.ndarray, np.ndarray, int, float]:
         failures += found is None
         near = near if found is None else found
         x = np.array(helper._flow(x, near.inputs[0])).ravel()
-        near = helper.shifted(near, targets.inputs[-1])
+        near = helper.shift(near, targets.inputs[-1])
     off = float(np.linalg.norm((x - every.states[periods])[:3]))
     return np.array(took), np.array(counts), failures, off
 

@@ -6,8 +6,7 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.engine.laws import on_host
-from echelon.engine.sums import Meter
+from echelon.engine.sums import Meter, on_host
 
 
 def run(model, graph, formation, drive, **more):

@@ -443,7 +443,15 @@ SIMULATIONS = {
     ),
     "no frames": (
         lambda: run(store_every=0),
-        "`store_every` is 0, and must be at least 1.",
+        "`store_every` is 0, and must be a whole number from 1 on.",
+    ),
+    "frames that are no number": (
+        lambda: run(store_every=NAN),
+        "`store_every` is nan, and must be a whole number from 1 on.",
+    ),
+    "a seed with a decimal point": (
+        lambda: run(seed=2.0),
+        "`seed` is 2.0, and must be a whole number from 0 on.",
     ),
     "unknown precision": (
         lambda: run(precision="float16"),

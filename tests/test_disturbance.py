@@ -32,7 +32,7 @@ from echelon.scenario import registry
 from echelon.scenario.build import build, resolve
 from echelon.scenario.scenario import load_scenario, scenario_from_mapping
 from echelon.world.disturbance import Disturbance
-from echelon.world.plant import differences, varied
+from echelon.world.plant import differences, vary_parameters
 
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 CART = DoubleIntegrator(2)
@@ -101,7 +101,7 @@ def test_linear_agents_settle_where_the_linear_system_says():
         Formation.from_offsets(model, TREE, {}),
         leader=TrimInput(),
         follower=Consensus(gain),
-        plant=varied(model, {}, {"B": leak}),
+        plant=vary_parameters(model, {}, {"B": leak}),
         disturbance=Disturbance(constant={"a": 0.3, "b": -0.1, "c": 0.5}),
         initial=rng.normal(size=(4, 3)),
         horizon=80.0,
@@ -254,7 +254,7 @@ def test_a_plant_like_the_model_changes_no_bit(model):
             **more,
         )
 
-    plain, same = fly(), fly(plant=varied(model, {}, {}))
+    plain, same = fly(), fly(plant=vary_parameters(model, {}, {}))
     assert plain.world.plant is None and same.world.plant is not model
     assert np.array_equal(plain.states, same.states)
     assert np.array_equal(plain.inputs, same.inputs)
@@ -269,7 +269,7 @@ def test_vehicles_heavier_than_their_model_sag_by_the_linear_solve():
         Formation.from_offsets(model, TREE, {1: (1, 0), 2: (2, 0), 3: (3, 0)}),
         leader=Tracking(Hover((0, 0, 0))),
         follower=Consensus(gain),
-        plant=varied(model, {}, {"mass": 1.05, "inertia": 1.05}),
+        plant=vary_parameters(model, {}, {"mass": 1.05, "inertia": 1.05}),
         initial={"position": 0.3},
         horizon=60.0,
         dt=0.005,
@@ -340,11 +340,11 @@ def test_every_number_of_every_bundled_model_can_be_scaled(name):
         value = getattr(model, field.name)
         if isinstance(value, bool | int | str) or field.name == "names":
             continue
-        plant = varied(model, {}, {field.name: 1.05})
+        plant = vary_parameters(model, {}, {field.name: 1.05})
         assert np.asarray(getattr(plant, field.name)) == pytest.approx(1.05 * np.asarray(value))
         assert type(plant) is type(model) and plant.state_names == model.state_names
         assert differences(model, plant).startswith(f"`{field.name}` ") == bool(np.any(value))
-        back = varied(plant, {field.name: value}, {})
+        back = vary_parameters(plant, {field.name: value}, {})
         assert differences(model, back).endswith("which is no different")
 
 
@@ -359,7 +359,7 @@ def test_the_rate_of_v_is_its_derivative_in_wind_and_with_another_plant():
         Formation.from_offsets(model, TREE, {1: (1, 0), 2: (2, 0), 3: (3, 0)}),
         leader=Tracking(Hover((0, 0, 0))),
         follower=Consensus(synthesize(model, TREE, Riccati())),
-        plant=varied(model, {}, {"mass": 1.2, "inertia": 0.9}),
+        plant=vary_parameters(model, {}, {"mass": 1.2, "inertia": 0.9}),
         disturbance=Disturbance(
             constant={"vy": 0.5}, rms={"velocity": 1.0}, input_rms={"torque": 3.0}, hold=0.05
         ),
@@ -510,7 +510,7 @@ def test_faults_of_plant_and_disturbance_are_told_with_their_place(section, plac
             "`disturbance` is a `dict`, and must be a `Disturbance`.",
         ),
         (
-            lambda: varied(Linear(np.eye(2), np.eye(2)), {}, {"names": 2.0}),
+            lambda: vary_parameters(Linear(np.eye(2), np.eye(2)), {}, {"names": 2.0}),
             "`names` of `Linear` is ('x1', 'x2'), which no factor can scale.",
         ),
     ],

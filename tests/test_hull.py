@@ -510,8 +510,8 @@ def test_circular_enclosures_agree_with_double_angles_and_the_library(x):
     (c, s), (cosine, sine) = circle(x), circle(2 * x)
     for identity in [
         c * c + s * s + point(-1),
-        c * c + (s * s).scaled(Fraction(-1)) + cosine.scaled(Fraction(-1)),
-        (c * s).scaled(Fraction(2)) + sine.scaled(Fraction(-1)),
+        c * c + (s * s).scale(Fraction(-1)) + cosine.scale(Fraction(-1)),
+        (c * s).scale(Fraction(2)) + sine.scale(Fraction(-1)),
     ]:
         assert identity.holds(0) and identity.hi - identity.lo < Fraction(1, 2**90)
     assert abs(float(c.lo) - math.cos(float(x))) < 1e-13

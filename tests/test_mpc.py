@@ -242,6 +242,12 @@ def test_a_result_says_what_its_agents_were_sent():
             "`horizon` is 0.01 s, and must be at least one `period` of 0.02 s.",
         ),
         ({"iterations": 0}, "`iterations` is 0, and must be a whole number from 1 on."),
+        ({"iterations": 1.5}, "`iterations` is 1.5, and must be a whole number from 1 on."),
+        (
+            {"iterations": float("nan")},
+            "`iterations` is nan, and must be a whole number from 1 on.",
+        ),
+        ({"period": "fast"}, "`period` is fast, and must be a positive finite number of seconds."),
         ({"on_failure": "cry"}, "`on_failure` is `cry`, allowed are `shift`, `stop`."),
         (
             {"solver": "pipq"},
@@ -260,7 +266,7 @@ def test_a_horizon_out_of_range_is_refused(how, sentence):
     ("how", "sentence"),
     [
         ({"state_weight": [1.0]}, "`state_weight` is [1.0], and must be 2 finite numbers that are "
-         "not negative."),
+         "not negative, one for each of `x`, `vx`."),
         ({"input_weight": [0.0]}, "`input_weight` is [0.0], and must be positive."),
         ({"options": {"no_such": 1}}, "`piqp` refuses the problem or its options: "),
     ],

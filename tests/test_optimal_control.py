@@ -317,8 +317,10 @@ def test_a_number_that_is_not_finite_is_told():
          "at least one step."),
         ({"steps": 2.5}, "`steps` is 2.5, and must be a whole number from 1 on; the horizon must "
          "hold at least one step."),
-        ({"horizon": -1.0}, "`horizon` is -1.0, and must be a positive finite number, s."),
-        ({"horizon": float("nan")}, "`horizon` is nan, and must be a positive finite number, s."),
+        ({"horizon": -1.0}, "`horizon` is -1.0, and must be a positive finite number of "
+         "seconds."),
+        ({"horizon": float("nan")}, "`horizon` is nan, and must be a positive finite number of "
+         "seconds."),
         ({"substeps": 0}, "`substeps` is 0, and must be a whole number from 1 on."),
         ({"parameters": -1}, "`parameters` is -1, and must be a whole number from 0 on."),
         ({"transcription": "euler"}, "`transcription` is `euler`, allowed are `shooting`, "

@@ -10,7 +10,7 @@ from echelon.studies.compare import Comparison
 
 
 def write_comparison(
-    comparison: Comparison, told: dict[str, Any], text: str, folder: Path, figures: bool = True
+    comparison: Comparison, summary: dict[str, Any], text: str, folder: Path, figures: bool = True
 ) -> None:
     """Write a comparison: numbers, text, each run's dataset under `runs`, and the figures.
 
@@ -20,12 +20,14 @@ def write_comparison(
     try:
         (folder / "runs").mkdir(parents=True, exist_ok=True)
         for row in comparison.rows:
+            # A method that was refused or failed to begin has no run, and a row all the same.
             if row.flight is not None:
                 save_dataset(row.flight.result, folder / "runs" / f"{row.label}.nc")
-        content = json.dumps(told, indent=2, allow_nan=False)
+        content = json.dumps(summary, indent=2, allow_nan=False)
         (folder / "comparison.json").write_text(content + "\n", "utf-8")
         (folder / "comparison.txt").write_text(text + "\n", "utf-8")
         if figures:
+            # Here, since matplotlib takes long to load, and numbers alone need none of it.
             from echelon.plots.comparison import save_comparison_figures
 
             save_comparison_figures(comparison, folder)

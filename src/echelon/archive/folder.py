@@ -43,15 +43,18 @@ def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[P
     if out is None:
         return [claim_folder(f"compare-{name}", None, force) for name in names]
     if len(names) == 1:
+        # One comparison alone is the folder that was given, and not a folder within it.
         return [claim_folder(names[0], out, force)]
     return [claim_folder(name, out / name, force) for name in names]
 
 
 def _new_folder(parent: Path, name: str) -> Path:
     parent.mkdir(parents=True, exist_ok=True)
+    # Local time, since a person looks for a run by the clock.
     stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for attempt in range(1, 1000):
         folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
+        # Made and not looked for: of two runs that start together only one can make it.
         try:
             folder.mkdir()
         except FileExistsError:
@@ -70,9 +73,11 @@ def _named_folder(out: Path, force: bool) -> Path:
             f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, "
             "or `--force` to replace an earlier run."
         )
+    # Only writing shows that a folder can be written: permission bits know nothing of a full disk.
     probe = out / ".writable"
     probe.touch()
     probe.unlink()
+    # By name, so that `--force` on a wrong folder takes nothing that echelon did not write.
     for name in _OURS:
         path = out / name
         shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)

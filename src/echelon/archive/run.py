@@ -28,6 +28,7 @@ def save_run(
     """
     name = result.provenance.get("scenario") or type(result.model).__name__
     place = claim_folder(name, None if folder is None else Path(folder), force)
+    # The data first: a figure that fails then costs no run.
     write_data(result, place)
     write_findings(result, place, figures)
     return place
@@ -40,6 +41,7 @@ def write_data(result: Result, folder: Path) -> None:
         OutputError: a file cannot be written.
     """
     try:
+        # A run from Python has no scenario file.
         if "scenario_text" in result.provenance:
             text = result.provenance["scenario_text"]
             (folder / "scenario.yaml").write_text(text, "utf-8")
@@ -56,10 +58,12 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> dict[s
     """
     numbers = summary(result)
     try:
+        # NaN is no JSON: whoever reads the file with another parser would stop there.
         content = json.dumps(numbers, indent=2, allow_nan=False)
         (folder / "summary.json").write_text(content + "\n", "utf-8")
         (folder / "report.txt").write_text(report(result) + "\n", "utf-8")
         if figures and len(result.times):
+            # Here, since matplotlib takes long to load, and a run without figures needs none of it.
             from echelon.plots.run import save_figures
 
             v = lyapunov(result)

@@ -25,8 +25,10 @@ def invariant_ellipsoid(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array
         GainError: a mode does not decay.
     """
     closed, n = modes(loop), len(loop.A)
+    # A + alpha/2 I has the Schur vectors of A, so each alpha costs a back substitution alone.
     forms = [scipy.linalg.schur(mode)[:2] for mode in closed]
     (solve,) = scipy.linalg.get_lapack_funcs(("trsyl",), (loop.A,))
+    # From there on A + alpha/2 I does not decay, and no ellipsoid exists.
     limit = -2.0 * float(np.linalg.eigvals(closed).real.max())
 
     def squares(alpha: float) -> Array:
@@ -63,6 +65,7 @@ def _impulse_norms(A: Array, E: Array) -> Array:
     A, (d, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     h, fast = -1.0 / float(np.linalg.eigvals(A).real.max()), 0.1 / float(np.linalg.norm(A, 2))
     flow = exponential(A * h)
+    # The tail beyond h is as small as exp(A h), so h grows by squaring until that is nothing.
     while np.linalg.norm(flow, 1) > 1e-12:
         flow, h = flow @ flow, 2.0 * h
     nodes, weights = np.polynomial.legendre.leggauss(8)
@@ -73,6 +76,7 @@ def _impulse_norms(A: Array, E: Array) -> Array:
         h *= 0.5
         *steps, flow = exponential(A * (h * times))
         starts = np.concatenate([starts, flow @ starts])
+        # In parts, since matrices of all panels and nodes at once need not fit into memory.
         few = np.array_split(starts[:, None], 1 + len(starts) // 4096)
         rows = np.concatenate([np.linalg.norm(np.array(steps) @ some, axis=-1) for some in few])
         parts = 0.5 * h * np.einsum("pij,i->pj", rows, weights)

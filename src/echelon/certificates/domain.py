@@ -59,6 +59,7 @@ class Domain:
 
     def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Array, Array]:
         """Return random deviations (count, n) and inputs (count, m); unbounded states in +-free."""
+        # Seeded, so that a promise by samples can be checked again.
         random = np.random.default_rng(seed)
         low = np.where(np.isfinite(self.lower), self.lower, -free)
         high = np.where(np.isfinite(self.upper), self.upper, free)
@@ -93,6 +94,7 @@ class Domain:
 
     def margins(self) -> Array:
         """Return (n,) how far each state may deviate from the trim to both sides."""
+        # The certified set is symmetric about the trim, so the nearer bound counts.
         return np.minimum(self.upper, -self.lower)
 
 

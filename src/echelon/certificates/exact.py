@@ -23,8 +23,8 @@ _ASYMMETRY = 1e-9  # relative; more than rounding can explain
 class Definiteness(NamedTuple):
     """Whether a matrix is positive definite, and the smallest pivot d of M = L diag(d) L'.
 
-    Elimination ends at the first pivot that fails, which then is the smallest one told. `pivot` is
-    rounded to a float, `holds` is exact.
+    Elimination ends at the first pivot that fails, which then is the smallest. `pivot` is rounded
+    to a float, `holds` is exact.
     """
 
     holds: bool
@@ -68,11 +68,11 @@ class _Scaled(NamedTuple):
         """Return the difference."""
         return self.plus(_Scaled(-other.integers, other.bits))
 
-    def transposed(self) -> "_Scaled":
+    def transpose(self) -> "_Scaled":
         """Return the transpose."""
         return _Scaled(self.integers.T, self.bits)
 
-    def sized(self) -> "_Scaled":
+    def absolute(self) -> "_Scaled":
         """Return the absolute values."""
         return _Scaled(abs(self.integers), self.bits)
 
@@ -81,18 +81,20 @@ class _Scaled(NamedTuple):
         return _Scaled(np.diag(self.integers.sum(axis=1)), self.bits)
 
 
-def _scaled(values: object, name: str) -> _Scaled:
+def _scale(values: object, name: str) -> _Scaled:
     """Return floats (or dyadic fractions) as integers over one power of two.
 
     Raises:
         GainError: a value is not finite or is no dyadic fraction.
     """
+    # As objects they stay Python's numbers: float64 would round an integer above 2^53.
     array = np.asarray(values, object)
     try:
         fractions = [Fraction(x) for x in array.flat]
     except (ValueError, OverflowError, TypeError) as fault:
         raise GainError(f"`{name}` holds an entry that is no finite number.") from fault
     bits = max((f.denominator.bit_length() - 1 for f in fractions), default=0)
+    # A power of two has one bit.
     if any(f.denominator & (f.denominator - 1) for f in fractions):
         raise GainError(f"`{name}` holds an entry that is no whole number over a power of two.")
     integers = np.empty(len(fractions), object)
@@ -100,25 +102,27 @@ def _scaled(values: object, name: str) -> _Scaled:
     return _Scaled(integers.reshape(array.shape), bits)
 
 
-def _symmetrized(values: object, name: str) -> _Scaled:
+def _symmetrize(values: object, name: str) -> _Scaled:
     """Return the symmetric part of a square matrix, exactly.
 
     Raises:
         GainError: the matrix is asymmetric by more than rounding.
     """
-    matrix = _scaled(values, name)
-    skew = matrix.minus(matrix.transposed()).sized().integers
-    if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.sized().integers.max()):
+    matrix = _scale(values, name)
+    skew = matrix.minus(matrix.transpose()).absolute().integers
+    if skew.size and skew.max() > _ASYMMETRY * Fraction(matrix.absolute().integers.max()):
         raise GainError(f"`{name}` is not symmetric, and must be.")
-    both = matrix.plus(matrix.transposed())
+    both = matrix.plus(matrix.transpose())
+    # One bit more halves, without rounding.
     return _Scaled(both.integers, both.bits + 1)
 
 
-def _positive(matrix: _Scaled) -> Definiteness:
+def _definiteness(matrix: _Scaled) -> Definiteness:
     """Say whether a symmetric matrix is positive definite."""
     rest, previous, smallest = matrix.integers, 1, None
     while len(rest):
         pivot, row, rest = rest[0, 0], rest[0, 1:], rest[1:, 1:]
+        # The ratio of successive minors is the pivot of Gauss.
         size = Fraction(pivot, previous)
         smallest = size if smallest is None else min(smallest, size)
         if pivot <= 0:
@@ -159,16 +163,17 @@ def prove_contraction(
     """
     start = time.perf_counter()
     _check_shapes(vertices, error, B, P)
-    metric, slack = _symmetrized(P, "P"), _scaled(error, "error")
-    weight, speed = _scaled(rho, "rho"), _scaled(rate, "rate")
+    metric, slack = _symmetrize(P, "P"), _scale(error, "error")
+    weight, speed = _scale(rho, "rho"), _scale(rate, "rate")
     if weight.integers[()] < 0 or (slack.integers < 0).any():
         raise GainError("`rho` and `error` must not be negative.")
-    found = _positive(metric)
+    found = _definiteness(metric)
     smallest, proved, failed = found.pivot, int(found.holds), None if found.holds else -1
-    constant = _constant_part(metric, slack, _scaled(B, "B"), weight, speed)
+    # The same for all vertices, so that each costs one product and one elimination.
+    constant = _constant_part(metric, slack, _scale(B, "B"), weight, speed)
     for number, vertex in enumerate(vertices) if found.holds else ():
-        drift = metric.times(_scaled(vertex, "vertices"))
-        found = _positive(constant.minus(drift.plus(drift.transposed())))
+        drift = metric.times(_scale(vertex, "vertices"))
+        found = _definiteness(constant.minus(drift.plus(drift.transpose())))
         smallest = min(smallest, found.pivot)
         if not found.holds:
             failed = number
@@ -183,10 +188,10 @@ def _constant_part(
 ) -> _Scaled:
     """Return rho P B B'P - 2 rate P minus the diagonal that errors of A may add."""
     gain = metric.times(B)
-    feedback = gain.times(gain.transposed()).times(weight)
+    feedback = gain.times(gain.transpose()).times(weight)
     wanted = metric.times(speed)
-    spread = metric.sized().times(slack)
-    lost = spread.plus(spread.transposed()).row_sums()
+    spread = metric.absolute().times(slack)
+    lost = spread.plus(spread.transpose()).row_sums()
     return feedback.minus(wanted.plus(wanted)).minus(lost)
 
 

@@ -46,7 +46,7 @@ def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     Raises:
         GainError: the Jacobian depends on a state that the domain leaves unbounded.
     """
-    return _over(model_jacobian(model), model, domain)
+    return _enclose(model_jacobian(model), model, domain)
 
 
 @kept
@@ -64,10 +64,10 @@ def weighted_jacobians(model: ControlAffine, domain: Domain, R: Array) -> Jacobi
         g = model.normalized_input_map(x)
         return jnp.concatenate([jacobian(x, v), g @ jnp.asarray(inverse, x.dtype) @ g.T], axis=1)
 
-    return _over(pair, model, domain)
+    return _enclose(pair, model, domain)
 
 
-def _over(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians:
+def _enclose(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians:
     """Return a matrix function of state and normalized input over a domain."""
     names = [*model.state_names, *model.input_names]
     with precision("float64"):
@@ -100,12 +100,14 @@ def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
             hull = jacobian_hull(slope, *_boxes(model, domain))
     except GainError:
         return False
+    # g is proved constant where the hull of its slopes is the matrix 0 alone.
     return not (hull.vertices.any() or hull.error.any())
 
 
 def _boxes(model: ControlAffine, domain: Domain) -> tuple[Box, Box]:
     """Return the domain as absolute states and normalized inputs; unbounded states in +-1."""
     trim = np.asarray(model.trim[0], float)
+    # Any stand-in will do: a Jacobian that depends on such a state is refused afterwards.
     low = np.where(np.isfinite(domain.lower), domain.lower, -1.0)
     high = np.where(np.isfinite(domain.upper), domain.upper, 1.0)
     return Box(trim + low, trim + high), Box(domain.input_lower, domain.input_upper)
@@ -116,10 +118,10 @@ def _check_bounded(model: ControlAffine, domain: Domain, hull: Hull) -> None:
     used = {atom.name for atom in hull.atoms}
     for k, name in enumerate(model.state_names):
         if name in used and not np.isfinite([domain.lower[k], domain.upper[k]]).all():
-            raise _unbounded(model, name)
+            raise _unbounded_error(model, name)
 
 
-def _unbounded(model: ControlAffine, name: str) -> GainError:
+def _unbounded_error(model: ControlAffine, name: str) -> GainError:
     return GainError(
         f"the domain leaves `{name}` unbounded, and the Jacobian of "
         f"`{type(model).__name__}` depends on it; give it a bound."
@@ -149,9 +151,10 @@ def _sample(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
 
     found = matrices(both)
     for k in np.flatnonzero(~np.isfinite(box).all(axis=0)):
+        # 3 is no multiple of pi, so that no sine hides its state.
         far = both + np.where(np.arange(len(base)) == k, 3.0, 0.0)
         if np.abs(matrices(far) - found).max() > 1e-12 * np.abs(found).max():
-            raise _unbounded(model, model.state_names[k])
+            raise _unbounded_error(model, model.state_names[k])
     return found
 
 

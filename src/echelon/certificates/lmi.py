@@ -7,7 +7,7 @@ eigenvalue lambda obeys A - c lambda B R^-1 B'P. So with
     P A_k + A_k'P - rho P B R^-1 B'P <= -2 rate P   for every k
 
 any coupling c >= rho / (2 lambda_min) makes V = sum delta_i'P delta_i fall like exp(-2 rate t) or
-faster: the strength rho = 2 c lambda_min is all that a metric asks of the graph. A solver proposes
+faster: the strength rho = 2 c lambda_min is all that a metric needs of the graph. A solver proposes
 P and decides nothing: eigenvalues in the caller's own states accept or refuse it.
 """
 
@@ -21,7 +21,7 @@ import scipy.linalg
 
 from echelon.certificates.modes import AXIS, axis_modes, obstacle, vertices_of
 from echelon.core.errors import GainError, MissingExtraError, listing
-from echelon.core.linear import in_words, riccati, symmetric_part
+from echelon.core.linear import in_words, riccati, symmetric_basis, symmetric_part
 from echelon.core.types import Array
 
 _STRICT = 1e-6  # the solver must keep, in scaled states, so that its own error does not reach zero
@@ -96,6 +96,7 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
             "the domain, or take a method with feedback."
         )
     cp = _cvxpy()
+    # One scaling for all vertices: that which balances the sum of their sizes.
     d = scipy.linalg.matrix_balance(np.abs(As).sum(0), permute=False, separate=True)[1][0]
     basis, slopes = _face(As * d / d[:, None])
     x, kappa, unit = cp.Variable(len(basis)), cp.Variable(), np.diag(d**2)
@@ -103,6 +104,7 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
     cones = [P - unit >> 0, kappa * unit - P >> 0, kappa <= condition_max]
     solved = _least(cp, kappa, cones, _gaps(cp, slopes, x))
     P = symmetric_part(P.value / d[:, None] / d) if solved else np.zeros_like(unit)
+    # A P at the bound has no optimum there: it would go on growing, as where none exists.
     if _condition(P) >= 0.999 * condition_max or not falls(P, As):
         raise GainError(
             f"no constant metric of condition number below {condition_max:g} was found that no "
@@ -110,6 +112,7 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
             "damping by an inner loop, or take a method with feedback."
         )
     found = _measure(P / np.linalg.eigvalsh(P)[0], As, None, 0.0)
+    # A drift that only must not grow is promised no rate; what is below 0 is rounding.
     return found._replace(rate=max(0.0, found.rate))
 
 
@@ -133,14 +136,16 @@ def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) 
     """
     cp, As = _cvxpy(), vertices_of(As)
     M, S = _scale(As, B, Q, R), _weigh_inputs(B, R) if W is None else W
-    basis, one = _basis(len(M)), np.eye(len(M))
+    basis, one = symmetric_basis(len(M)), np.eye(len(M))
     values, vectors = np.linalg.eigh(Q)
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T @ np.linalg.inv(M)
     v, y = cp.Variable(len(basis)), cp.Variable(len(basis))
     Z = cp.Variable(one.shape, symmetric=True)
     # Y stands for V Q V, V = P^-1, once for all vertices: each vertex's own cone stays n x n.
     V, Y = _matrix(cp, basis, v), _matrix(cp, basis, y)
+    # Schur complements: Z >= V^-1 = P and Y >= V Q V.
     cones = [cp.bmat([[Z, one], [one, V]]) >> 0, cp.bmat([[Y, V @ root.T], [root @ V, one]]) >> 0]
+    # Times V from both sides the inequality is A V + V A' + V Q V - S <= 0, linear in V and Y.
     gaps = _gaps(cp, _stack(As, S, M, basis), cp.hstack([v, y, [-1.0]]))
     solved = _least(cp, cp.trace(M @ M.T @ Z), cones, gaps)
     P = _unscale(V.value, M) if solved else None
@@ -180,12 +185,13 @@ def contraction(
     n = As.shape[-1]
     M = _scale(As + rate * np.eye(n), B, np.eye(n), np.eye(B.shape[-1]))
     S = _weigh_inputs(B, None) if W is None else W
-    # The solver's error grows with V: it is asked for a little more than eigenvalues must show.
+    # The solver's error grows with V: a little more is requested than eigenvalues must show.
     more = _STRICT * np.linalg.norm(M @ As @ np.linalg.inv(M), axis=(1, 2)).max()
-    shifted, basis, unit = As + (rate + more) * np.eye(n), _basis(n), M @ M.T
+    shifted, basis, unit = As + (rate + more) * np.eye(n), symmetric_basis(n), M @ M.T
     v, rho = cp.Variable(len(basis)), cp.Variable(nonneg=True)
     V = _matrix(cp, basis, v)
     gaps = _gaps(cp, _stack(shifted, S, M, basis[:0]), cp.hstack([v, -rho]))
+    # A thousandth inside the bound, which the solver's error may then use up.
     solved = _least(cp, rho, [V - unit >> 0, 0.999 * condition_max * unit - V >> 0], gaps)
     P = _unscale(V.value, M) if solved else None
     # A little more strength than the solver's makes up for its error and costs nothing else.
@@ -194,7 +200,7 @@ def contraction(
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(
             f"no constant metric of condition number up to {condition_max:g} was found that one "
-            f"gain contracts at {rate:g} 1/s on all of the {len(As)} matrices; ask a smaller "
+            f"gain contracts at {rate:g} 1/s on all of the {len(As)} matrices; take a smaller "
             "`rate` or shrink the domain."
         )
     return _measure(P, As, S, enough[0])
@@ -214,6 +220,7 @@ def _drift(P: Array, As: Array, S: Array | None, strength: float) -> Array:
 
 
 def _rate(P: Array, As: Array, S: Array | None, strength: float) -> float:
+    # The pencil (X, P) has the eigenvalues of L^-1 X L^-T for P = L L', which is symmetric.
     inverse = np.linalg.inv(np.linalg.cholesky(P))
     X = inverse @ _drift(P, As, S, strength) @ inverse.T
     return -0.5 * float(np.linalg.eigvalsh(0.5 * (X + X.swapaxes(-1, -2))).max())
@@ -239,6 +246,7 @@ def _measure(P: Array, As: Array, S: Array | None, rho: float) -> Metric:
 
 def _cvxpy() -> Any:
     try:
+        # Imported here: both are an extra, and slow to load.
         import clarabel  # noqa: F401
         import cvxpy
     except ImportError:
@@ -263,11 +271,14 @@ def _least(cp: Any, goal: Any, cones: list[Any], gaps: list[Any]) -> bool:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
+                # What a solver calls inaccurate may do, and what it calls solved may not:
+                # eigenvalues decide.
                 cp.Problem(cp.Minimize(goal), cones).solve(solver=cp.CLARABEL, accept_unknown=True)
             except cp.SolverError:
                 return False
         if goal.value is None or not np.isfinite(goal.value):
             return False
+        # Half of the margin, since the solver keeps the whole of it to its own accuracy only.
         over = np.array([np.linalg.eigvalsh(gap.value)[-1] for gap in gaps]) + 0.5 * _STRICT
         new = [k for k in np.argsort(-over)[:_BATCH].tolist() if over[k] > 0.0 and k not in active]
         if not new:
@@ -277,14 +288,6 @@ def _least(cp: Any, goal: Any, cones: list[Any], gaps: list[Any]) -> bool:
 def _matrix(cp: Any, basis: Array, x: Any) -> Any:
     """Return sum_i x_i basis_i."""
     return cp.reshape(basis.reshape(len(basis), -1).T @ x, basis.shape[1:], order="C")
-
-
-def _basis(n: int) -> Array:
-    """Return a basis of the symmetric matrices, (n (n + 1) / 2, n, n)."""
-    i, j = np.triu_indices(n)
-    basis = np.zeros((len(i), n, n))
-    basis[range(len(i)), i, j] = basis[range(len(i)), j, i] = 1.0
-    return basis
 
 
 def _pull(As: Array, basis: Array) -> Array:
@@ -305,7 +308,7 @@ def _gaps(cp: Any, slopes: list[Array], x: Any) -> list[Any]:
 def _stack(As: Array, S: Array, M: Array, more: Array) -> list[Array]:
     """Return A_k E_i + E_i A_k', then `more`, then S_k, in the states M x, for each k."""
     S = np.broadcast_to(M @ S @ M.T, As.shape)
-    pulls = _pull(M @ As @ np.linalg.inv(M), _basis(len(M)))
+    pulls = _pull(M @ As @ np.linalg.inv(M), symmetric_basis(len(M)))
     return [np.concatenate([X, more, s[None]]) for X, s in zip(pulls, S, strict=True)]
 
 
@@ -330,7 +333,7 @@ def _face(A: Array) -> tuple[Array, list[Array]]:
     to be negative, and the solver must not look for any.
     """
     A = A.swapaxes(1, 2) / (np.abs(A).max() or 1.0)
-    basis = _basis(A.shape[-1])
+    basis = symmetric_basis(A.shape[-1])
     equations = [
         np.moveaxis(X @ part, 0, -1).reshape(-1, len(basis))
         for X, a in zip(_pull(A, basis), A, strict=True)
@@ -339,6 +342,7 @@ def _face(A: Array) -> tuple[Array, list[Array]]:
     ]
     if not equations:
         return basis, list(_pull(A, basis))
+    # R has the right singular vectors of the equations and far fewer rows.
     _, size, right = np.linalg.svd(np.linalg.qr(np.vstack(equations), mode="r"))
     allowed = right[int((size > AXIS).sum()) :]
     basis = np.tensordot(allowed, basis, 1) if len(allowed) else basis  # then there is no point

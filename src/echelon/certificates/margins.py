@@ -14,6 +14,7 @@ import scipy.linalg
 import scipy.optimize
 
 from echelon.core.errors import GainError
+from echelon.core.linear import symmetric_basis
 from echelon.core.types import Array
 
 _FAR = 1e6  # factors on the coupling beyond this count as infinite
@@ -220,6 +221,7 @@ def string_gain(loop: ClosedLoop) -> StringGain:
     def sizes(w: Array) -> Array:
         return np.linalg.norm(K @ _resolvent(closed, w, loop.B), ord=2, axis=(-2, -1))
 
+    # The sweep is logarithmic, so w = 0 is added by hand.
     grid = np.append(0.0, _frequencies([loop.A, closed]))
     grid = np.union1d(grid, _peaks(lambda w: float(sizes(np.array([w]))[0]), grid, sizes(grid)))
     at = int(sizes(grid).argmax())
@@ -249,6 +251,8 @@ def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -
     """Return where stability ends on the way from k over the candidates `edges` to `end`."""
     inside = k
     for here, beyond in itertools.pairwise([*edges, end]):
+        # Stability cannot change between neighbouring candidates, so their middle speaks for both
+        # ends.
         probe = 0.5 * (here + beyond)
         if not decays(probe):
             outside = probe
@@ -262,13 +266,13 @@ def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -
 
 def _crossings(A: Array, G: Array, top: float) -> Array:
     """Return the k in (0, top) at which two eigenvalues of A - k G may add to zero, ascending."""
-    i, j = np.triu_indices(len(A))
-    basis = np.zeros((len(i), *A.shape))
-    basis[range(len(i)), i, j] = basis[range(len(i)), j, i] = 1.0
+    basis, (i, j) = symmetric_basis(len(A)), np.triu_indices(len(A))
     fixed, moved = (((M @ basis) + (M @ basis).swapaxes(1, 2))[:, i, j].T for M in (A, G))
+    # As pairs, since G has few inputs' rank and most of the quotients are infinite.
     over, under = np.asarray(scipy.linalg.eigvals(fixed, moved, homogeneous_eigvals=True))
     with np.errstate(divide="ignore", invalid="ignore"):
         k = over / under
+    # Rounding splits double roots into complex pairs; a candidate too many costs one sample.
     real = np.isfinite(k) & (np.abs(k.imag) <= 1e-3 * np.abs(k)) & (k.real > 0.0)
     return np.unique(k.real[real & (k.real < top)])
 
@@ -286,6 +290,7 @@ def _frequencies(matrices: list[Array]) -> Array:
     width = np.maximum(np.abs(poles.real), 1e-6 * np.abs(poles))
     steps = np.geomspace(0.05, 20.0, 12)
     near = np.abs(poles.imag)[:, None] + width[:, None] * np.concatenate([-steps, steps])
+    # 400 frequencies a decade.
     sweep = np.geomspace(1e-9 * top, top, 3600)
     return np.union1d(sweep, near[near > sweep[0]])
 
@@ -307,9 +312,11 @@ def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
 
 def _unobservable(A: Array, C: Array) -> Array:
     """Return an orthonormal basis, (n, r), of the largest invariant subspace where C vanishes."""
+    # Each row in units of its own, so that a small torque counts like a large thrust.
     rows = np.linalg.norm(C, axis=1, keepdims=True)
     basis = _null_space(C / np.where(rows > 0.0, rows, 1.0), _HIDDEN)
     while basis.shape[1]:
+        # What A leads out of the subspace; the directions without it are kept, until all are.
         leak = A @ basis - basis @ (basis.T @ A @ basis)
         kept = _null_space(leak, _HIDDEN * float(np.linalg.norm(A, 2)))
         if kept.shape[1] == basis.shape[1]:
@@ -326,6 +333,7 @@ def _null_space(M: Array, tolerance: float) -> Array:
 
 def _sparse(vectors: Array) -> Array:
     """Return unit vectors of the same span, (n, r), each alone at one state where it is large."""
+    # Through the pivots each column is 1 at its own state and 0 at those of the others.
     pivots = np.asarray(scipy.linalg.qr(vectors.conj().T, pivoting=True)[-1])[: vectors.shape[1]]
     sparse = vectors @ np.linalg.inv(vectors[pivots])
     sparse = np.where(np.abs(sparse) > _HIDDEN, sparse, 0.0)

@@ -37,13 +37,19 @@ def obstacle(As: Array) -> Obstacle | None:
     space of A - s I do not pair. Singular values decide, relative to the norm of the balanced A.
     """
     for vertex, A in enumerate(vertices_of(As)):
+        # The units of the states must not decide what counts as zero.
         A = scipy.linalg.matrix_balance(A, permute=False)[0]
         for s, right, left in axis_modes(A):
+            # Left and right null spaces pair off where there is no chain; a chain's two ends are
+            # orthogonal.
             _, cosines, turn = np.linalg.svd(left.conj().T @ right)
             lost = right @ turn[cosines < _DEFECTIVE].conj().T
             if lost.size:
+                # (A - s I) w = v: the vector w that feeds the end v of a chain, and so makes it
+                # grow.
                 feeding = np.linalg.lstsq(A - s * np.eye(len(A)), lost)[0]
                 return Obstacle(vertex, s, True, _support(np.hstack([lost, feeding])))
+        # After the axis, since rounding scatters a Jordan block to both sides of it.
         values, vectors = np.linalg.eig(A)
         worst = int(np.argmax(np.real(values)))
         if values[worst].real > AXIS * np.linalg.norm(A, 2):
@@ -67,9 +73,12 @@ def axis_modes(A: Array) -> list[tuple[complex, Array, Array]]:
     """
     size, values = float(np.linalg.norm(A, 2)) or 1.0, np.linalg.eigvals(A)
     points: dict[float, complex] = {}
+    # A block of k scatters by eps^(1/k), which is 1e-3 for five: hence radii from a tenth of the
+    # norm.
     for radius in size * 10.0 ** np.arange(-1.0, -11.0, -1.0):
         close = np.abs(values[:, None] - values) <= radius
         for mean in (close @ values) / close.sum(1):
+            # A is real, so -w mirrors w.
             if abs(mean.real) <= AXIS * size and mean.imag >= -AXIS * size:
                 points.setdefault(round(float(mean.imag / size), 10), 1j * mean.imag)
     cuts = [(s, *np.linalg.svd(A - s * np.eye(len(A)))) for s in points.values()]

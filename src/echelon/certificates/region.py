@@ -96,12 +96,14 @@ def contracting_region(
     domain, found, A, W = pairs
     strength, constant = 2.0 * coupling * spectrum.low, W is None
     # P A + A'P - strength P W P is affine in a pair, so the corners of the pairs' hull suffice.
+    # With A - strength W P / 2 the drift's formula gives P A + A'P - strength P W P.
     rate = rate_of(P, A, B, R, strength) if W is None else rate_of(P, A - 0.5 * strength * W @ P)
     if rate <= 0.0:
         return None
     kind, why = found.kind, found.why
     if exact and constant and kind is Kind.VERTICES:
         shown = float(Fraction(rate * _SAFE).limit_denominator(10**6))
+        # B R^-1 B' as a product of a matrix with its own transpose, the form that the proof takes.
         weighted = B @ np.linalg.cholesky(np.linalg.inv(R))
         proof = prove_contraction(A, found.error, weighted, P, strength, shown)
         kind, rate = (Kind.PROOF, shown) if proof.holds else (kind, rate)
@@ -134,7 +136,8 @@ def drift_region(
     """
     reach = radius(domain, P)
     if reach is not None and not has_constant_input_map(model, domain):
-        # Then sum delta_i'P delta_i may rise; V = delta'(L kron P) delta may not.
+        # Then S = sum delta_i'P delta_i may rise, V = delta'(L kron P) delta may not, and
+        # lambda_min S <= V <= lambda_max S.
         reach *= float(np.sqrt(spectrum.low / spectrum.high))
     return RegionCertificate(
         kind=found.kind,
@@ -151,6 +154,7 @@ def drift_region(
 
 def radius(domain: Domain, P: Array) -> float | None:
     """Return r with {delta'P delta <= r^2} inside the domain: r^2 = min_j margin_j^2 / W_jj."""
+    # delta_j reaches r sqrt(W_jj) on {delta'P delta <= r^2}, by Cauchy and Schwarz in the metric P.
     margins, W = domain.margins(), np.linalg.inv(P)
     bounded = np.isfinite(margins)
     if not bounded.any():

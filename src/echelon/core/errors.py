@@ -1,7 +1,7 @@
-"""What can go wrong, and how it is told: errors for bad input, outcomes for runs.
+"""What can go wrong, and how it is reported: errors for bad input, outcomes for runs.
 
 Bad input raises at once; its message is one sentence that says what was got and what is allowed. A
-numerical event during a run is not an exception but an `Outcome`, kept beside the data that was
+numerical event during a run is not an exception but an `Outcome`, kept with the data that was
 computed.
 """
 
@@ -59,7 +59,7 @@ class ScenarioError(EchelonError):
 
 
 class OutputError(EchelonError):
-    """Results cannot be written where they were asked for."""
+    """Results cannot be written where they were requested."""
 
 
 class MissingExtraError(EchelonError):
@@ -78,6 +78,7 @@ class Outcome(enum.Enum):
     @property
     def exit_code(self) -> int:
         """Exit code of the command line for a run that ended so."""
+        # 130 is 128 + SIGINT, what shells report of a program that was interrupted.
         return {Outcome.COMPLETED: 0, Outcome.DIVERGED: 3, Outcome.INTERRUPTED: 130}[self]
 
 

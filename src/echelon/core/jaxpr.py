@@ -53,7 +53,9 @@ def evaluate(
         arguments: arrays of entries.
         algebra: what the function's equations mean for them.
     """
+    # A trace holds its constants: in float32 they would be rounded before any rule sees them.
     with precision("float64"):
+        # Shapes alone shape a trace, so zeros stand for entries that JAX cannot take.
         closed = jax.make_jaxpr(function)(*(jnp.zeros(a.shape) for a in arguments))
         return walk(closed.jaxpr, closed.consts, arguments, algebra)
 
@@ -79,6 +81,7 @@ def walk(
         literal = hasattr(variable, "val")
         return algebra.lift(np.asarray(variable.val)) if literal else values[variable]
 
+    # Equations stand in order and assign once, so one pass binds every variable before its use.
     for equation in jaxpr.eqns:
         results = _apply(equation, [read(v) for v in equation.invars], algebra)
         values |= dict(zip(equation.outvars, results, strict=True))
@@ -89,12 +92,14 @@ def _apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[
     """Return the results of one equation."""
     name = equation.primitive.name
     if name in INLINED:
-        inner = _called(equation)
+        inner = _inner_jaxpr(equation)
         # What `checkpoint` calls is a jaxpr without constants of its own.
         jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
         return walk(jaxpr, consts, operands, algebra)
+    # What numbers alone make is folded, so that rules see constants and not what made them.
     if all(a.dtype != object for a in operands):
         return [algebra.lift(a) for a in compute(equation, operands)]
+    # It only keeps XLA from reordering, and nothing is reordered here.
     if name == "optimization_barrier":
         return operands
     if name in PLACED:
@@ -138,7 +143,7 @@ ADDED = {"scatter-add", "scatter_add", "cumsum"}
 """Primitives that are linear in their entries, with weights of any kind."""
 
 
-def _called(equation: Any) -> Any:
+def _inner_jaxpr(equation: Any) -> Any:
     """Return the jaxpr, closed or not, that an equation of an `INLINED` primitive calls."""
     return next(
         equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
@@ -147,6 +152,7 @@ def _called(equation: Any) -> Any:
 
 def each(function: Callable[..., object], *arrays: np.ndarray) -> np.ndarray:
     """Return a function of one entry of each array, entry by entry."""
+    # Of arrays without axes `frompyfunc` makes a bare entry, and the walk needs arrays throughout.
     return np.asarray(np.frompyfunc(function, len(arrays), 1)(*arrays), dtype=object)
 
 
@@ -163,6 +169,7 @@ def _place(
     pool, places = _label_entries(operands)
 
     def entry(place: float) -> Any:
+        # `gather` fills what it reads from outside with NaN, which no comparison holds for.
         return pool[int(place)] if 0.0 <= place < len(pool) else outside()
 
     return [each(entry, r) for r in compute(equation, places)]
@@ -178,6 +185,7 @@ def _add(
         data = [unit[a.astype(int)] if a.dtype == float else jnp.asarray(a) for a in places]
         return equation.primitive.bind(*data, **equation.params)
 
+    # Linear in its data, so that the images of unit vectors are the columns of its matrix.
     weights = np.asarray(jax.vmap(result)(jnp.eye(len(pool))))
     total = np.full(weights.shape[1:], constant(0.0), object)
     for entry, weight in zip(pool, weights, strict=True):
@@ -190,9 +198,11 @@ def _label_entries(operands: Sequence[np.ndarray]) -> tuple[list[Any], list[np.n
     pool: list[Any] = []
     places = []
     for a in operands:
+        # Integers are indices: they say where, not what.
         if a.dtype.kind in "iu":
             places.append(a)
             continue
+        # Floats, since JAX moves them in the place of float data; exact up to 2^53.
         places.append(np.arange(len(pool), len(pool) + a.size, dtype=float).reshape(a.shape))
         pool += list(a.flat)
     return pool, places
@@ -212,6 +222,7 @@ def reduction(join: Callable[[Any, Any], Any], of_none: Any) -> Rule:
     joined = np.frompyfunc(join, 2, 1)
 
     def reduce(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+        # From the last one on, so that the numbers of the axes to come still hold.
         for axis in sorted(params["axes"], reverse=True):
             begin = {} if x.shape[axis] else {"initial": of_none}
             x = np.asarray(joined.reduce(x, axis=axis, **begin), object)
@@ -233,6 +244,7 @@ def _dot(zero: Any, params: Mapping[str, Any], a: np.ndarray, b: np.ndarray) -> 
     found = np.empty((left.shape[0], left.shape[1], right.shape[1]), object)
     for i, j, k in np.ndindex(*found.shape):
         products = (p * q for p, q in zip(left[i, j], right[i, k], strict=True))
+        # A plain `sum` would begin at the integer 0, which an entry need not know how to add.
         found[i, j, k] = sum(products, start=zero)
     return found.reshape(batch + rows + columns)
 
@@ -245,6 +257,7 @@ def _matrix_form(
     batch_shape = tuple(x.shape[axis] for axis in batch)
     free_shape = tuple(x.shape[axis] for axis in free)
     inner = math.prod(x.shape[axis] for axis in contracted)
+    # Sizes are spelled out, as NumPy cannot infer a -1 next to an axis of length zero.
     moved = x.transpose([*batch, *free, *contracted])
     return (
         moved.reshape(math.prod(batch_shape), math.prod(free_shape), inner),
@@ -262,6 +275,7 @@ def _broadcast(params: Mapping[str, Any], x: np.ndarray, *_: Any) -> np.ndarray:
 
 def _slice(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     starts, ends = params["start_indices"], params["limit_indices"]
+    # JAX leaves strides out where all of them are 1.
     steps = params["strides"] or [1] * x.ndim
     return x[tuple(slice(*cut) for cut in zip(starts, ends, steps, strict=True))]
 
@@ -280,6 +294,7 @@ COMMON: dict[str, Rule] = {
     "transpose": lambda params, x: x.transpose(params["permutation"]),
     "concatenate": lambda params, *xs: np.concatenate(xs, axis=params["dimension"]),
     "stack": lambda params, *xs: np.stack(xs, axis=params["axis"]),
+    # Exact entries have no memory, no precision and, once traced, no derivative.
     **{
         name: lambda params, x: x
         for name in ("copy", "copy_p", "reduce_precision", "stop_gradient")

@@ -22,6 +22,8 @@ def held_step(
     n, m = B.shape
     unit = np.eye(n + m)
     if integrator is None:
+        # exp([[A, B], [0, 0]] dt) = [[e^(A dt), G], [0, I]] with G = int_0^dt e^(A s) B ds
+        # (Van Loan).
         block = np.zeros((n + m, n + m))
         block[:n, :n], block[:n, n:] = A, B
         moved = scipy.linalg.expm(block * dt)[:n]
@@ -57,6 +59,7 @@ def longest_step(
     slowest mode's. Gains are (K, m, n).
     """
     poles = np.linalg.eigvals(A - B @ gains)
+    # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
     dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
 
     def decays(dt: float) -> bool:
@@ -67,6 +70,7 @@ def longest_step(
         if dt > end:
             return float("inf")
     low, high = dt, 1.1 * dt
+    # 20 halvings of a tenth leave 1e-7 of the step.
     for _ in range(20):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if decays(middle) else (low, middle)
@@ -75,6 +79,7 @@ def longest_step(
 
 def in_words(eigenvalue: complex) -> str:
     """Return an eigenvalue as text, without an imaginary part that is zero."""
+    # Adding zero makes 0.0 of -0.0, whose sign would read as decay.
     real = f"{eigenvalue.real + 0.0:.3g}"
     return real if eigenvalue.imag == 0.0 else f"{real} +- {abs(eigenvalue.imag):.3g}i"
 
@@ -82,6 +87,14 @@ def in_words(eigenvalue: complex) -> str:
 def symmetric_part(matrix: np.ndarray) -> np.ndarray:
     """Return (M + M^T) / 2."""
     return 0.5 * (matrix + matrix.T)
+
+
+def symmetric_basis(n: int) -> np.ndarray:
+    """Return a basis of the symmetric matrices, (n (n + 1) / 2, n, n)."""
+    i, j = np.triu_indices(n)
+    basis = np.zeros((len(i), n, n))
+    basis[range(len(i)), i, j] = basis[range(len(i)), j, i] = 1.0
+    return basis
 
 
 def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np.ndarray]]:
@@ -94,6 +107,8 @@ def uncontrollable_modes(A: np.ndarray, B: np.ndarray) -> list[tuple[complex, np
     found = []
     for s in np.linalg.eigvals(A):
         pencil = np.hstack([s * np.eye(len(A)) - A, B])
+        # u'[s I - A, B] = 0 for the last left singular vector u: a left eigenvector that B does not
+        # see.
         left, singular, _ = np.linalg.svd(pencil)
         if singular[-1] <= 1e-9 * scale:
             found.append((complex(s), left[:, -1].conj()))
@@ -105,6 +120,8 @@ def observability_rank(A: np.ndarray, C: np.ndarray) -> int:
     block, rows = C, [C]
     for _ in range(len(A) - 1):
         block = block @ A
+        # Powers of A spread over decades, in which the tolerance of a rank would lose the small
+        # blocks.
         size = np.linalg.norm(block)
         if size == 0.0:
             break
@@ -119,6 +136,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     Raises:
         GainError: the equation has no stabilizing solution.
     """
+    # SciPy refuses empty matrices, and an integrator has no state that an inner loop must damp.
     if not len(A):
         return np.zeros((0, 0))
     try:
@@ -128,6 +146,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
             f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "
             "check that every undamped mode is weighted by `Q`."
         ) from error
+    # Rounding leaves P asymmetric, and routines that read one triangle would differ from the rest.
     return symmetric_part(P)
 
 
@@ -151,6 +170,7 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
             f"`{name}` is not symmetric: entry [{i}, {j}] is {matrix[i, j]:.6g} "
             f"and entry [{j}, {i}] is {matrix[j, i]:.6g}."
         )
+    # `eigvalsh` reads one triangle, which is why symmetry comes first.
     least = float(np.linalg.eigvalsh(matrix)[0])
     if least <= 0.0:
         raise GainError(
@@ -165,6 +185,7 @@ def as_matrix(name: str, value: Weight, size: int) -> Array:
         GainError: it is neither `size` numbers nor a `size` x `size` matrix.
     """
     try:
+        # A copy, so that no later change of the caller's own array changes a gain.
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise GainError(

@@ -17,11 +17,13 @@ Field: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 def precision(name: Precision) -> contextlib.AbstractContextManager[object]:
     """Return a context in which JAX computes in `name`, whatever the user's own flags are."""
+    # A context and no `jax.config.update`: importing or calling echelon changes no global setting.
     return jax.enable_x64(name == "float64")
 
 
 def rk4(field: Field, x: jax.Array, u: jax.Array, dt: float | jax.Array) -> jax.Array:
     """Advance one step by the classical Runge-Kutta method with the input held; error O(dt^4)."""
+    # With u held the field is smooth within the step, which order 4 needs.
     k1 = field(x, u)
     k2 = field(x + 0.5 * dt * k1, u)
     k3 = field(x + 0.5 * dt * k2, u)
@@ -54,10 +56,12 @@ def derivatives(path: Callable[[jax.Array], jax.Array], t: jax.Array, order: int
             return lambda s: (path(s),)
         lower = up_to(k - 1)
 
-        def raised(s: jax.Array) -> tuple[jax.Array, ...]:
+        def append_rate(s: jax.Array) -> tuple[jax.Array, ...]:
+            # One jvp of all lower orders gives them and the next; one for each order would repeat
+            # them.
             values, rates = jax.jvp(lower, (s,), (jnp.ones_like(s),))
             return (*values, rates[-1])
 
-        return raised
+        return append_rate
 
     return jnp.stack(up_to(order)(t))

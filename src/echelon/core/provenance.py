@@ -27,13 +27,15 @@ def versions() -> dict[str, str]:
 
 def _commit() -> str | None:
     """Return the commit of echelon's own checkout, with `+` when changed; None elsewhere."""
+    # core, echelon, src, and then the checkout.
     home = Path(__file__).resolve().parents[3]
     if not (home / ".git").exists():
         return None
     try:
-        ask = ["git", "-C", str(home), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        command = ["git", "-C", str(home), "describe", "--always", "--dirty=+", "--abbrev=12"]
+        # A slow disk must not hold up a run for its footnote, hence the timeout.
         return subprocess.run(
-            ask, capture_output=True, text=True, timeout=5, check=True
+            command, capture_output=True, text=True, timeout=5, check=True
         ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

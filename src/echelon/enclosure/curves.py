@@ -18,9 +18,11 @@ from echelon.enclosure.interval import Interval, circle, pi
 Gaussian: TypeAlias = tuple[int, int]
 """A direction in the plane, as a complex integer."""
 
+# Directions are rounded to 2^-64, and an arc's ends turned outward by 2^-60, which is more.
 _UNIT = 1 << 64
 _TILT = 1 << 60
 _FAR = 1 << 199  # rad; beyond it `circle` no longer tells where on the circle an angle lies
+# At half the angles a full turn is half a turn, here in four pieces.
 _FULL: list[Gaussian] = [(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)]
 
 
@@ -28,6 +30,7 @@ def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fr
     """Return points whose hull holds (x^k for k in powers), x in the interval."""
     wanted = sorted(powers)
     if len(wanted) == 1:
+        # A single power has a range, which is tighter than the control points of its curve.
         reached = interval.power(wanted[0])
         return [{wanted[0]: end} for end in (reached.lo, reached.hi)]
     degree = wanted[-1]
@@ -36,6 +39,7 @@ def power_points(interval: Interval, powers: Iterable[int]) -> list[dict[int, Fr
         {
             k: sum(
                 (
+                    # The polar form of x^k at i times hi and degree - i times lo.
                     Fraction(comb(i, m) * comb(degree - i, k - m), comb(degree, k))
                     * hi**m
                     * lo ** (k - m)
@@ -82,6 +86,7 @@ def _cuts(arc: Interval) -> list[Gaussian]:
     start, end = arc.lo / 2, arc.hi / 2
     if end - start >= pi().lo - Fraction(1, 1 << 40) or max(abs(start), abs(end)) > _FAR:
         return _FULL
+    # So each is below 90 degrees; towards 180 the tangents at its ends meet ever farther away.
     pieces = 2 if end - start < pi().lo / 2 else 4
     between = [start + (end - start) * Fraction(k, pieces) for k in range(1, pieces)]
     return [_direction(start, -1), *(_direction(a, 0) for a in between), _direction(end, 1)]
@@ -92,6 +97,7 @@ def _direction(angle: Fraction, turn: int) -> Gaussian:
 
     Rounding moves the direction by less than 2^-63, the turn by arctan 2^-60.
     """
+    # Exact, and no long fraction.
     if angle == 0:
         return 1, 0
     cosine, sine = circle(angle)
@@ -103,6 +109,7 @@ def _times(a: Gaussian, b: Gaussian) -> Gaussian:
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
+# Every control point of an arc takes powers of the same few directions.
 @lru_cache(maxsize=4096)
 def _power(a: Gaussian, k: int) -> Gaussian:
     return (1, 0) if k == 0 else _times(a, _power(a, k - 1))
@@ -113,6 +120,7 @@ def _form(a: Gaussian, b: Gaussian, degree: int, i: int, k: int) -> tuple[Fracti
     real, imaginary = Fraction(0), Fraction(0)
     bar_a, bar_b, plain = (a[0], -a[1]), (b[0], -b[1]), degree + k
     for m in range(max(0, plain - 2 * degree + i), min(i, plain) + 1):
+        # The polar form averages over which of the arguments go to z, m of them b.
         weight = Fraction(comb(i, m) * comb(2 * degree - i, plain - m), comb(2 * degree, plain))
         one = _times(_power(b, m), _power(a, plain - m))
         other = _times(_power(bar_b, i - m), _power(bar_a, 2 * degree - i - plain + m))

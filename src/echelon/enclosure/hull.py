@@ -85,7 +85,7 @@ def jacobian_hull(
         GainError: a bound is not finite or above its partner, the Jacobian has no enclosure on the
             box (the primitive is named), or there are more than `MOST_VERTICES` vertices.
     """
-    n, m = _checked(states, "x"), _checked(inputs, "v")
+    n, m = _count_bounds(states, "x"), _count_bounds(inputs, "v")
     called = list(names) or [f"x[{k}]" for k in range(n)] + [f"v[{k}]" for k in range(m)]
     if len(called) != n + m:
         raise GainError(f"`names` has {len(called)} entries, and must have {n + m}.")
@@ -93,6 +93,7 @@ def jacobian_hull(
     bounds = [*zip(*states, strict=True), *zip(*inputs, strict=True)]
     variables = np.empty(n + m, object)
     for k, (low, high) in enumerate(bounds):
+        # A float is a fraction with a power of two below, so nothing is rounded here.
         interval = Interval(Fraction(float(low)), Fraction(float(high)))
         variables[k] = atoms.variable(called[k], interval)
     results = evaluate(jacobian, [variables[:n], variables[n:]], polynomials(atoms))
@@ -101,7 +102,7 @@ def jacobian_hull(
     return _hull_of(results[0], atoms)
 
 
-def _checked(box: Box, name: str) -> int:
+def _count_bounds(box: Box, name: str) -> int:
     """Return how many bounds a box has."""
     lower, upper = (np.asarray(side, float) for side in box)
     if lower.ndim != 1 or lower.shape != upper.shape:
@@ -120,47 +121,55 @@ def _checked(box: Box, name: str) -> int:
 
 def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
     """Return the hull of a matrix of polynomials."""
+    # Over all entries together: corners for each entry alone would lose that they share angles.
     used: dict[int, set[Any]] = {}
     for p in entries.flat:
         for atom, exponents in p.exponents().items():
             used.setdefault(atom, set()).update(exponents)
     corners = {atom: atoms.corners(atom, used[atom]) for atom in sorted(used)}
     counts = {atom: len(c.points) for atom, c in corners.items()}
+    # Before anything is built, as each atom multiplies the count.
     check_count(math.prod(counts.values()))
-    parts = [_floats(p, corners) for p in entries.flat]
-    vertices = np.stack([_spread(values, array, counts) for values, array, _ in parts], axis=-1)
+    parts = [_round_values(p, corners) for p in entries.flat]
+    spread = [_expand_values(values, array, counts) for values, array, _ in parts]
     error = np.array([bound for _, _, bound in parts]).reshape(entries.shape)
-    vertices = np.unique(vertices.reshape(-1, entries.size), axis=0)
-    return Hull(vertices.reshape(-1, *entries.shape), error, _described(atoms, used, counts))
+    # Entries may not tell all products apart, and each vertex is a constraint for a solver.
+    vertices = np.unique(np.stack(spread, axis=-1), axis=0)
+    return Hull(vertices.reshape(-1, *entries.shape), error, _describe_atoms(atoms, used, counts))
 
 
-def _floats(p: Polynomial, corners: dict[int, Corners]) -> tuple[CornerValues, np.ndarray, float]:
+def _round_values(
+    p: Polynomial, corners: dict[int, Corners]
+) -> tuple[CornerValues, np.ndarray, float]:
     """Return an entry's vertex values, exactly and rounded, with the bound of their difference."""
     values = corner_values(p, corners)
     rounded = np.empty(values.array.shape)
     worst = Fraction(0)
     for place, exact in np.ndenumerate(values.array):
         try:
+            # To the nearest float; what that moves is measured exactly and becomes part of `error`.
             rounded[place] = float(exact)
         except OverflowError as fault:
             raise GainError("an entry of the Jacobian exceeds float64 on the domain.") from fault
         worst = max(worst, abs(Fraction(float(rounded[place])) - exact))
-    return values, rounded, _rounded_up(worst + values.slack)
+    return values, rounded, _round_up(worst + values.slack)
 
 
-def _rounded_up(x: Fraction) -> float:
+def _round_up(x: Fraction) -> float:
     """Return the smallest float that is not below x."""
     near = float(x)
+    # `float` rounds to nearest, and a bound must not be rounded down.
     return near if Fraction(near) >= x else math.nextafter(near, math.inf)
 
 
-def _spread(values: CornerValues, array: np.ndarray, counts: dict[int, int]) -> np.ndarray:
+def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, int]) -> np.ndarray:
     """Return an entry's values at every product of vertices, in the order of `counts`."""
     shape = [count if atom in values.atoms else 1 for atom, count in counts.items()]
+    # An entry is constant along the atoms that it does not use.
     return np.broadcast_to(array.reshape(shape), list(counts.values())).ravel()
 
 
-def _described(
+def _describe_atoms(
     atoms: Atoms, used: dict[int, set[Any]], counts: dict[int, int]
 ) -> tuple[HullAtom, ...]:
     """Return what the hull is made of, in the order in which the model uses it."""

@@ -27,10 +27,11 @@ class Interval:
         return Interval(self.lo + other.lo, self.hi + other.hi)
 
     def __mul__(self, other: "Interval") -> "Interval":
+        # A product is linear in each factor, so its extremes lie at ends.
         ends = [a * b for a in (self.lo, self.hi) for b in (other.lo, other.hi)]
         return Interval(min(ends), max(ends))
 
-    def scaled(self, factor: Fraction) -> "Interval":
+    def scale(self, factor: Fraction) -> "Interval":
         """Return factor times the interval."""
         return self * Interval(factor, factor)
 
@@ -48,7 +49,7 @@ class Interval:
         """Return the smallest interval that holds both."""
         return Interval(min(self.lo, other.lo), max(self.hi, other.hi))
 
-    def cut(self, other: "Interval") -> "Interval":
+    def intersect(self, other: "Interval") -> "Interval":
         """Return the common part of two enclosures of the same set."""
         return Interval(max(self.lo, other.lo), min(self.hi, other.hi))
 
@@ -69,8 +70,9 @@ def point(x: Fraction | int) -> Interval:
     return Interval(Fraction(x), Fraction(x))
 
 
-def _rounded(x: Fraction, up: bool) -> Fraction:
+def _round_end(x: Fraction, up: bool) -> Fraction:
     """Return x moved down (or up) to `_BITS` significant bits, x itself where that is exact."""
+    # Exact fractions would double their length with each operation.
     shift = _BITS - abs(x.numerator).bit_length() + x.denominator.bit_length()
     scale = Fraction(2) ** shift
     return (math.ceil(x * scale) if up else math.floor(x * scale)) / scale
@@ -78,7 +80,7 @@ def _rounded(x: Fraction, up: bool) -> Fraction:
 
 def outward(lo: Fraction, hi: Fraction) -> Interval:
     """Return an interval around [lo, hi] whose ends are short dyadic rationals."""
-    return Interval(_rounded(lo, up=False), _rounded(hi, up=True))
+    return Interval(_round_end(lo, up=False), _round_end(hi, up=True))
 
 
 def inverse(x: Interval) -> Interval:
@@ -111,6 +113,7 @@ def circle(x: Fraction) -> tuple[Interval, Interval]:
     """
     if x == 0:
         return point(1), point(0)
+    # The 2^-319 of pi, times as many turns, must stay far below the margin.
     turns = round(x / (2 * pi().lo))
     if abs(turns) >> 200:
         return Interval(Fraction(-1), Fraction(1)), Interval(Fraction(-1), Fraction(1))
@@ -119,6 +122,7 @@ def circle(x: Fraction) -> tuple[Interval, Interval]:
     for k in range(64):
         totals[k % 2] += term if k % 4 < 2 else -term
         term = term * y // ((k + 1) << 120)
+    # 64 terms by 6 units of 2^-120 are below 2^-111.
     margin = Fraction(1, 1 << 100)
     values = [Fraction(total, 1 << 120) for total in totals]
     cosine, sine = (
@@ -132,15 +136,17 @@ def wave(x: Interval, sine: bool) -> Interval:
     if x.hi - x.lo >= 2 * pi().lo:
         return Interval(Fraction(-1), Fraction(1))
     found = circle(x.lo)[sine].union(circle(x.hi)[sine])
+    # Extremes lie at k pi for cos and (k + 1/2) pi for sin; fewer than eight fit, rounding
+    # included.
     first = math.floor(x.lo / pi().lo) - 2
     for k in range(first, first + 8):
-        place = pi().scaled(k + Fraction(int(sine), 2))
+        place = pi().scale(k + Fraction(int(sine), 2))
         if place.lo <= x.hi and place.hi >= x.lo:
             found = found.union(point((-1) ** (k % 2)))
     return found
 
 
-def _fixed(x: Fraction) -> int:
+def _to_fixed_point(x: Fraction) -> int:
     """Return x in units of 2^-256, rounded down."""
     return math.floor(x * _ONE)
 
@@ -157,10 +163,12 @@ def _exp(x: Fraction) -> Interval:
     """
     if x == 0:
         return point(1)
+    # The lower end would be a fraction of endless length, and 0 is as good.
     if x < -4096:
         return Interval(Fraction(0), _exp(Fraction(-4096)).hi)
+    # exp x = exp(x / 2^k)^(2^k).
     halvings = max(0, math.ceil(abs(x)).bit_length() + 1)
-    y, total, term = _fixed(x / 2**halvings), 0, _ONE
+    y, total, term = _to_fixed_point(x / 2**halvings), 0, _ONE
     for k in range(40):
         total += term
         term = term * y // ((k + 1) * _ONE)
@@ -173,7 +181,7 @@ def _exp(x: Fraction) -> Interval:
 def _log(x: Fraction) -> Interval:
     """Enclose log x as e log 2 + 2 artanh((m - 1) / (m + 1)) with x = m 2^e and m in (1/2, 2)."""
     e = x.numerator.bit_length() - x.denominator.bit_length()
-    doubled = _twice_artanh(Fraction(1, 3)).scaled(Fraction(e))
+    doubled = _twice_artanh(Fraction(1, 3)).scale(Fraction(e))
     m = x / Fraction(2) ** e
     total = doubled + _twice_artanh((m - 1) / (m + 1))
     return outward(total.lo, total.hi)
@@ -186,7 +194,7 @@ def _twice_artanh(z: Fraction) -> Interval:
     """
     if z == 0:
         return point(0)
-    square, power, total = _fixed(z * z), _fixed(z), 0
+    square, power, total = _to_fixed_point(z * z), _to_fixed_point(z), 0
     for k in range(80):
         total += 2 * power // (2 * k + 1)
         power = power * square // _ONE
@@ -200,10 +208,11 @@ def _atan(x: Fraction) -> Interval:
     """
     if x == 0:
         return point(0)
+    # arctan x = +-pi/2 - arctan(1/x).
     if abs(x) > 1:
-        rest, quarter = _atan(1 / x), pi().scaled(Fraction(1 if x > 0 else -1, 2))
+        rest, quarter = _atan(1 / x), pi().scale(Fraction(1 if x > 0 else -1, 2))
         return outward(quarter.lo - rest.hi, quarter.hi - rest.lo)
-    ratio, term, total = _fixed(x * x / (1 + x * x)), _fixed(x / (1 + x * x)), 0
+    ratio, term, total = _to_fixed_point(x * x / (1 + x * x)), _to_fixed_point(x / (1 + x * x)), 0
     for n in range(160):
         total += term
         term = term * ratio * (2 * n + 2) // ((2 * n + 3) * _ONE)
@@ -214,6 +223,7 @@ def _sqrt(x: Fraction) -> Interval:
     """Enclose the root of x >= 0; exact where the root is a short rational."""
     shift = max(0, _BITS - x.numerator.bit_length() // 2 + x.denominator.bit_length() // 2)
     whole = x * (1 << (2 * shift))
+    # The root of a number lies between that of its floor, rounded down, and one more.
     low = math.isqrt(math.floor(whole))
     high = low if low * low == whole else low + 1
     return Interval(Fraction(low, 1 << shift), Fraction(high, 1 << shift))
@@ -221,9 +231,10 @@ def _sqrt(x: Fraction) -> Interval:
 
 def _asin(x: Fraction) -> Interval:
     if abs(x) == 1:
-        return pi().scaled(x / 2)
+        return pi().scale(x / 2)
+    # arcsin x = arctan(x / sqrt(1 - x^2)).
     root = _sqrt(1 - x * x)
-    return _rising(_atan)(outward(*sorted((x / root.lo, x / root.hi))))
+    return _monotone_range(_atan)(outward(*sorted((x / root.lo, x / root.hi))))
 
 
 def _tan(x: Fraction) -> Interval:
@@ -242,6 +253,7 @@ def _logistic(x: Fraction) -> Interval:
 
 
 def _tanh(x: Fraction) -> Interval:
+    # tanh x = 2 / (1 + e^(-2x)) - 1.
     found = _logistic(2 * x)
     return point(0) if x == 0 else outward(2 * found.lo - 1, 2 * found.hi - 1)
 
@@ -249,7 +261,7 @@ def _tanh(x: Fraction) -> Interval:
 def _cosh(x: Interval) -> Interval:
     sizes = sorted((abs(x.lo), abs(x.hi)))
     low = Fraction(0) if x.holds(0) else sizes[0]
-    ends = [(_exp(t) + _exp(-t)).scaled(Fraction(1, 2)) for t in (low, sizes[1])]
+    ends = [(_exp(t) + _exp(-t)).scale(Fraction(1, 2)) for t in (low, sizes[1])]
     return outward(ends[0].lo, ends[1].hi)
 
 
@@ -262,13 +274,13 @@ def _sign(x: Interval) -> Interval:
     return Interval(*(Fraction((end > 0) - (end < 0)) for end in (x.lo, x.hi)))
 
 
-def _rising(at: Callable[[Fraction], Interval]) -> Callable[[Interval], Interval]:
+def _monotone_range(at: Callable[[Fraction], Interval]) -> Callable[[Interval], Interval]:
     """Return the range of a function that rises everywhere on its domain."""
     return lambda x: Interval(at(x.lo).lo, at(x.hi).hi)
 
 
 def _acos(x: Interval) -> Interval:
-    rest, quarter = _rising(_asin)(x), pi().scaled(Fraction(1, 2))
+    rest, quarter = _monotone_range(_asin)(x), pi().scale(Fraction(1, 2))
     return outward(quarter.lo - rest.hi, quarter.hi - rest.lo)
 
 
@@ -279,7 +291,7 @@ def _is_clear(x: Interval) -> bool:
 
 
 class Elementary(NamedTuple):
-    """A function of one real: its range on an interval, where that is defined, and what it asks."""
+    """A function of one real: its range on an interval, and where that is defined, in words too."""
 
     range: Callable[[Interval], Interval]
     defined: Callable[[Interval], bool] = lambda x: True
@@ -287,32 +299,35 @@ class Elementary(NamedTuple):
 
 
 _POSITIVE = (lambda x: x.lo > 0, "must be positive")
+# float64 overflows at exp(710), so nothing of use lies beyond 2048.
 _SHORT = (lambda x: x.hi <= 2048, "must be at most 2048")
 _BOTH = (lambda x: -2048 <= x.lo and x.hi <= 2048, "must lie between -2048 and 2048")
 _COSINES = (lambda x: -1 <= x.lo and x.hi <= 1, "must lie between -1 and 1")
 
 ELEMENTARY: dict[str, Elementary] = {
     "reciprocal": Elementary(inverse, _is_clear, "must keep well away from 0"),
-    "exp": Elementary(_rising(_exp), *_SHORT),
-    "expm1": Elementary(lambda x: _rising(_exp)(x) + point(-1), *_SHORT),
-    "log": Elementary(_rising(_log), *_POSITIVE),
+    "exp": Elementary(_monotone_range(_exp), *_SHORT),
+    # Nothing is rounded before the subtraction, so it cancels no digits.
+    "expm1": Elementary(lambda x: _monotone_range(_exp)(x) + point(-1), *_SHORT),
+    "log": Elementary(_monotone_range(_log), *_POSITIVE),
     "log1p": Elementary(
-        lambda x: _rising(_log)(x + point(1)), lambda x: x.lo > -1, "must be above -1"
+        lambda x: _monotone_range(_log)(x + point(1)), lambda x: x.lo > -1, "must be above -1"
     ),
-    "sqrt": Elementary(_rising(_sqrt), lambda x: x.lo >= 0, "must not be negative"),
-    "rsqrt": Elementary(lambda x: inverse(_rising(_sqrt)(x)), *_POSITIVE),
+    "sqrt": Elementary(_monotone_range(_sqrt), lambda x: x.lo >= 0, "must not be negative"),
+    "rsqrt": Elementary(lambda x: inverse(_monotone_range(_sqrt)(x)), *_POSITIVE),
     "tan": Elementary(
-        _rising(_tan),
+        _monotone_range(_tan),
+        # Between two poles tan rises and cos has no zero: a cos that keeps clear of 0 says both.
         lambda x: _is_clear(wave(x, sine=False)),
         "must keep well between two odd multiples of 90 degrees",
     ),
-    "asin": Elementary(_rising(_asin), *_COSINES),
+    "asin": Elementary(_monotone_range(_asin), *_COSINES),
     "acos": Elementary(_acos, *_COSINES),
-    "atan": Elementary(_rising(_atan)),
-    "sinh": Elementary(_rising(_sinh), *_BOTH),
+    "atan": Elementary(_monotone_range(_atan)),
+    "sinh": Elementary(_monotone_range(_sinh), *_BOTH),
     "cosh": Elementary(_cosh, *_BOTH),
-    "tanh": Elementary(_rising(_tanh), *_BOTH),
-    "logistic": Elementary(_rising(_logistic), *_BOTH),
+    "tanh": Elementary(_monotone_range(_tanh), *_BOTH),
+    "logistic": Elementary(_monotone_range(_logistic), *_BOTH),
     "abs": Elementary(_abs),
     "sign": Elementary(_sign),
 }

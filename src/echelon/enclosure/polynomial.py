@@ -38,11 +38,13 @@ _THIN = Fraction(1, 1 << 64)  # relative width of what is a number in all but na
 def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
     """Return cos or sin of a times cos or sin of b as a sum of waves; None stands for 1."""
     (p, i), (q, j) = a, b
+    # Two cosines or two sines make cosines, and one of each makes sines.
     part = i ^ j
     sum_sign = Fraction(-1 if i and j else 1)
     difference_sign = Fraction(-1 if j and not i else 1)
     terms: list[tuple[Fraction, Wave | None]] = [(_HALF * sum_sign, (p + q, part))]
     if p != q:
+        # sin((p - q) x) is odd, and frequencies are kept positive.
         if part and p < q:
             difference_sign = -difference_sign
         terms.append((_HALF * difference_sign, (abs(p - q), part)))
@@ -54,6 +56,7 @@ def _wave_product(a: Wave, b: Wave) -> list[tuple[Fraction, Wave | None]]:
 def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial]]:
     """Return the product of two monomials as a sum of monomials."""
     found: list[tuple[Fraction, dict[int, Exponent]]] = [(Fraction(1), dict(a))]
+    # A monomial holds each atom once: shared ones merge, and a product of waves forks the sum.
     for atom, exponent in b:
         held = dict(a).get(atom)
         for _, factors in found:
@@ -63,6 +66,7 @@ def _monomial_product(a: Monomial, b: Monomial) -> list[tuple[Fraction, Monomial
         elif isinstance(held, int) and isinstance(exponent, int):
             options = [(Fraction(1), held + exponent)]
         else:
+            # Angles are atoms of their own (`_angle`), so no atom bears both powers and waves.
             assert isinstance(held, tuple) and isinstance(exponent, tuple)
             options = [*_wave_product(held, exponent)]
         found = [
@@ -198,11 +202,14 @@ class Atoms:
         """Return cos p and sin p, with the angles of a sum taken apart."""
         linear = self._linear(p)
         shift = linear.pop((), Fraction(0))
+        # The cosine of a number is irrational: an interval 2^-99 wide, and hence a variable.
         if not linear:
             cosine, sine = circle(shift)
             return self.fresh(("cos", shift), cosine), self.fresh(("sin", shift), sine)
+        # By the addition theorem, one angle after the other.
         found = (constant(1), constant(0))
         for ((atom, _),), factor in linear.items():
+            # The constant goes into the first angle, where it moves a range and adds no term.
             c, s = self._angle(atom, factor, shift)
             found = found[0] * c - found[1] * s, found[1] * c + found[0] * s
             shift = Fraction(0)
@@ -218,9 +225,11 @@ class Atoms:
 
     def _angle(self, atom: int, factor: Fraction, shift: Fraction) -> tuple[Polynomial, Polynomial]:
         """Return cos and sin of factor x + shift for a variable x."""
+        # factor x + shift = factor (x + phase).
         phase, behind = shift / factor, self.known[atom]
         theta = Atom(behind.name, behind.interval + point(phase), behind.sources)
         angle = self._add(("angle", atom, phase), theta)
+        # cos is even and sin is odd, so frequencies can be positive.
         cosine = Polynomial({((angle, (abs(factor), 0)),): Fraction(1)})
         sine = Polynomial({((angle, (abs(factor), 1)),): Fraction(1 if factor > 0 else -1)})
         return cosine, sine
@@ -233,7 +242,7 @@ class Atoms:
             self._ranges[key] = (
                 interval.power(exponent)
                 if isinstance(exponent, int)
-                else wave(interval.scaled(exponent[0]), sine=bool(exponent[1]))
+                else wave(interval.scale(exponent[0]), sine=bool(exponent[1]))
             )
         return self._ranges[key]
 
@@ -245,29 +254,32 @@ class Atoms:
             for atom, exponent in monomial:
                 product = product * self.factor_range(atom, exponent)
             total = total + product
+        # A monomial holds each atom once, so corners would sharpen nothing.
         if len(p.terms) < 2:
             return total
+        # Terms that share atoms do not vary freely, which their common corners know.
         corners = {atom: self.corners(atom, used) for atom, used in p.exponents().items()}
         if math.prod(len(c.points) for c in corners.values()) > _FEW:
             return total
         values = corner_values(p, corners)
         low, high = min(values.array.flat), max(values.array.flat)
-        return total.cut(Interval(low - values.slack, high + values.slack))
+        return total.intersect(Interval(low - values.slack, high + values.slack))
 
     def corners(self, atom: int, used: Iterable[Exponent]) -> "Corners":
         """Return points whose hull holds the used powers or waves of an atom, jointly."""
         wanted = list(used)
+        # A coordinate alone has a range, which no polygon around a curve is tighter than.
         if len(wanted) == 1:
-            return _gathered(self._ends(atom, wanted[0]))
+            return _gather_points(self._ends(atom, wanted[0]))
         powers = [e for e in wanted if isinstance(e, int)]
         if powers:
-            return _gathered([{**p} for p in power_points(self.known[atom].interval, powers)])
+            return _gather_points([{**p} for p in power_points(self.known[atom].interval, powers)])
         arc, found = self.known[atom].interval, [dict[Exponent, Fraction]()]
         for group in _harmonics(e for e in wanted if isinstance(e, tuple)):
             around = _wave_corners(arc, group) if len(group) > 1 else self._ends(atom, group[0])
             check_count(len(found) * len(around))
             found = [{**p, **q} for p in found for q in around]
-        return _gathered(found)
+        return _gather_points(found)
 
     def _ends(self, atom: int, exponent: Exponent) -> list[dict[Exponent, Fraction]]:
         reached = self.factor_range(atom, exponent)
@@ -294,7 +306,7 @@ def _wave_corners(arc: Interval, waves: list[Wave]) -> list[dict[Exponent, Fract
     """Return points around the waves of a group, jointly."""
     unit = common_unit(w for w, _ in waves)
     orders = {w: int(w / unit) for w, _ in waves}
-    around = wave_points(arc.scaled(unit), set(orders.values()))
+    around = wave_points(arc.scale(unit), set(orders.values()))
     return [{(w, s): p[orders[w], s] for w, s in waves} for p in around]
 
 
@@ -322,9 +334,10 @@ class Corners(NamedTuple):
         return max(abs(p[exponent]) for p in self.points) + self.radius[exponent]
 
 
-def _gathered(points: list[dict[Exponent, Fraction]]) -> Corners:
+def _gather_points(points: list[dict[Exponent, Fraction]]) -> Corners:
     """Return points without repetition, or their middle where they all but agree."""
     ends = {e: (min(p[e] for p in points), max(p[e] for p in points)) for e in points[0]}
+    # Two corners for the cosine of a number would double the hull for nothing but rounding.
     if all(hi - lo <= _THIN * max(1, abs(hi)) for lo, hi in ends.values()):
         middle = {e: (lo + hi) / 2 for e, (lo, hi) in ends.items()}
         return Corners([middle], {e: (hi - lo) / 2 for e, (lo, hi) in ends.items()})

@@ -57,6 +57,7 @@ def _fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
             "Jacobians does not know; allowed are arithmetic, powers, trigonometric and hyperbolic "
             "functions, exponentials, logarithms, absolute values and choices by `where`."
         )
+    # In float64, since that is what the program itself computes of its constants.
     numbers = [np.asarray(a, np.float64) if a.dtype == object else a for a in values]
     return [_lift(a) for a in compute(equation, numbers)]
 
@@ -100,6 +101,7 @@ def _power(atoms: Atoms, p: Polynomial, exponent: Any) -> Polynomial:
         )
     if k.denominator == 1:
         return _whole_power(atoms, p, int(k))
+    # A root has an enclosure of its own, which holds at 0 too, where a logarithm has none.
     if abs(k) == Fraction(1, 2):
         return atoms.elementary("sqrt" if k > 0 else "rsqrt", p)
     return atoms.elementary("exp", constant(k) * atoms.elementary("log", p))
@@ -112,6 +114,7 @@ def _atan2(atoms: Atoms, y: Polynomial, x: Polynomial) -> Polynomial:
             "the Jacobian of the model takes `atan2` with a second argument that may be anything "
             f"in {reached.text()} on the domain, and must be positive; make the domain smaller."
         )
+    # atan2(y, x) = atan(y / x) for x > 0; elsewhere it jumps, and a hull over the jump says little.
     return atoms.elementary("atan", _quotient(atoms, y, x))
 
 
@@ -125,6 +128,7 @@ def _absolute(atoms: Atoms, p: Polynomial) -> Polynomial:
 def _larger(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
     """Return max(a, b)."""
     left, right = atoms.range(a), atoms.range(b)
+    # Equal terms cancel in a - b, so its sign may be certain where the ranges overlap.
     difference = atoms.range(a - b)
     if difference.lo >= 0 or difference.hi <= 0:
         return a if difference.lo >= 0 else b
@@ -134,6 +138,7 @@ def _larger(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
 
 def _smaller(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
     """Return min(a, b)."""
+    # min(a, b) = -max(-a, -b), which keeps one variable for both.
     return -_larger(atoms, -a, -b)
 
 
@@ -148,18 +153,20 @@ def _comparison(certain: Callable[[Interval], bool], never: Callable[[Interval],
         if not (isinstance(a, Polynomial) and isinstance(b, Polynomial)):
             return None
         difference = atoms.range(a - b)
+        # Neither holds where the box does not decide.
         return True if certain(difference) else False if never(difference) else None
 
-    return lambda atoms, params, a, b: _decided(each(functools.partial(compare, atoms), a, b))
+    return lambda atoms, params, a, b: _as_booleans(each(functools.partial(compare, atoms), a, b))
 
 
-def _decided(answers: np.ndarray) -> np.ndarray:
+def _as_booleans(answers: np.ndarray) -> np.ndarray:
     """Return booleans where every answer is known."""
     return answers if any(a is None for a in answers.flat) else answers.astype(bool)
 
 
 def _and(a: bool | None, b: bool | None) -> bool | None:
     if a is None or b is None:
+        # Kleene's logic: one false decides, whatever the other is.
         return False if a is not None and not a or b is not None and not b else None
     return bool(a and b)
 
@@ -169,14 +176,15 @@ def _not(a: bool | None) -> bool | None:
 
 
 def _or(a: bool | None, b: bool | None) -> bool | None:
+    # De Morgan, which holds in it too.
     return _not(_and(_not(a), _not(b)))
 
 
 def _logic(function: Callable[..., bool | None]) -> Rule:
-    return lambda atoms, params, *arrays: _decided(each(function, *arrays))
+    return lambda atoms, params, *arrays: _as_booleans(each(function, *arrays))
 
 
-def _chosen(atoms: Atoms, which: Any, *cases: Any) -> Any:
+def _choose_case(atoms: Atoms, which: Any, *cases: Any) -> Any:
     """Return the case that is chosen, or a value that may be any of them."""
     if which is not None:
         return cases[int(which)]
@@ -188,8 +196,10 @@ def _chosen(atoms: Atoms, which: Any, *cases: Any) -> Any:
             "not decide; make the domain smaller."
         )
     keys = [case.key() for case in cases]
+    # Cases that agree need no decision.
     if all(key == keys[0] for key in keys):
         return cases[0]
+    # Sound and coarse: of the choice nothing is kept but a range that holds all cases.
     reached = functools.reduce(Interval.union, (atoms.range(case) for case in cases))
     return atoms.fresh(("choice", frozenset(keys)), reached, *cases)
 
@@ -214,11 +224,13 @@ def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarr
 def _as_number(atoms: Atoms, answer: bool | None) -> Polynomial:
     """Return 1 for true, 0 for false and anything between for what is not decided."""
     if answer is None:
+        # A key of its own each time, as two open answers need not be the same.
         return atoms.fresh(("undecided", object()), Interval(Fraction(0), Fraction(1)))
     return constant(int(answer))
 
 
 RULES: dict[str, Rule] = {
+    # JAX has no `reciprocal`, and `abs` looks at the sign first.
     **{name: _elementary(name) for name in ELEMENTARY if name not in ("reciprocal", "abs")},
     "div": _function(_quotient),
     "integer_pow": lambda atoms, params, x: each(lambda p: _whole_power(atoms, p, params["y"]), x),
@@ -236,11 +248,12 @@ RULES: dict[str, Rule] = {
     "ge": _comparison(lambda d: d.lo >= 0, lambda d: d.hi < 0),
     "eq": _comparison(lambda d: d.lo == d.hi == 0, lambda d: not d.holds(0)),
     "ne": _comparison(lambda d: not d.holds(0), lambda d: d.lo == d.hi == 0),
+    # Reals are finite; what has no value on the box was refused by its own rule.
     "is_finite": lambda atoms, params, x: np.ones(x.shape, bool),
     "and": _logic(_and),
     "or": _logic(_or),
     "not": _logic(_not),
-    "select_n": _function(_chosen),
+    "select_n": _function(_choose_case),
     "convert_element_type": _convert,
 }
 """What each primitive of JAX means for polynomials, beyond what the walk itself knows."""

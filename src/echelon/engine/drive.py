@@ -150,6 +150,7 @@ class Drive(eqx.Module):
 
     def start(self, model: ControlAffine) -> State:
         """Return the state (n,) in which leaders begin, the trim unless replaced."""
+        # By way of NumPy, so that a trim of whole numbers becomes one of floats.
         return jnp.asarray(np.asarray(model.trim[0], float))
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:

@@ -1,4 +1,4 @@
-"""Agents whose inputs come from the host: a pilot is asked every few steps, the plant moves on."""
+"""Agents whose inputs come from the host: a pilot gives them every few steps, the plant moves."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias, final
@@ -11,7 +11,7 @@ import numpy as np
 from echelon.core.types import Array, Inputs, States
 from echelon.engine.drive import Chunk, Problem, Stepper
 from echelon.engine.motion import Motion
-from echelon.engine.sums import Meter, Sums, follow
+from echelon.engine.sums import Meter, Sums, on_host, reference_at
 from echelon.engine.work import SolverStats
 
 Pilot: TypeAlias = Callable[[int, Array], Array]
@@ -24,13 +24,13 @@ class Stopped(Exception):
 
 @final
 class HostStepper(Stepper):
-    """The plant under the inputs of a pilot, which is asked every `hold` steps.
+    """The plant under the inputs of a pilot, which gives them every `hold` steps.
 
     Args:
         problem: the agents and how they move.
         pilot: gives the inputs.
         hold: steps for which they are held.
-        work: tells what solving took so far.
+        work: returns what solving took so far.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class HostStepper(Stepper):
         return self._work()
 
     def start(self) -> "_Held":
-        """Return the moment at which the run begins, before the pilot is asked."""
+        """Return the moment at which the run begins, before the pilot gives any input."""
         x = jnp.asarray(self.problem.states)
         still = jnp.zeros((len(x), len(self.problem.model.input_names)), x.dtype)
         return _Held(0, x, still, jnp.zeros(len(x), bool))
@@ -69,36 +69,42 @@ class HostStepper(Stepper):
         return made.chunk(now)
 
     def _frame(self, now: "_Held", count: int, made: "_Made") -> "_Held":
-        """Store a frame and take `count` steps; ask the pilot wherever a hold begins."""
+        """Store a frame and take `count` steps; query the pilot wherever a hold begins."""
         end = now.step + count
         try:
-            now = self._asked(now) if count else now
+            # The last frame has no steps after it, and so no plan of its own.
+            now = self._query_pilot(now) if count else now
         finally:
             # Where the pilot stops right here, the frame is kept with the inputs that led to it.
             if now.step or now.fresh:
                 made.store(now)
         while now.step < end:
-            now = self._asked(now)
+            now = self._query_pilot(now)
+            # To the next frame or the next plan, whichever comes first.
             steps = min(end, (now.step // self.hold + 1) * self.hold) - now.step
             states, sums = self._hold(now, steps, made)
             made.sums = made.sums.plus(sums)
             now = now._replace(step=now.step + steps, states=states, fresh=False)
+            # No solver is given a state that is not finite: it would fail, and count as a failure.
             if not np.isfinite(np.asarray(states)).all():
                 return now
         return now
 
     def _hold(self, now: "_Held", steps: int, made: "_Made") -> tuple[States, Sums]:
         """Return the states after `steps` steps under held inputs, and the sums over them."""
+        # As one array, so that another step or length compiles nothing again.
         span = np.array([now.step, made.first, steps], np.int32)
         problem, reference = self.problem, made.reference
-        return _held(problem.motion, problem.meter, now[1:4], jnp.asarray(span), reference)
+        return _hold_inputs(problem.motion, problem.meter, now[1:4], jnp.asarray(span), reference)
 
-    def _asked(self, now: "_Held") -> "_Held":
-        """Return the moment with the pilot's inputs, where a hold begins and it was not asked."""
+    def _query_pilot(self, now: "_Held") -> "_Held":
+        """Return the moment with the pilot's inputs, where a hold begins and they are not new."""
         if now.fresh or now.step % self.hold:
             return now
+        # Solvers work in float64, and so are the states that they start from.
         wanted = jnp.asarray(self.pilot(now.step, np.asarray(now.states, np.float64)))
         inputs = self.problem.motion.deliver(wanted.astype(now.states.dtype))
+        # To the bit, as `limit` returns what fits.
         limited = jnp.any(inputs != wanted, axis=1)
         return now._replace(inputs=inputs, limited=limited, fresh=True)
 
@@ -106,7 +112,7 @@ class HostStepper(Stepper):
 class _Held(NamedTuple):
     """A moment: the step, the states (N, n), the inputs (N, m) that are held and who is limited.
 
-    `fresh` tells that the pilot has been asked at this very step.
+    `fresh` says that the pilot gave them at this very step.
     """
 
     step: int
@@ -138,12 +144,11 @@ class _Made:
             np.array(rows).reshape(len(rows), *each)
             for rows, each in zip((self.states, self.inputs), shape, strict=True)
         )
-        sums = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), self.sums)
-        return Chunk(now, states, inputs, sums, self.stopped)
+        return Chunk(now, states, inputs, on_host(self.sums), self.stopped)
 
 
 @eqx.filter_jit
-def _held(
+def _hold_inputs(
     motion: Motion,
     meter: Meter,
     held: tuple[States, Inputs, jax.Array],
@@ -159,7 +164,7 @@ def _held(
 
     def one(step: jax.Array, done: tuple[States, Sums]) -> tuple[States, Sums]:
         x, sums = done
-        read = meter.read(step, x, inputs, limited, follow(reference, step - span[1], x))
+        read = meter.read(step, x, inputs, limited, reference_at(reference, step - span[1], x))
         return motion.advance(x, inputs, step), sums.plus(read)
 
     return jax.lax.fori_loop(span[0], span[0] + span[2], one, (states, meter.nothing()))

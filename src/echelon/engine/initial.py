@@ -26,18 +26,18 @@ def initial_states(parts: Parts, seed: int) -> np.ndarray:
     shape = (graph.agents, len(model.state_names))
     error = _per_state(model, parts.start_error, "start error")
     if initial is not None and not isinstance(initial, Mapping):
-        states = _checked(initial, shape, "initial states have", "(agents, states)")
+        states = _read_states(initial, shape, "initial states have", "(agents, states)")
+        # Given states are where leaders belong; the error is what they are off from there.
         states[list(graph.leaders)] += error
         return states
     named = dict(initial or {})
-    spread = _per_state(
-        model,
-        {key: value for key, value in named.items() if isinstance(key, str)},
-        "initial spread",
-    )
+    spreads = {key: value for key, value in named.items() if isinstance(key, str)}
+    spread = _per_state(model, spreads, "initial spread")
     if (spread < 0.0).any():
         raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
     leaders = np.asarray(parts.drive.start(model), np.float64) + error
+    # Drawn for all agents and scaled afterwards, so that another spread keeps the directions, and
+    # another choice of leaders the followers' draws.
     deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
     deviations[list(graph.leaders)] = 0.0
     states = leaders + parts.formation.offsets + deviations
@@ -50,7 +50,7 @@ def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:
     """Put the given agents into their given states."""
     for agent, state in given.items():
         _check_agent(agent, graph)
-        states[agent] = _checked(
+        states[agent] = _read_states(
             state, states.shape[1:], f"the initial state of agent {agent} has", "(states,)"
         )
 
@@ -63,7 +63,8 @@ def _check_agent(agent: int, graph: Graph) -> None:
         )
 
 
-def _checked(values: object, shape: tuple[int, ...], what: str, meaning: str) -> np.ndarray:
+def _read_states(values: object, shape: tuple[int, ...], what: str, meaning: str) -> np.ndarray:
+    # A copy: the error of the leaders is added to it, and the caller's array stays.
     array = np.array(values, dtype=np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise SimulationError(

@@ -1,10 +1,9 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from echelon.core.errors import ModelError, check_kind
 from echelon.core.types import Array, State
@@ -12,6 +11,7 @@ from echelon.core.words import Feedforward
 from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
 from echelon.engine.loop import Loop, Moment, advance, assemble, begin
 from echelon.engine.settings import Settings
+from echelon.engine.sums import on_host
 from echelon.laws.law import Law, gain_of
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -49,12 +49,13 @@ class Laws(Drive):
 
     @property
     def feedforward(self) -> Feedforward:
-        """What the followers' law asks for."""
+        """What the followers' law needs of others' inputs."""
         return self.follower.feedforward
 
     @property
     def reacts(self) -> bool:
         """Whether the leaders' law is given a reaction."""
+        # Not every law has one, and a user's own need not know of this question.
         return getattr(self.leader, "reaction", None) is not None
 
     @property
@@ -122,6 +123,8 @@ class _LawStepper(Stepper):
         try:
             now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
         except ValueError as error:
+            # JAX caches traces by shape and type: a NumPy constant met in float64 stays so in a
+            # float32 run, and all that JAX says of it is this.
             if "Cannot lower jaxpr" not in str(error):
                 raise
             raise ModelError(
@@ -130,8 +133,3 @@ class _LawStepper(Stepper):
                 "`jnp.asarray(constant, x.dtype)`."
             ) from error
         return Chunk(now, *on_host((states, inputs, sums)))
-
-
-def on_host(tree: Any) -> Any:
-    """Return the same with every array in float64 NumPy."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)

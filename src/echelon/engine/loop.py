@@ -1,4 +1,4 @@
-"""One step of the closed loop: who hears what, what the laws ask for, what the plant does with it.
+"""One step of the closed loop: who hears what, what the laws want, what the plant does with it.
 
 This file sees only the interfaces of models and laws.
 """
@@ -15,7 +15,7 @@ from echelon.core.types import Array, Inputs, States
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Problem
 from echelon.engine.motion import Motion
-from echelon.engine.sums import Meter, Sums, follow
+from echelon.engine.sums import Meter, Sums, reference_at
 from echelon.laws.law import Law, LocalView, Memory, without_certificates
 from echelon.models.model import ControlAffine
 from echelon.network.exchange import Exchange
@@ -80,9 +80,11 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         offsets=np.asarray(problem.formation.offsets),
         leaders=leaders,
         followers=followers,
+        # The place of each follower's leader among the leaders, whose numbers ascend.
         sender=np.searchsorted(leaders, nearest[followers]),
         parents=np.array(graph.parents()) if by_depth else None,
         levels=_levels(graph) if by_depth else None,
+        # Leaders act first, and this puts what all did back into the agents' own order.
         order=np.argsort(np.concatenate([leaders, followers])),
     )
 
@@ -94,6 +96,7 @@ def _levels(graph: Graph) -> Array:
     """
     depth = graph.depths()[list(graph.followers)]
     rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
+    # One shape for all levels, as a scan needs; a copy of an agent does what the agent does.
     width = max(map(len, rows))
     return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
 
@@ -101,6 +104,7 @@ def _levels(graph: Graph) -> Array:
 def begin(loop: Loop, states: States) -> Moment:
     """Return the moment at which a run begins from states (N, n)."""
 
+    # `init` is of one agent; all begin alike.
     def remember(law: Law, who: Array) -> Memory:
         return jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (len(who), *jnp.shape(leaf))), law.init()
@@ -130,24 +134,29 @@ def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
     x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
     y = x - offsets
+    # What was sent is what is: this network neither delays nor loses.
     z = loop.exchange(y, y)
+    # From the step number, since a sum of many dt would gather rounding.
     t = now.step.astype(x.dtype) * loop.motion.dt
 
-    def act(law: Law, who: Any, said: jax.Array, memory: Memory) -> _Acted:
-        view = LocalView(t, x[who], offsets[who], z[who], said)
+    def act(law: Law, who: Any, sent: jax.Array, memory: Memory) -> _Acted:
+        view = LocalView(t, x[who], offsets[who], z[who], sent)
+        # One time for all; of everything else, an agent sees its own row and no other.
         axes = LocalView(None, 0, 0, 0, 0)  # type: ignore[arg-type]
         wanted, memory = jax.vmap(law.update, in_axes=(None, axes, 0))(loop.model, view, memory)
         return _Acted(wanted, loop.motion.deliver(wanted), memory)
 
+    # Nobody is before a leader whose input it could be sent.
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
     led = act(loop.leader, loop.leaders, silence, now.leader_memory)
     if loop.levels is None:
-        said = _broadcast(loop, x[loop.leaders], led.inputs)[loop.sender]
-        followed = act(loop.follower, loop.followers, said, now.follower_memory)
+        sent = _broadcast(loop, x[loop.leaders], led.inputs)[loop.sender]
+        followed = act(loop.follower, loop.followers, sent, now.follower_memory)
     else:
         followed = _by_depth(loop, now, led, act)
     u = jnp.concatenate([led.inputs, followed.inputs])[loop.order]
     wanted = jnp.concatenate([led.wanted, followed.wanted])[loop.order]
+    # To the bit, as `limit` returns what fits; NaN differs from itself, and is a divergence.
     limited = jnp.any((u != wanted) & ~jnp.isnan(wanted), axis=1)
     return Control(u, limited, led.memory, followed.memory)
 
@@ -162,13 +171,14 @@ def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) 
     def level(done: tuple[Inputs, _Acted], places: jax.Array) -> tuple[Any, None]:
         u, all_ = done
         who = followers[places]
-        said = _broadcast(loop, now.states[parents[who]], u[parents[who]])
+        sent = _broadcast(loop, now.states[parents[who]], u[parents[who]])
         memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
-        acted = act(loop.follower, who, said, memory)
+        acted = act(loop.follower, who, sent, memory)
         # Where a level repeats an agent, the same is written twice.
         all_ = jax.tree.map(lambda a, b: a.at[places].set(b), all_, acted)
         return (u.at[who].set(acted.inputs), all_), None
 
+    # Every follower is in one level, so that no zero of these is left.
     start = _Acted(nothing, nothing, now.follower_memory)
     return jax.lax.scan(level, (u, start), jnp.asarray(loop.levels))[0][1]
 
@@ -177,6 +187,7 @@ def _broadcast(loop: Loop, x: States, u: Inputs) -> jax.Array:
     """Return what agents at x (K, n) with delivered inputs u (K, m) send to followers."""
     if loop.follower.feedforward is Feedforward.NONE:
         return jnp.zeros_like(u)
+    # After the limits: what a leader could not do its followers must not copy (theory page).
     v = loop.model.normalized(u)
     return jax.vmap(loop.follower.broadcast, in_axes=(None, 0, 0))(loop.model, x, v)
 
@@ -204,11 +215,12 @@ def advance(
     def one(_: jax.Array, done: tuple[Moment, Sums]) -> tuple[Moment, Sums]:
         now, sums = done
         acted = control(loop, now)
-        followed = follow(reference, now.step - first, now.states)
-        read = loop.meter.read(now.step, now.states, acted.inputs, acted.limited, followed)
+        wanted = reference_at(reference, now.step - first, now.states)
+        read = loop.meter.read(now.step, now.states, acted.inputs, acted.limited, wanted)
         return step(loop, now, acted), sums.plus(read)
 
     def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:
+        # The first step computes these inputs again, but after the last frame there is none.
         stored = (done[0].states, control(loop, done[0]).inputs)
         return jax.lax.fori_loop(0, count, one, done), stored
 

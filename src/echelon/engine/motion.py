@@ -10,7 +10,7 @@ from echelon.core.numerics import INTEGRATORS
 from echelon.core.types import Input, Inputs, State, States
 from echelon.engine.settings import Settings
 from echelon.models.model import ControlAffine
-from echelon.world.disturbance import Wind, disturbed
+from echelon.world.disturbance import Wind, disturb
 from echelon.world.world import World
 
 
@@ -35,7 +35,8 @@ class Motion(eqx.Module):
     @classmethod
     def of(cls, model: ControlAffine, world: World, settings: Settings) -> Self:
         """Return the motion of agents in a world."""
-        plant, disturbance = world.moved(model), world.disturbance
+        # Limits and disturbance are the plant's: a world may give other motors than the laws know.
+        plant, disturbance = world.plant_for(model), world.disturbance
         wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
         return cls(plant, wind, settings.dt, settings.integrator, settings.limits)
 
@@ -48,9 +49,11 @@ class Motion(eqx.Module):
 
         The delivered inputs (N, m) are held over it, and so is the disturbance of this step.
         """
+        # Integrated with the input held, as a digital controller holds it: the order of the method
+        # stays, since u and the wind are constant within a step.
         integrate = INTEGRATORS[self.integrator]
 
         def one(x: State, u: Input, agent: jax.Array) -> State:
-            return integrate(disturbed(self.plant, self.wind, step, agent), x, u, self.dt)
+            return integrate(disturb(self.plant, self.wind, step, agent), x, u, self.dt)
 
         return jax.vmap(one)(states, inputs, jnp.arange(len(states)))

@@ -34,7 +34,7 @@ class Parts:
         world: what the laws do not know: a plant that differs from the model, wind and noise.
 
     Raises:
-        SimulationError: a part is not what its place asks for.
+        SimulationError: a part is not of the kind of its place.
     """
 
     model: ControlAffine
@@ -46,7 +46,8 @@ class Parts:
     world: World = dataclasses.field(default_factory=World)
 
     def __post_init__(self) -> None:
-        """Check that each part is what its place asks for."""
+        """Check that each part is of the kind of its place."""
+        # The model is left out: `check_model` says more of what is wrong with one.
         wanted = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
         for place, kind in wanted.items():
             check_kind(place, getattr(self, place), kind)

@@ -33,6 +33,7 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     check_kind("settings", settings, Settings)
     settings.check()
     model, graph, formation = parts.model, parts.graph, parts.formation
+    # Gains, plans and starts are the same in a float32 run, and so is what is promised of them.
     with precision("float64"):
         warnings = check_model(model) + parts.world.check(model)
         _check_offsets(model, parts)
@@ -50,6 +51,7 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
         )
         warnings += parts.drive.warnings(model, graph, settings)
     warnings += formation_warnings(model, formation)
+    # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
 
@@ -65,15 +67,16 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
 def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
     """Tell of offsets that the dynamics do not respect, and of goals that coincide."""
     broken = formation.broken_symmetries(model)
-    told = [
+    sentences = [
         f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
         "so the agents settle off their goals."
+        # The first is enough: what one offset breaks, the others mostly break too.
         for agent, reason in list(broken.items())[:1]
     ]
     pairs = formation.coincident() if model.position else ()
-    told += [
+    sentences += [
         f"agents {i} and {j} have the same goal, and would collide there." for i, j in pairs[:3]
     ]
     if len(pairs) > 3:
-        told.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
-    return tuple(told)
+        sentences.append(f"{len(pairs) - 3} more pairs of agents have the same goal.")
+    return tuple(sentences)

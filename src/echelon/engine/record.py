@@ -58,6 +58,7 @@ class Recorder:
         """
         self.chunks.append(chunk)
         if reference is not None:
+            # The row of a frame is the number of steps before it; a stopped chunk has fewer.
             self.followed.append(reference[np.cumsum(counts) - counts][: len(chunk.states)])
         finite = np.isfinite(chunk.states).all() and np.isfinite(chunk.inputs).all()
         return chunk.stopped is None and bool(finite)
@@ -69,6 +70,7 @@ class Recorder:
         """
         settings, m = self.problem.settings, len(self.problem.model.input_names)
         counts, agents = frame_counts(settings), self.problem.graph.agents
+        # So that a run without a frame has arrays of the right shape all the same.
         none = np.zeros((0, *self.problem.states.shape)), np.zeros((0, agents, m))
         states = np.concatenate([none[0], *(c.states for c in self.chunks)])[: len(counts)]
         inputs = np.concatenate([none[1], *(c.inputs for c in self.chunks)])[: len(counts)]
@@ -76,9 +78,11 @@ class Recorder:
         sums = nothing
         for chunk in self.chunks:
             sums = sums.plus(chunk.sums)
+        # In the order of frames, then agents: the first row is the first to be lost.
         lost = np.argwhere(~(np.isfinite(states).all(axis=2) & np.isfinite(inputs).all(axis=2)))
         cut = int(lost[0, 0]) if len(lost) else len(times)
         reached = float(times[-1]) if len(times) else 0.0
+        # One that stopped did so between two frames; the steps themselves were counted.
         if self.chunks and self.chunks[-1].stopped:
             reached = float(sums.steps[0]) * settings.dt
         complete = len(states) == len(counts)

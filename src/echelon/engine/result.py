@@ -89,6 +89,7 @@ class Result:
 
         The leaders' rows are zero.
         """
+        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
         y = self.states - self.formation.offsets
         return y - y[:, list(self.graph.nearest_leader())]
 

@@ -1,6 +1,7 @@
 """How a run is computed."""
 
 import math
+import numbers
 from typing import NamedTuple
 
 from echelon.core.errors import SimulationError, did_you_mean, listing
@@ -34,6 +35,7 @@ class Settings(NamedTuple):
     @property
     def steps(self) -> int:
         """The number of steps."""
+        # Rounded, since 0.3 / 0.1 is a little less than 3.
         return max(1, round(self.horizon / self.dt))
 
     @property
@@ -68,13 +70,13 @@ class Settings(NamedTuple):
             ("precision", ("float64", "float32")),
         ):
             _check_name(name, getattr(self, name), allowed)
-        for name, least, words in (
-            ("seed", 0, "a whole number from 0 on"),
-            ("store_every", 1, "at least 1"),
-        ):
+        for name, least in (("seed", 0), ("store_every", 1)):
             value = getattr(self, name)
-            if value != int(value) or value < least:
-                raise SimulationError(f"`{name}` is {value}, and must be {words}.")
+            # By its type: neither a seed nor a count of list entries may be 2.0, or NaN.
+            if not isinstance(value, numbers.Integral) or value < least:
+                raise SimulationError(
+                    f"`{name}` is {value}, and must be a whole number from {least} on."
+                )
 
 
 def _check_name(what: str, name: str, allowed: tuple[str, ...]) -> None:

@@ -53,9 +53,14 @@ class Sums(NamedTuple):
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
         total = Sums(*(a + b for a, b in zip(self, more, strict=True)))
-        # Both NumPy on the host and JAX within a chunk come here.
+        # The later maximum; written so that NumPy on the host and JAX within a chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
         return total._replace(unsettled=last)
+
+
+def on_host(tree: Any) -> Any:
+    """Return the same with every array in float64 NumPy."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)
 
 
 @final
@@ -69,6 +74,7 @@ class Meter(eqx.Module):
     edges: Array
     spacings: Array
     first_steady: Array
+    # Static, since they decide shapes.
     measured: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
@@ -86,12 +92,14 @@ class Meter(eqx.Module):
             leaders=np.array(graph.leaders),
             edges=graph.edges,
             spacings=np.linalg.norm(goals[i] - goals[j], axis=1),
+            # An array and not a constant: another window compiles nothing again.
             first_steady=np.asarray(settings.first_steady, np.int32),
             measured=measured,
         )
 
     def nothing(self) -> Sums:
         """Return the sums of no step."""
+        # The precision that is switched on now: float32 within a float32 run.
         dtype = jnp.zeros(()).dtype
         agents, leaders, q = len(self.offsets), len(self.leaders), len(self.model.output_names)
         return Sums(
@@ -122,11 +130,15 @@ class Meter(eqx.Module):
             limited: (N,) whose inputs a limit changed.
             reference: (n,) what the leaders follow at its beginning, or None.
         """
+        # A row for all steps, a row for those of the steady window.
         twice = jnp.stack([jnp.asarray(True), step >= jnp.asarray(self.first_steady)])
+        # y_i = x_i - xi_i, and y_i - y_0 is the deviation from the goal (theory page).
         y = states - jnp.asarray(self.offsets, states.dtype)
         squares = self._lengths(y - y[self.nearest])
         tracking, outputs = self._tracking(y[self.leaders], reference)
+        # A newton and a newton metre cannot be added; accelerations can.
         v = self.model.normalized(inputs)
+        # Not finite counts as unsettled: a comparison with it is false.
         last = jnp.where(jnp.sqrt(squares) <= SETTLED, -1, step)
         return Sums(
             steps=twice.astype(jnp.int32),
@@ -155,6 +167,7 @@ class Meter(eqx.Module):
             q = len(self.model.output_names)
             return jnp.zeros(len(states), states.dtype), jnp.zeros((len(states), q), states.dtype)
         offsets = jnp.asarray(self.offsets, states.dtype)[self.leaders]
+        # The offset back in: outputs are nonlinear in the state, so each is taken where it holds.
         wanted = reference[None] + offsets
         away = jax.vmap(lambda x, r: output_error(self.model, x, r))(states + offsets, wanted)
         return self._lengths(states - reference[None]), away * away
@@ -166,7 +179,7 @@ class Meter(eqx.Module):
         return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
 
 
-def follow(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
+def reference_at(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:
     """Return row k of a reference (S, n) in the precision of the states; None without one."""
     return None if reference is None else jnp.asarray(reference, states.dtype)[k]
 

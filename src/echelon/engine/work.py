@@ -44,6 +44,7 @@ def solver_stats(
     setup_seconds: float,
 ) -> SolverStats:
     """Return the figures of plans that took these seconds and iterations."""
+    # A run that ended before its first plan has none, and zeros stand for it.
     ms = 1e3 * np.array(seconds) if len(seconds) else np.zeros(1)
     counts = np.array(iterations) if len(iterations) else np.zeros(1)
     return SolverStats(

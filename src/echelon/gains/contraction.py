@@ -41,7 +41,9 @@ class Contraction(Method):
             GainError: there is no such metric, or the domain does not fit.
             MissingExtraError: the solver is not installed.
         """
+        # The inequality weighs no input against a state, and normalized inputs are of like size.
         R, B = np.eye(len(model.input_names)), linear.B
         pairs = pairs_on(model, self.domain, R)
+        # The rate at rho itself is left: the region measures it at the strength chosen.
         P, rho, *_ = contraction(pairs.A, B, self.rate, W=pairs.W)
         return Feedback(P, R, rho, partial(contracting_region, pairs, P, B, R, self.exact))

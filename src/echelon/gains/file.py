@@ -46,6 +46,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
             "agents": graph.agents,
             "leaders": list(graph.leaders),
             "edges": _edges(graph),
+            # Stored beside the edges: the checker compares them, and of a large graph it is all.
             "spectrum": graph.spectrum().eigenvalues.tolist(),
         },
         "certificate": _certificate_as_mapping(gain.certificate),
@@ -56,6 +57,7 @@ def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
     linear = linearize(model)
     return {
         "class": f"{type(model).__module__}:{type(model).__qualname__}",
+        # The checker makes a bundled model again from them; one of the user's own it never imports.
         "parameters": _parameters(model),
         "state_names": list(model.state_names),
         "input_names": list(model.input_names),
@@ -72,6 +74,7 @@ def _parameters(model: ControlAffine) -> dict[str, Any] | None:
     stored = {name: getattr(model, name) for name in fields}
     try:
         return json.loads(
+            # By way of JSON itself, so that what is stored is what will be read.
             json.dumps(stored, allow_nan=False, default=lambda x: np.asarray(x).tolist())
         )
     except (TypeError, ValueError):
@@ -106,6 +109,7 @@ def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
         "rate": region.rate,
         "radius": region.radius,
         "strength": region.strength,
+        # JSON has no infinity, and a file that only Python can read would be no file for others.
         "domain": {name: _finite(getattr(domain, name)) for name in _ENDS},
         "hull": _pack(region.hull),
         "error": region.error.tolist(),
@@ -118,6 +122,7 @@ def _finite(bounds: Array) -> list[float | None]:
 
 def _pack(matrices: Array) -> dict[str, Any]:
     """Return many matrices as one, and what of it changes: most entries are the same in all."""
+    # A vehicle's hull has thousands of corners that differ in a few entries of (n, n) or (n, 2n).
     places = np.argwhere((matrices != matrices[0]).any(axis=0))
     values = matrices[:, places[:, 0], places[:, 1]]
     return {"base": matrices[0].tolist(), "places": places.tolist(), "values": values.tolist()}
@@ -125,6 +130,7 @@ def _pack(matrices: Array) -> dict[str, Any]:
 
 def _unpack(stored: Mapping[str, Any]) -> Array:
     values = np.array(stored["values"], float)
+    # A hull of one matrix has no places, and an empty list no second axis.
     places = np.array(stored["places"], int).reshape(-1, 2)
     matrices = np.repeat(np.array(stored["base"], float)[None], len(values), axis=0)
     matrices[:, places[:, 0], places[:, 1]] = values
@@ -138,6 +144,7 @@ def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) ->
         OutputError: the file cannot be written.
     """
     stored = gain_as_mapping(gain, model, graph)
+    # A line a key: a diff then shows what changed. NaN is refused, since no promise rests on one.
     lines = [f"{json.dumps(key)}: {json.dumps(stored[key], allow_nan=False)}" for key in stored]
     try:
         Path(path).write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
@@ -157,6 +164,7 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
         _check_model(path, stored["model"], model)
         _check_graph(path, stored["graph"], graph)
         return _gain(stored)
+    # What a hand has changed in the file fails somewhere in here, in one of these ways.
     except (LookupError, TypeError, ValueError) as error:
         raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
 
@@ -180,6 +188,7 @@ def _read(path: PathLike) -> Mapping[str, Any]:
 
 
 def _gain(stored: Mapping[str, Any]) -> Gain:
+    # `Gain` and `Certificate` take no words of the file on trust: names become members here.
     inner, certificate = stored["inner"], stored["certificate"]
     region = None if certificate["region"] is None else _region(certificate["region"])
     parts = {**certificate, "kind": Kind.named(certificate["kind"]), "region": region}
@@ -219,6 +228,7 @@ def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine
                 f"the gain in `{path}` was made for `{made_for}` with {what} "
                 f"{list(stored[what])}, and the model is {name} with {list(ours)}."
             )
+    # Class and parameters may differ: near the trim a gain knows a model by these numbers alone.
     compared = {
         "input_scale": (stored["input_scale"], model.input_scale),
         "the trim input": (stored["trim"][1], model.trim[1]),
@@ -228,6 +238,7 @@ def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine
     for what, (theirs, ours) in compared.items():
         theirs, ours = np.asarray(theirs, float), np.asarray(ours, float)
         gap = float(np.abs(theirs - ours).max())
+        # `not <=` instead of `>`: a gap that is not a number must not pass.
         if not gap <= _SAME * max(1e-12, float(np.abs(ours).max())):
             raise GainError(
                 f"the gain in `{path}` was made for another {name}: {what} differs by {gap:.3g}; "

@@ -34,6 +34,7 @@ class FixedGain(Method):
         """
         m = len(model.input_names)
         R = np.eye(m) if self.R is None else as_matrix("R", self.R, m)
+        # No inequality stands behind this P, so that no coupling is known to be enough.
         return Feedback(self._matrix(len(model.state_names)), R, rho=None)
 
     def _matrix(self, n: int) -> np.ndarray:

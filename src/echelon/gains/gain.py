@@ -47,6 +47,7 @@ class Gain(eqx.Module):
     coupling: float
     method: str = eqx.field(static=True)
     certificate: Certificate
+    # Kept, so that no step of a run solves with R, and a float32 run does not invert in float32.
     R_inverse: Array
     inner: Array | None
 
@@ -71,6 +72,7 @@ class Gain(eqx.Module):
         """Return kappa(x) = -K (x - x*), the inner loop; zero without one."""
         if self.inner is None:
             return jnp.zeros(len(model.input_names), x.dtype)
+        # About the trim, where the loop gives nothing: the trim input stays the law's to add.
         return -jnp.asarray(self.inner, x.dtype) @ (x - jnp.asarray(model.trim[0], x.dtype))
 
 
@@ -135,13 +137,18 @@ class Method(eqx.Module):
         """
         if self.coupling is not None:
             check_coupling(self.coupling)
+        # Every method works on the same A and B, of normalized inputs: entries of like size.
         linear = linearize(model)
         P, R, rho, region, inner = self.feedback(model, linear)
+        # Before the certificate, which solves with R, and takes eigenvalues of what P makes.
         check_definite("P", P)
         check_definite("R", R)
+        # L_g >= lambda_min I, so 2 c lambda_min >= rho is enough for every mode (theory, T1).
         edge = None if rho is None else rho / (2.0 * spectrum.low)
+        # A coupling of zero was refused above, and an edge of zero means that any coupling does.
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
         promised = None if region is None else region(coupling, spectrum)
+        # The consensus law acts on what the inner loop leaves: c scales no part of that loop.
         closed = linear.with_inner(inner)
         certificate = certify(closed, spectrum, P, R, coupling, edge, promised)
         return Gain(P, R, coupling, self.name, certificate, inner)
@@ -171,6 +178,7 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
         raise GainError(f"`method` is {got}, and must be a gain method such as `Riccati()`.")
     if not method.name:
         raise GainError(f"`{type(method).__name__}` has no `name`, and every gain method must.")
+    # JAX would differentiate in float32, which no test of stabilizability at 1e-9 survives.
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph.spectrum())

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from echelon.core.errors import GainError, listing
-from echelon.core.linear import Weight, riccati
+from echelon.core.linear import Weight, riccati, symmetric_part
 from echelon.core.types import Array
 from echelon.gains.gain import Feedback, Method
 from echelon.gains.weights import weights_of
@@ -15,6 +15,7 @@ from echelon.models.linearization import Linearization
 from echelon.models.model import ControlAffine
 
 _SAMPLES = 16
+"""Random states; more than one, since a drift may be flat on one side of a threshold."""
 
 
 class InnerLoop(Method):
@@ -56,15 +57,18 @@ class InnerLoop(Method):
             )
         K = self._feedback(model, linear, fixed)
         P = _monotone(model, linear.with_inner(K).A, fixed, self._weights(model, len(fixed)))
+        # P A + A'P <= 0 without any feedback, so that every coupling keeps it: rho is 0.
         return Feedback(P, np.eye(len(model.input_names)), rho=0.0, inner=K)
 
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
         """Return K (m, n), zero in the columns of the symmetric states."""
+        # A Riccati equation knows no actuators' limits; a model's own damping minds them.
         if self.Q is None and self.R is None and model.damping is not None:
             return np.asarray(model.damping, float)
         free = _others(model, fixed)
         Q, R = weights_of(model, self.Q, self.R)
         A, B = linear.A[np.ix_(free, free)], linear.B[free]
+        # Zero columns: a loop that felt a position would make its offsets no symmetries (Lemma 4).
         K = np.zeros((len(model.input_names), len(model.state_names)))
         K[:, free] = np.linalg.solve(R, B.T @ riccati(A, B, Q[np.ix_(free, free)], R))
         return K
@@ -81,8 +85,10 @@ class InnerLoop(Method):
 def symmetric_states(model: ControlAffine) -> list[int]:
     """Return the indices of states on which neither f nor g depends (tested at random states)."""
     base = np.asarray(model.trim[0], float)
+    # Half a unit about the trim stays inside the charts of angles; a fixed seed, one answer.
     states = base + np.random.default_rng(0).uniform(-0.5, 0.5, (_SAMPLES, len(base)))
     slopes = np.asarray(_sensitivity(model, jnp.asarray(states)))
+    # Exactly zero: a state that the code does not use has a derivative of zero, without rounding.
     return [k for k in range(len(base)) if slopes[k] == 0.0]
 
 
@@ -108,6 +114,7 @@ def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) 
     """
     free = _others(model, fixed)
     inner = A[np.ix_(free, free)]
+    # With no other states nothing is left to decay, and -1 stands for any mode that does.
     slow = np.linalg.eigvals(inner).real.max() if free else -1.0
     if slow >= 0.0:
         names = listing(model.state_names[k] for k in free)
@@ -115,9 +122,11 @@ def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) 
             f"the inner loop leaves a mode at {slow:.3g} 1/s among {names}, and must damp them all."
         )
     T_inverse = np.eye(len(A))
+    # The columns of the symmetric states are zero in A, so y = x_f - A_fs A_ss^-1 x_s has ydot = 0.
     T_inverse[np.ix_(fixed, free)] = -A[np.ix_(fixed, free)] @ np.linalg.inv(inner)
     core = np.zeros_like(A)
+    # Any positive weights keep V from rising, since y stands still; they set rates alone.
     core[fixed, fixed] = weights
     core[np.ix_(free, free)] = scipy.linalg.solve_continuous_lyapunov(inner.T, -np.eye(len(free)))
-    P = T_inverse.T @ core @ T_inverse
-    return 0.5 * (P + P.T)
+    # P A + A'P = T^-T diag(0, -I) T^-1 <= 0. Rounding leaves it a little off symmetry.
+    return symmetric_part(T_inverse.T @ core @ T_inverse)

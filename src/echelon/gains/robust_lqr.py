@@ -42,7 +42,10 @@ class RobustLQR(Method):
             MissingExtraError: the solver is not installed.
         """
         Q, R = weights_of(model, self.Q, self.R)
+        # The rate is at least half the least eigenvalue of P^-1 Q: a Q with a kernel promises none.
         check_definite("Q", Q)
         pairs = pairs_on(model, self.domain, R)
+        # Where g varies, W replaces B R^-1 B' corner by corner: at the trim's alone the rate would
+        # be too good.
         P = robust_lqr(pairs.A, linear.B, Q, R, pairs.W).P
         return Feedback(P, R, 1.0, partial(contracting_region, pairs, P, linear.B, R, self.exact))

@@ -15,10 +15,13 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
     A, B = linearize(model).with_inner(gain.inner)
     depth, parents = graph.depths(), graph.parents()
     i, j = graph.edges.T
+    # An edge belongs to its end that is farther out; one between leaders lands on a leader, and
+    # leaders are left out below.
     weight = np.ones(graph.agents)
     weight[np.where(depth[i] > depth[j], i, j)] = graph.weights
     used = np.unique(weight[list(graph.followers)])
     try:
+        # Links of one weight are alike, and each gain is a sweep over frequencies.
         gains = [
             string_gain(ClosedLoop(A, B, gain.P, gain.R, gain.coupling * w, used)).gain
             for w in used
@@ -29,6 +32,7 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
             f"weight, {used[0]:.4g}, is too weak: a mode of the formation does not decay.",
         )
     growth = np.ones(graph.agents)
+    # Outward, so that an agent's parent has its product before the agent does.
     for agent in np.argsort(depth, kind="stable"):
         if depth[agent]:
             growth[agent] = growth[parents[agent]] * gains[np.searchsorted(used, weight[agent])]

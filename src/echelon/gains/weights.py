@@ -26,6 +26,7 @@ def weights_of(
     Q = as_matrix("Q", own_Q if Q is None else Q, len(model.state_names))
     R = as_matrix("R", own_R if R is None else R, len(model.input_names))
     check_definite("R", R)
+    # R must be inverted and so is definite; Q may leave states free that decay by themselves.
     _check_semidefinite(Q)
     return Q, R
 

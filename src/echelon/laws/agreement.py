@@ -28,6 +28,7 @@ class Agreement(Law):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Agreement":
         """Refuse a model that is no single integrator."""
+        # u = -z gives differences of states as velocities, which suits xdot = u and no other.
         if not isinstance(model, SingleIntegrator):
             raise LawError(
                 f"the law `agreement` is made for `SingleIntegrator`, and the model is "
@@ -37,4 +38,5 @@ class Agreement(Law):
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the velocity of one agent."""
+        # With f = 0 and g = I the consensus law at P = R = I and c = 1 is this: z has the brackets.
         return -view.disagreement, memory

@@ -33,7 +33,7 @@ class Consensus(Law):
 
     Args:
         gain: P, R and c.
-        feedforward: `none`, or what is told of others' inputs of the same step, after their limits:
+        feedforward: `none`, or what is sent of others' inputs of the same step, after their limits:
             `relay`, the leader's normalized input; `relay-velocity`, the velocity g S v that it
             makes, of which each follower takes the input nearest in P; `parent`, on a tree, the
             normalized input of the neighbour nearer to the leader. The paper's network gives none
@@ -43,6 +43,7 @@ class Consensus(Law):
     """
 
     gain: Gain
+    # Static: what is sent decides the structure of a step, so each choice is compiled for itself.
     feedforward: Feedforward = eqx.field(
         default=Feedforward.NONE, static=True, converter=_feedforward
     )
@@ -70,6 +71,7 @@ class Consensus(Law):
         """Check that the gain fits the model, and the feed-forward the graph."""
         check_gain_fits(self, model, self.gain.P.shape, self.gain.R.shape)
         if self.feedforward is Feedforward.PARENT:
+            # Raises where the graph is no tree; what it returns is computed again where it is used.
             graph.parents()
         return self
 
@@ -81,14 +83,16 @@ class Consensus(Law):
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the input of one agent."""
-        told = view.feedforward
+        sent = view.feedforward
         if self.feedforward is Feedforward.RELAY_VELOCITY:
-            told = _matching(self.gain, model, view.x, told)
-        v = told - feedback(self.gain, model, view.x, view.disagreement)
+            sent = _match_velocity(self.gain, model, view.x, sent)
+        v = sent - feedback(self.gain, model, view.x, view.disagreement)
         return model.physical(v + self.gain.inner_loop(model, view.x), trim=self.trim), memory
 
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return the input beyond the inner loop, v - kappa(x), or the velocity that it makes."""
+        # A follower closes its own loop about its own state, and adds this; with the whole v the
+        # loop would count twice wherever the two states differ.
         beyond = v - self.gain.inner_loop(model, x)
         if self.feedforward is Feedforward.RELAY_VELOCITY:
             return model.normalized_input_map(x) @ beyond
@@ -96,18 +100,22 @@ class Consensus(Law):
 
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return the drift with the inner loop closed."""
+        # What Assumption 5 must hold of under this law: the loop is there without any neighbour.
         return model.velocity(x, model.physical(self.gain.inner_loop(model, x)))
 
 
-def _matching(gain: Gain, model: ControlAffine, x: State, velocity: State) -> Input:
+def _match_velocity(gain: Gain, model: ControlAffine, x: State, velocity: State) -> Input:
     """Return the normalized input (m,) whose g(x) S v is nearest to a velocity in the metric P."""
     G = model.normalized_input_map(x)
+    # Least |G v - velocity|_P: G'P G v = G'P velocity. The second sum of V' has just this P, so
+    # that what no input can match pushes V least.
     weighted = G.T @ jnp.asarray(gain.P, x.dtype)
     return jnp.linalg.solve(weighted @ G, weighted @ velocity)
 
 
 def feedback(gain: Gain, model: ControlAffine, x: State, error: State) -> Input:
     """Return c R^-1 (g(x) S)'P error, a normalized input (m,)."""
+    # From the right: vectors only, and in the precision of the states.
     weighted = jnp.asarray(gain.P, x.dtype) @ error
     pulled = model.normalized_input_map(x).T @ weighted
     return gain.coupling * (jnp.asarray(gain.R_inverse, x.dtype) @ pulled)

@@ -26,7 +26,7 @@ class LocalView(NamedTuple):
         t: time, s.
         x: own state (n,).
         offset: own goal offset xi (n,).
-        disagreement: z = e + d (n,), from what the neighbours said.
+        disagreement: z = e + d (n,), from what the neighbours sent.
         feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
             unless the law's `broadcast` says otherwise.
     """
@@ -44,7 +44,7 @@ class Law(eqx.Module):
     It is the same for one agent in its own process and for a million in a batch.
 
     Attributes:
-        feedforward: which feed-forward the law asks for, none unless replaced by a field, an
+        feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
     """
 
@@ -52,7 +52,7 @@ class Law(eqx.Module):
 
     @property
     def information(self) -> tuple[str, ...]:
-        """What the law must be told by others, in words."""
+        """What the law must be sent by others, in words."""
         return ()
 
     def start(self, model: ControlAffine) -> State:
@@ -82,10 +82,10 @@ class Law(eqx.Module):
         return None
 
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
-        """Return what followers under this law are told of an agent at x with normalized input v.
+        """Return what followers under this law are sent of an agent at x with normalized input v.
 
-        The input itself unless replaced: a law with an inner loop of its own asks for what is
-        applied beyond that loop.
+        The input itself unless replaced: a law with an inner loop of its own needs what is applied
+        beyond that loop.
         """
         return v
 
@@ -95,6 +95,7 @@ class Law(eqx.Module):
 
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return xdot (n,) when the disagreement and the feed-forward are zero."""
+        # The trim input is no feedback: what is left about the trim is the drift f + g u*.
         return model.normalized_drift(x)
 
     @abc.abstractmethod
@@ -120,6 +121,7 @@ def check_gain_fits(
 
 def gain_of(law: Law) -> Gain | None:
     """Return the gain that a law runs with, where it has one."""
+    # By name, since a law may be a user's own, and need not have one.
     gain = getattr(law, "gain", None)
     return gain if isinstance(gain, Gain) else None
 
@@ -130,10 +132,13 @@ def without_certificates(law: Law) -> Law:
     So another coupling or another graph of the same size compiles nothing again.
     """
 
-    def lean(node: Any) -> Any:
+    def strip(node: Any) -> Any:
         if not isinstance(node, Gain):
             return node
+        # `filter_jit` takes floats for constants: with this one, or those of a certificate, every
+        # other graph would be compiled anew.
         parts = (np.asarray(node.coupling), None)
         return eqx.tree_at(lambda gain: (gain.coupling, gain.certificate), node, parts)
 
-    return jax.tree.map(lean, law, is_leaf=lambda node: isinstance(node, Gain))
+    # A gain may stand anywhere in a user's own law, so that none is found by its name.
+    return jax.tree.map(strip, law, is_leaf=lambda node: isinstance(node, Gain))

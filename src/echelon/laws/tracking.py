@@ -44,22 +44,18 @@ class Tracking(Law):
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
         """Complete the gain where it is not, and check that the model can follow a reference."""
         check_flat(model)
-        riccati, gain = Riccati(coupling=1.0), self.gain
-        gain = riccati.solve(model, graph.spectrum()) if gain is None else gain
-        for each in (gain, self.reaction):
-            if each is not None:
-                check_gain_fits(self, model, each.P.shape, each.R.shape)
-        law = self
-        if gain is not self.gain or gain.coupling != 1.0:
-            unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
-            law = Tracking(self.reference, unit, self.reaction)
+        if self.reaction is not None:
+            check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
+        gain = tracking_gain(self, model, graph, self.gain)
+        # Refused here, since a run would only say that the leader diverged at once.
         begin = follow_at(model, self.reference, jnp.zeros(1))
         if not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
                 f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
             )
-        return law
+        # A law that is complete stays itself, so that a result asks of what was asked before.
+        return self if gain is self.gain else Tracking(self.reference, gain, self.reaction)
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
@@ -78,8 +74,23 @@ class Tracking(Law):
         if self.gain is None:
             raise LawError("`Tracking` has no gain yet; call `prepared(model, graph)` first.")
         state, u = self.target(model, view.t)
+        # With several leaders each follows the reference an offset of its own away.
         error = model.difference(view.x, state + view.offset)
         v = feedback(self.gain, model, view.x, error)
+        # Normalized inputs are added, and the trim once: it is in u already.
         if self.reaction is not None:
             v = v + feedback(self.reaction, model, view.x, view.disagreement)
         return u - model.physical(v, trim=False), memory
+
+
+def tracking_gain(law: Law, model: ControlAffine, graph: Graph, gain: Gain | None) -> Gain:
+    """Return a leader's own gain with coupling 1, the model's Riccati gain where it is None.
+
+    Raises:
+        LawError: it does not fit the model.
+    """
+    if gain is None:
+        gain = Riccati(coupling=1.0).solve(model, graph.spectrum())
+    check_gain_fits(law, model, gain.P.shape, gain.R.shape)
+    # The coupling makes up for lambda_min of a network, and a leader hears its reference directly.
+    return gain if gain.coupling == 1.0 else eqx.tree_at(lambda g: g.coupling, gain, 1.0)

@@ -6,7 +6,7 @@ from echelon.models.model import ControlAffine
 
 
 class TrimInput(Law):
-    """u = u* + S v_ff, with nothing asked for and so v_ff = 0.
+    """u = u* + S v_ff, with nothing sent and so v_ff = 0.
 
     It leaves the agent to its own unforced motion about the trim.
     """

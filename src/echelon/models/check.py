@@ -11,6 +11,7 @@ from echelon.core.numerics import precision
 from echelon.models.linearization import at_trim
 from echelon.models.model import ControlAffine
 
+# Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
 _TRIM_TOLERANCE = 1e-9
 
 
@@ -36,6 +37,8 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
         )
     name = type(model).__name__
     for what, names in (("state_names", model.state_names), ("input_names", model.input_names)):
+        # A text is a sequence too, of letters: ("x") without its comma would name one state by
+        # luck.
         if isinstance(names, str):
             raise ModelError(
                 f"`{what}` of `{name}` is the text `{names}`, and must be a tuple of names; "
@@ -82,6 +85,7 @@ def _trim(model: ControlAffine, name: str, n: int, m: int) -> tuple[np.ndarray, 
     x, u = _pair(name, "trim", model.trim, n, m)
     _pair(name, "weights", model.weights, n, m)
     scale = _numbers(name, "input_scale", model.input_scale, (m, m))
+    # Near a condition of 1/eps = 4.5e15 no digit of the inverse is right.
     if np.linalg.cond(scale) > 1e15:
         raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")
     return x, u
@@ -104,6 +108,7 @@ def _numbers(name: str, what: str, value: Any, shape: tuple[int, ...]) -> np.nda
     except (TypeError, ValueError):
         raise ModelError(f"`{what}` of `{name}` is {value}, and must be numbers.") from None
     if len(shape) == 1:
+        # The trim of a single state may be a plain number.
         array = np.atleast_1d(array)
     _check_shape(name, what, array.shape, shape)
     if not np.isfinite(array).all():
@@ -127,13 +132,16 @@ def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray)
 
 
 def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ...]:
-    """Return the shape of a model's function, telling apart the errors of the model's own code."""
+    """Return the shape of a model's function, with errors of the model's own code named as such."""
     try:
+        # Abstract evaluation finds shapes and faults without compiling anything.
         value = jax.eval_shape(function, jnp.asarray(at))
+    # The model is anyone's code: whatever it raises is its own fault, and stays attached as the
+    # cause.
     except Exception as error:
-        told = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
+        message = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
         raise ModelError(
-            f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {told}; "
+            f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {message}; "
             "it must be written with `jax.numpy` and take one agent's state."
         ) from error
     if not hasattr(value, "shape"):
@@ -173,6 +181,7 @@ def trim_shortfall(model: ControlAffine, wanted: np.ndarray | None = None) -> di
 
 def _weak_actuators(model: ControlAffine, name: str) -> tuple[str, ...]:
     """Warn of a trim that the actuators cannot hold."""
+    # `limit` returns what fits unchanged, to the bit, so any difference is saturation.
     short = trim_shortfall(model).items()
     told = ", ".join(f"`{what}` {got:.4g} of {asked:.4g}" for what, (got, asked) in short)
     return (f"the actuators of `{name}` cannot hold its trim: they deliver {told}.",) * bool(short)
@@ -181,6 +190,7 @@ def _weak_actuators(model: ControlAffine, name: str) -> tuple[str, ...]:
 def _low_precision(model: ControlAffine, name: str) -> tuple[str, ...]:
     """Warn of parameters that a JAX array made without float64 has already rounded."""
     leaves = jax.tree_util.tree_leaves_with_path(model)
+    # Made outside of an x64 context a JAX array is float32, whatever it was given.
     rounded = [
         jax.tree_util.keystr(path).lstrip(".")
         for path, leaf in leaves

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from echelon.core.errors import ModelError
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, not_negative
+from echelon.models.model import ControlAffine, check_not_negative
 
 _AXES = ("x", "y", "z")
 
@@ -19,6 +19,7 @@ def _axes(dimension: int) -> tuple[str, ...]:
 
 
 def _check_dimension(model: eqx.Module, dimension: int) -> None:
+    # True is an integer to Python, and no dimension.
     if isinstance(dimension, bool) or not isinstance(dimension, numbers.Integral) or dimension < 1:
         raise ModelError(
             f"`dimension` of `{type(model).__name__}` is {dimension}, "
@@ -29,6 +30,7 @@ def _check_dimension(model: eqx.Module, dimension: int) -> None:
 class SingleIntegrator(ControlAffine):
     """xdot = u, with x a position in `dimension` axes (m) and u a velocity (m/s)."""
 
+    # Static, since it sets shapes, which a compiled function cannot take as data.
     dimension: int = eqx.field(default=2, static=True)
 
     flat_order = 1
@@ -70,6 +72,7 @@ class SingleIntegrator(ControlAffine):
     @property
     def flat_outputs(self) -> tuple[str, ...]:
         """The axes, up to three."""
+        # A reference has three coordinates of space.
         return self.state_names if self.dimension <= 3 else ()
 
     def drift(self, x: State) -> State:
@@ -78,6 +81,7 @@ class SingleIntegrator(ControlAffine):
 
     def input_map(self, x: State) -> InputMap:
         """Return g = I."""
+        # In the precision of x: else float32 runs are promoted wherever x64 is on.
         return jnp.eye(self.dimension, dtype=x.dtype)
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
@@ -99,7 +103,7 @@ class DoubleIntegrator(ControlAffine):
     def __check_init__(self) -> None:
         """Refuse a dimension below one or a negative drag."""
         _check_dimension(self, self.dimension)
-        not_negative(self, drag=self.drag)
+        check_not_negative(self, drag=self.drag)
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -160,4 +164,5 @@ class DoubleIntegrator(ControlAffine):
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return (position, velocity) and the acceleration that holds against drag."""
         position, velocity, acceleration = derivatives
+        # vdot = u - drag v, solved for u.
         return jnp.concatenate([position, velocity]), acceleration + self.drag * velocity

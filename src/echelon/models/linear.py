@@ -27,6 +27,7 @@ class Linear(ControlAffine):
     A: Array
     B: Array
     C: Array
+    # Text is no data to JAX, so it belongs to the structure of the module.
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -37,6 +38,7 @@ class Linear(ControlAffine):
         names: Sequence[str] = (),
     ) -> None:
         """Check and keep the matrices as float64."""
+        # NumPy's float64: a JAX array made outside of an x64 context would already be rounded.
         self.A, self.B = _matrix("A", A), _matrix("B", B)
         n = len(self.A)
         self.C = np.eye(n) if C is None else _matrix("C", C)

@@ -54,6 +54,7 @@ def at_trim(model: ControlAffine) -> AtTrim:
     precision.
     """
     x, u = (np.asarray(part, float) for part in model.trim)
+    # Gains are kept in files, so they must not depend on the precision of the run that needs them.
     with precision("float64"):
         return AtTrim(*map(_freeze, _evaluate(model, jnp.asarray(x), jnp.asarray(u))))
 
@@ -76,6 +77,7 @@ def linearize(model: ControlAffine) -> Linearization:
 @kept
 def trim_slopes(model: ControlAffine) -> Array:
     """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: what each trim input puts into A."""
+    # d(g u*)/dx = sum_k u*_k dg_k/dx: an input scaled by s scales its own term alone.
     u = np.asarray(model.trim[1], float)
     return _freeze(u[:, None, None] * np.moveaxis(at_trim(model).input_slope, 1, 0))
 

@@ -30,6 +30,7 @@ class _Default(Generic[_T]):
     def __init__(self, make: Callable[[Any], _T]) -> None:
         self.make = make
 
+    # Without `__set__` it gives way to a field of the instance, as a property would not.
     def __get__(self, instance: object, owner: type) -> "_T | _Default[_T]":
         """Return the value for an instance."""
         return self if instance is None else self.make(instance)
@@ -121,7 +122,7 @@ class ControlAffine(eqx.Module):
     """Open bounds of states outside which the equations do not hold, such as a pitch of 90 deg."""
 
     flat_outputs: ClassVar[tuple[str, ...]] = ()
-    """Which of a reference's coordinates (x, y, z, yaw) the model can be told to follow."""
+    """Which of a reference's coordinates (x, y, z, yaw) the model can follow."""
 
     flat_order: ClassVar[int] = 0
     """How many time derivatives of the reference `flat` needs."""
@@ -157,7 +158,7 @@ class ControlAffine(eqx.Module):
         return x - y
 
     def limit(self, u: Input) -> Input:
-        """Return the input that the actuators deliver when asked for u; u itself unless replaced.
+        """Return the input that the actuators deliver for a requested u; itself unless replaced.
 
         An input within the limits must be returned unchanged, to the bit: that is how saturation is
         counted.
@@ -182,6 +183,7 @@ class ControlAffine(eqx.Module):
         Without the trim it is S v, what an input is changed by.
         """
         xp = v.__array_namespace__()
+        # One input a row: (S v)' = v'S'.
         u = v @ xp.asarray(self.input_scale, v.dtype).T
         return u + _rest(self, u) if trim else u
 
@@ -234,12 +236,13 @@ def _rest(model: ControlAffine, u: _Inputs) -> _Inputs:
     return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
 
 
-def positive(owner: object, **values: float) -> None:
+def check_positive(owner: object, **values: float) -> None:
     """Check that each named parameter is a finite positive number.
 
     Raises:
         ModelError: one is not.
     """
+    # A chain of comparisons is false for NaN, which is refused with the rest.
     for name, value in values.items():
         if not (isinstance(value, numbers.Real) and 0.0 < value < float("inf")):
             raise ModelError(
@@ -248,7 +251,7 @@ def positive(owner: object, **values: float) -> None:
             )
 
 
-def not_negative(owner: object, **values: float) -> None:
+def check_not_negative(owner: object, **values: float) -> None:
     """Check that each named parameter is a finite number of at least zero.
 
     Raises:

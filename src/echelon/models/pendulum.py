@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from echelon.core.types import InputMap, State
-from echelon.models.model import ControlAffine, not_negative, positive
+from echelon.models.model import ControlAffine, check_not_negative, check_positive
 
 
 class Pendulum(ControlAffine):
@@ -23,8 +23,8 @@ class Pendulum(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse a stiffness that is not positive or a negative damping."""
-        positive(self, stiffness=self.stiffness)
-        not_negative(self, damping=self.damping)
+        check_positive(self, stiffness=self.stiffness)
+        check_not_negative(self, damping=self.damping)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, Limits, diagonal, positive
+from echelon.models.model import ControlAffine, Limits, check_positive, diagonal
 from echelon.models.rotors import attitude_priority, fits
 
 # Right and left pairs of motors; each pair counts as one rotor with twice the thrust.
@@ -24,6 +24,7 @@ class PlanarQuadrotor(ControlAffine):
     mass: float = 0.028
     inertia: float = 16.571710e-6
     gravity: float = 9.81
+    # 0.046 m from the hub to a motor, over sqrt 2 along a body axis; 2 x 0.15975 N a pair.
     arm: float = 0.0325
     motor_thrust: float = 0.3195
 
@@ -39,15 +40,17 @@ class PlanarQuadrotor(ControlAffine):
         "attitude": ("roll",),
         "rate": ("roll_rate",),
     }
+    # One over the square of what counts as much: 1 m, 0.7 rad, 2 m/s, 5 rad/s; 5 m/s^2, 20 rad/s^2.
     weights = ((1.0, 1.0, 2.0, 0.25, 0.25, 0.04), (1 / 25, 1 / 400))
     flat_outputs = ("y", "z")
+    # The path's second derivative sets the roll, whose second derivative is the torque.
     flat_order = 4
 
     def __check_init__(self) -> None:
         """Refuse parameters that are not positive."""
         names = ("mass", "inertia", "gravity", "arm", "motor_thrust")
         values: dict[str, Any] = {name: getattr(self, name) for name in names}
-        positive(self, **values)
+        check_positive(self, **values)
 
     @property
     def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -62,6 +65,7 @@ class PlanarQuadrotor(ControlAffine):
     @property
     def input_limits(self) -> Limits:
         """Each pair of motors gives between 0 and `motor_thrust`."""
+        # T = f1 + f2 and tau = arm (f1 - f2), solved for the thrusts.
         rows = tuple((0.5, sign / (2.0 * self.arm)) for sign in _LEFT)
         return Limits(rows, (0.0,) * 2, (self.motor_thrust,) * 2)
 
@@ -88,7 +92,10 @@ class PlanarQuadrotor(ControlAffine):
         up = jnp.array([0.0, self.gravity], derivatives.dtype)
 
         def roll(s: jax.Array) -> jax.Array:
+            # Taylor's polynomial of acceleration - gravity: roll is needed to its second derivative
+            # at s = 0.
             lift = acceleration + up + s * jerk + 0.5 * s**2 * snap
+            # The lift is (T/m) (-sin roll, cos roll).
             return jnp.arctan2(-lift[0], lift[1])
 
         def roll_rate(s: jax.Array) -> jax.Array:
@@ -108,4 +115,5 @@ class PlanarQuadrotor(ControlAffine):
         wanted = u[0] / 2.0 + tilt
         f = attitude_priority(u[0] / 2.0, tilt, jnp.zeros_like(tilt), self.motor_thrust)
         delivered = jnp.stack([jnp.sum(f), self.arm * (left @ f)])
+        # u itself where it fits, since mixing there and back would round and count as saturation.
         return jnp.where(fits(wanted, self.motor_thrust), u, delivered)

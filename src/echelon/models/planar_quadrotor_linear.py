@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, Limits, diagonal, positive
+from echelon.models.model import ControlAffine, Limits, check_positive, diagonal
 
 
 class LinearPlanarQuadrotor(ControlAffine):
@@ -18,6 +18,7 @@ class LinearPlanarQuadrotor(ControlAffine):
     inertia: float = 16.571710e-6
     gravity: float = 9.81
 
+    # The source's order: a coordinate, then its rate.
     state_names = ("y", "vy", "z", "vz", "roll", "roll_rate")
     state_units = ("m", "m/s", "m", "m/s", "rad", "rad/s")
     input_names = ("thrust", "torque")
@@ -28,7 +29,7 @@ class LinearPlanarQuadrotor(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse parameters that are not positive."""
-        positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)
+        check_positive(self, mass=self.mass, inertia=self.inertia, gravity=self.gravity)
 
     @property
     def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -43,6 +44,7 @@ class LinearPlanarQuadrotor(ControlAffine):
     @property
     def input_limits(self) -> Limits:
         """|u1| <= 1.2 m g and |u2| <= Ixx pi / 10, as printed."""
+        # To both sides, as the source prints it, though no rotor can pull.
         high = (1.2 * self.mass * self.gravity, self.inertia * float(np.pi) / 10.0)
         return Limits(diagonal(1.0, 1.0), (-high[0], -high[1]), high)
 
@@ -58,6 +60,7 @@ class LinearPlanarQuadrotor(ControlAffine):
 
     def input_map(self, x: State) -> InputMap:
         """Return g."""
+        # Filled by NumPy, so that a trace sees one constant and no updates.
         g = np.zeros((6, 2))
         g[3, 0], g[5, 1] = 1.0 / self.mass, 1.0 / self.inertia
         return jnp.asarray(g, x.dtype)

@@ -9,7 +9,7 @@ import math
 import jax.numpy as jnp
 
 from echelon.core.types import InputMap, Output, State
-from echelon.models.model import ControlAffine, positive
+from echelon.models.model import ControlAffine, check_positive
 from echelon.models.rigid_body import thrust_axis
 
 _GROUPS = {
@@ -45,10 +45,11 @@ class QuadrotorEuler(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse a gravity that is not positive."""
-        positive(self, gravity=self.gravity)
+        check_positive(self, gravity=self.gravity)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
+        # f is the motion at a = 0, a thrust of m g along the body axis.
         lift = self.gravity * (thrust_axis(x[6:9]) - jnp.array([0.0, 0.0, 1.0], x.dtype))
         return jnp.concatenate([x[3:6], lift, x[9:12], jnp.zeros(3, x.dtype)])
 
@@ -85,11 +86,12 @@ class QuadrotorThrust(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse a gravity that is not positive."""
-        positive(self, gravity=self.gravity)
+        check_positive(self, gravity=self.gravity)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
         up = jnp.array([0.0, 0.0, self.gravity], x.dtype)
+        # The thrust that turns is a state here, so it is in f, and g holds integrators alone.
         lift = thrust_axis(x[6:9]) * (self.gravity + x[12]) - up
         return jnp.concatenate([x[3:6], lift, x[9:12], jnp.zeros(4, x.dtype)])
 

@@ -1,11 +1,10 @@
 """The quadrotor exactly as the paper prints it (literal), kept to show what follows from it."""
 
-import math
-
 import jax.numpy as jnp
 
 from echelon.core.types import InputMap, Output, State
-from echelon.models.model import ControlAffine, diagonal, positive
+from echelon.models.model import ControlAffine, check_positive, diagonal
+from echelon.models.quadrotor import Quadrotor
 from echelon.models.rigid_body import check_moments, euler_rates, free_spin
 
 
@@ -22,28 +21,20 @@ class PrintedQuadrotor(ControlAffine):
     """
 
     mass: float = 0.028
+    # Table I, which no rigid body has: Ixx + Iyy < Izz.
     inertia: tuple[float, float, float] = (6.4893e-6, 16.4562e-6, 29.5435e-6)
 
-    state_names = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
-    state_units = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
-    input_names = ("thrust", "torque_x", "torque_y", "torque_z")
-    input_units = ("N", "N m", "N m", "N m")
-    output_names = ("x", "y", "z", "yaw")
-    position = ("x", "y", "z")
-    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
-    state_groups = {
-        "position": ("x", "y", "z"),
-        "velocity": ("vx", "vy", "vz"),
-        "attitude": ("roll", "pitch", "yaw"),
-        "rate": ("p", "q", "r"),
-    }
+    state_names, state_units = Quadrotor.state_names, Quadrotor.state_units
+    input_names, input_units = Quadrotor.input_names, Quadrotor.input_units
+    output_names, position = Quadrotor.output_names, Quadrotor.position
+    state_groups, chart = Quadrotor.state_groups, Quadrotor.chart
 
     def __check_init__(self) -> None:
         """Refuse a mass or inertia that is not positive.
 
         The printed inertia itself is kept on purpose.
         """
-        positive(self, mass=self.mass)
+        check_positive(self, mass=self.mass)
         check_moments(self, self.inertia)
 
     @property

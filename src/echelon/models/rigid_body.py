@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from echelon.core.errors import ModelError
 from echelon.core.types import Scalar
-from echelon.models.model import positive
+from echelon.models.model import check_positive
 
 Vector: TypeAlias = Float[jax.Array, " 3"]
 
@@ -27,7 +27,7 @@ def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
             f"`inertia` of `{type(owner).__name__}` is {inertia}, and must be three moments "
             "(Ixx, Iyy, Izz) in kg m^2."
         )
-    positive(owner, **{f"inertia[{k}]": moment for k, moment in enumerate(inertia)})
+    check_positive(owner, **{f"inertia[{k}]": moment for k, moment in enumerate(inertia)})
 
 
 def check_inertia(inertia: tuple[float, float, float]) -> None:
@@ -36,6 +36,8 @@ def check_inertia(inertia: tuple[float, float, float]) -> None:
     Raises:
         ModelError: one exceeds the sum of the other two, by more than rounding.
     """
+    # Ixx + Iyy - Izz = int 2 z^2 dm >= 0 for each axis, with equality for a flat plate: hence the
+    # slack.
     total = sum(inertia)
     for axis, moment in zip("xyz", inertia, strict=True):
         if 2.0 * moment > total * (1.0 + 1e-12):
@@ -49,12 +51,14 @@ def check_inertia(inertia: tuple[float, float, float]) -> None:
 
 def free_spin(inertia: tuple[float, float, float], omega: Vector) -> Vector:
     """Return -J^-1 (omega x J omega), the angular acceleration without torque."""
+    # In principal axes J is diagonal, and J^-1 a division.
     J = jnp.asarray(inertia, omega.dtype)
     return -jnp.cross(omega, J * omega) / J
 
 
 def thrust_axis(zeta: Vector) -> Vector:
     """Return the body z axis in the world frame, R e3."""
+    # The third column of Rz(yaw) Ry(pitch) Rx(roll).
     (sr, sp, sy), (cr, cp, cy) = jnp.sin(zeta), jnp.cos(zeta)
     return jnp.stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
 
@@ -63,6 +67,7 @@ def euler_rates(zeta: Vector, omega: Vector) -> Vector:
     """Return zetadot = W(zeta) omega (rad/s) from the body rate; singular at pitch +-90 deg."""
     sr, cr = jnp.sin(zeta[0]), jnp.cos(zeta[0])
     p, q, r = omega
+    # The yaw rate, of which sin(pitch) turns into roll.
     turn = (sr * q + cr * r) / jnp.cos(zeta[1])
     return jnp.stack([p + jnp.sin(zeta[1]) * turn, cr * q - sr * r, turn])
 
@@ -80,6 +85,7 @@ def tilt_towards(direction: Vector, yaw: Scalar) -> Vector:
     The length of `direction` does not matter.
     """
     sy, cy = jnp.sin(yaw), jnp.cos(yaw)
+    # With the yaw undone R e3 is (cos roll sin pitch, -sin roll, cos roll cos pitch).
     forward = cy * direction[0] + sy * direction[1]
     left = cy * direction[1] - sy * direction[0]
     # atan2 of the two legs keeps the derivative finite where an arcsine of a unit length would not.

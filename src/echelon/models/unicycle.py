@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, State
-from echelon.models.model import ControlAffine, diagonal, positive
+from echelon.models.model import ControlAffine, check_positive, diagonal
 
 
-def _wound(x: State, y: State) -> State:
+def _wrap_heading(x: State, y: State) -> State:
     """Return x - y with the heading (third entry) brought to (-pi, pi]."""
+    # Followers that differ by a whole turn agree, and must not unwind.
     turn = x[2] - y[2]
     return (x - y).at[2].set(turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi)))
 
@@ -17,6 +18,7 @@ def _drive(derivatives: jax.Array) -> tuple[State, Input]:
     """Return axle state (x, y, heading) and input (speed, turn rate) on a path, speed > 0."""
     (px, py), (vx, vy), (ax, ay) = derivatives
     speed = jnp.hypot(vx, vy)
+    # The derivative of atan2(vy, vx).
     turn_rate = (vx * ay - vy * ax) / speed**2
     return jnp.stack([px, py, jnp.arctan2(vy, vx)]), jnp.stack([speed, turn_rate])
 
@@ -53,7 +55,7 @@ class Unicycle(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the heading wrapped."""
-        return _wound(x, y)
+        return _wrap_heading(x, y)
 
 
 class UnicyclePoint(ControlAffine):
@@ -76,11 +78,12 @@ class UnicyclePoint(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse a point that is not ahead of the axle."""
-        positive(self, ahead=self.ahead)
+        check_positive(self, ahead=self.ahead)
 
     @property
     def input_scale(self) -> tuple[tuple[float, ...], ...]:
         """S = diag(1, 1 / ahead)."""
+        # With ahead w as the input g is a rotation on positions, so that g g' = I there.
         return diagonal(1.0, 1.0 / self.ahead)
 
     def drift(self, x: State) -> State:
@@ -105,4 +108,4 @@ class UnicyclePoint(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the heading wrapped."""
-        return _wound(x, y)
+        return _wrap_heading(x, y)

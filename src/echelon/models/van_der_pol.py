@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from echelon.core.types import InputMap, State
-from echelon.models.model import ControlAffine, not_negative
+from echelon.models.model import ControlAffine, check_not_negative
 
 
 class VanDerPol(ControlAffine):
@@ -16,7 +16,7 @@ class VanDerPol(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse a damping that is negative or not finite."""
-        not_negative(self, damping=self.damping)
+        check_not_negative(self, damping=self.damping)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

@@ -1,4 +1,4 @@
-"""Who hears whom, and where each belongs: graphs and formations."""
+"""Who receives from whom, and where each belongs: graphs and formations."""
 
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph

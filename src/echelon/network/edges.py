@@ -11,6 +11,7 @@ from echelon.core.types import Array
 
 def split_weights(edges: Iterable[Sequence[float]]) -> tuple[Array, Array]:
     """Return pairs (E, 2) of whole numbers and weights (E,)."""
+    # Arrays come from generators of large graphs, and need no look at each edge.
     if isinstance(edges, np.ndarray) and edges.ndim == 2 and edges.shape[1] == 2:
         return _whole(edges, "an edge is"), np.ones(len(edges))
     edges = [tuple(edge) for edge in edges]
@@ -28,6 +29,7 @@ def _whole(values: Sequence[Any] | Array, what: str) -> Array:
             if not _are_whole(value):
                 shown = list(value) if isinstance(value, tuple) else value
                 raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
+    # By way of floats, so that the 1.0 of a file is agent 1.
     return np.array(values, dtype=np.float64).astype(np.int64)
 
 
@@ -55,6 +57,7 @@ def count_agents(pairs: Array, agents: int | None) -> int:
 def check_edges(pairs: Array, weights: Array, agents: int) -> tuple[Array, Array]:
     """Return the edges with the smaller agent first, and their weights."""
     edges = np.sort(pairs, axis=1)
+    # The first fault alone is reported, here and below.
     for i, j in pairs[edges[:, 0] < 0][:1]:
         raise GraphError(
             f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
@@ -66,6 +69,7 @@ def check_edges(pairs: Array, weights: Array, agents: int) -> tuple[Array, Array
     _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
     for i, j in edges[np.sort(first[count > 1])][:1]:
         raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
+    # Negated, so that NaN, which no comparison holds for, is wrong too.
     wrong = ~((weights > 0.0) & (weights < np.inf))
     for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
         raise GraphError(
@@ -93,7 +97,7 @@ def check_at_least(agents: int, least: int, kind: str) -> None:
         raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
 
 
-def _some(agents: np.ndarray) -> str:
-    """Return a subject such as `agents 2, 3 have`, shortened when there are many."""
+def name_agents(agents: np.ndarray) -> str:
+    """Return a subject with its verb such as `agents 2, 3 have`, shortened when there are many."""
     shown = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
     return f"agent {shown} has" if len(agents) == 1 else f"agents {shown} have"

@@ -10,7 +10,7 @@ from echelon.core.types import Array, States
 class Exchange(eqx.Module):
     """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
 
-    The agents' own values and the values that they said are separate arguments, since on a real
+    The agents' own values and the values that they sent are separate arguments, since on a real
     network the second may be old or lost.
     """
 
@@ -18,10 +18,10 @@ class Exchange(eqx.Module):
     senders: Array
     weights: Array
 
-    def __call__(self, own: States, said: States) -> States:
-        """Return z (N, n), z_i = sum_j A_ij (own_i - said_j)."""
+    def __call__(self, own: States, sent: States) -> States:
+        """Return z (N, n), z_i = sum_j A_ij (own_i - sent_j)."""
         weights = jnp.asarray(self.weights, own.dtype)[:, None]
         # Differences before sums: at consensus they vanish exactly, while sums of positions would
         # leave rounding.
-        differences = weights * (own[self.receivers] - said[self.senders])
+        differences = weights * (own[self.receivers] - sent[self.senders])
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))

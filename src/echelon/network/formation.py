@@ -17,6 +17,7 @@ from echelon.core.types import Array, States
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
+# For an analytic model one random state would do, almost surely; kinks need more.
 _SAMPLES = 32
 _TESTED = 64
 _SYMMETRY_TOLERANCE = 1e-9
@@ -75,52 +76,54 @@ class Formation:
 
         Rows of 2, 3, ... agents stand behind it, towards minus the first axis.
         """
+        # Row r begins with agent r (r + 1) / 2, solved for r.
         rows = np.floor((np.sqrt(8.0 * np.arange(graph.agents) + 1.0) - 1.0) / 2.0)
         place = np.arange(graph.agents) - rows * (rows + 1) / 2.0
-        return cls._drawn(
-            model, graph, np.column_stack([-rows * np.sqrt(0.75), place - rows / 2.0]), spacing
-        )
+        # The height of an equilateral triangle, so that neighbours are one spacing apart.
+        plan = np.column_stack([-rows * np.sqrt(0.75), place - rows / 2.0])
+        return cls._place_plan(model, graph, plan, spacing)
 
     @classmethod
     def line(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
         """Return agents one behind the other."""
         number = np.arange(graph.agents)
-        return cls._drawn(model, graph, np.column_stack([-number, np.zeros_like(number)]), spacing)
+        plan = np.column_stack([-number, np.zeros_like(number)])
+        return cls._place_plan(model, graph, plan, spacing)
 
     @classmethod
     def wedge(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
         """Return a V: agents alternate between two arms at 45 degrees behind agent 0."""
         number = np.arange(graph.agents)
+        # One spacing along an arm at 45 degrees.
         step = (number + 1) // 2 * np.sqrt(0.5)
         side = np.where(number % 2 == 1, 1.0, -1.0)
-        return cls._drawn(model, graph, np.column_stack([-step, side * step]), spacing)
+        return cls._place_plan(model, graph, np.column_stack([-step, side * step]), spacing)
 
     @classmethod
     def circle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
         """Return agents 1, 2, ... on a circle around agent 0, `spacing` apart along its chords."""
         ring = max(graph.agents - 1, 1)
         angle = 2.0 * np.pi * np.arange(ring) / ring
+        # A chord is 2 r sin(pi / ring); of one or two agents it says nothing of use.
         radius = 1.0 if ring < 3 else 0.5 / np.sin(np.pi / ring)
         points = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-        return cls._drawn(
-            model, graph, np.vstack([np.zeros((1, 2)), points])[: graph.agents], spacing
-        )
+        plan = np.vstack([np.zeros((1, 2)), points])[: graph.agents]
+        return cls._place_plan(model, graph, plan, spacing)
 
     @classmethod
     def grid(
         cls, model: ControlAffine, graph: Graph, spacing: float = 1.0, columns: int | None = None
     ) -> "Formation":
-        """Return rows of `columns` agents (near a square unless told), agent 0 at a corner."""
+        """Return rows of `columns` agents (near a square unless given), agent 0 at a corner."""
         columns = int(np.ceil(np.sqrt(graph.agents))) if columns is None else columns
         if columns < 1:
             raise FormationError(f"`columns` of a grid is {columns}, and must be at least 1.")
         number = np.arange(graph.agents)
-        return cls._drawn(
-            model, graph, np.column_stack([-(number // columns), number % columns]), spacing
-        )
+        plan = np.column_stack([-(number // columns), number % columns])
+        return cls._place_plan(model, graph, plan, spacing)
 
     @classmethod
-    def _drawn(
+    def _place_plan(
         cls, model: ControlAffine, graph: Graph, plan: np.ndarray, spacing: float
     ) -> "Formation":
         """Place a plan (N, 2), in units of the spacing, on the first two position coordinates."""
@@ -134,6 +137,7 @@ class Formation:
                 f"`{type(model).__name__}` has no position, "
                 "so a drawn formation has no meaning; give `offsets`."
             )
+        # On a line the plan is projected; goals that then coincide are warned of before a run.
         used = min(2, len(axes))
         full = np.zeros((graph.agents, len(model.state_names)))
         full[:, axes[:used]] = spacing * plan[:, :used]
@@ -167,6 +171,8 @@ class Formation:
     def is_rigid(self, model: ControlAffine, graph: Graph) -> bool:
         """Tell whether the edges' lengths fix the shape to first order (infinitesimal rigidity)."""
         agents, dim = graph.agents, len(model.position)
+        # dim translations and dim (dim - 1) / 2 turns; agents fewer than axes can fix as many
+        # lengths as they have pairs.
         motions = (
             dim * (dim + 1) // 2 if agents >= dim else agents * dim - agents * (agents - 1) // 2
         )
@@ -189,8 +195,9 @@ class Formation:
         offsets = self.offsets - self.offsets[0] + 0.0  # which makes -0.0 the same as 0.0
         distinct = np.unique(offsets, axis=0)
         tested = distinct[:: max(1, -(-len(distinct) // _TESTED))]
+        # In float32 rounding alone would exceed the tolerance.
         with precision("float64"):
-            reasons = {d.tobytes(): _changes(model, d) if d.any() else None for d in tested}
+            reasons = {d.tobytes(): _describe_change(model, d) if d.any() else None for d in tested}
         found = {agent: reasons.get(offset.tobytes()) for agent, offset in enumerate(offsets)}
         return {agent: reason for agent, reason in found.items() if reason}
 
@@ -219,13 +226,15 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
     )
 
 
-def _changes(model: ControlAffine, offset: np.ndarray) -> str | None:
+def _describe_change(model: ControlAffine, offset: np.ndarray) -> str | None:
     """Return how f or g changes under x -> x + offset, or None where it does not."""
     base = np.asarray(model.trim[0], float)
+    # Near the trim, so that no angle leaves its chart.
     states = base + np.random.default_rng(0).uniform(-0.5, 0.5, (_SAMPLES, len(base)))
     both = jnp.asarray(np.concatenate([states, states + offset]))
     for name, (values, slopes) in _local(model, both).items():
         here, there = np.split(np.asarray(values), 2)
+        # A change that happens to vanish at a state rarely vanishes with its slope.
         turned = np.abs(np.diff(np.split(np.asarray(slopes), 2), axis=0))[0].max(axis=-1)
         change = np.maximum(np.abs(there - here), turned)
         # Each entry against its own size: an inertia makes some entries of g tens of thousands.

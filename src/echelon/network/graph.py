@@ -14,11 +14,11 @@ import scipy.sparse.linalg as spla
 from echelon.core.errors import GraphError
 from echelon.core.types import Array, States
 from echelon.network.edges import (
-    _some,
     check_at_least,
     check_edges,
     check_leaders,
     count_agents,
+    name_agents,
     split_weights,
 )
 from echelon.network.exchange import Exchange
@@ -63,6 +63,8 @@ class Graph:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         self._check_connected()
         self._spectrum: Spectrum | None = None
+        # Gains and runs share a graph, and its spectrum is kept: what cannot change cannot go
+        # stale.
         for array in (self.edges, self.weights):
             array.setflags(write=False)
 
@@ -151,19 +153,20 @@ class Graph:
         Raises:
             GraphError: the radius is too small for the points to be connected.
         """
+        # Imported here: random graphs alone need it.
         from scipy.spatial import KDTree
 
         check_at_least(agents, 2, "geometric")
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
         pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
+        # The tree returns pairs in no promised order; sorted, a seed is one graph everywhere.
         return cls(pairs[np.lexsort(pairs.T[::-1])], leaders, agents)
 
     def adjacency(self) -> sp.csr_array:
         """Return the symmetric adjacency matrix (N, N), sparse."""
-        i, j = self.edges.T
-        both = (np.concatenate([i, j]), np.concatenate([j, i]))
-        values = np.concatenate([self.weights, self.weights])
-        return sp.csr_array(sp.coo_array((values, both), shape=(self.agents, self.agents)))
+        both = self.exchange()
+        entries = (both.weights, (both.receivers, both.senders))
+        return sp.csr_array(sp.coo_array(entries, shape=(self.agents, self.agents)))
 
     def laplacian(self) -> sp.csr_array:
         """Return the Laplacian (N, N), sparse; its rows sum to zero."""
@@ -179,6 +182,7 @@ class Graph:
 
     def inverse_grounded(self) -> Array:
         """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
+        # Dense: the inverse has no zeros within a connected piece of followers.
         return np.linalg.inv(self.grounded_laplacian().toarray())
 
     def spectrum(self) -> Spectrum:
@@ -215,6 +219,7 @@ class Graph:
     def nearest_leader(self) -> tuple[int, ...]:
         """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
         hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+        # `argmin` takes the first of equals, and leaders are sorted.
         return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
 
     def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
@@ -223,6 +228,7 @@ class Graph:
         It is the order in which agents can plan when each needs the plans of those before it. Among
         the equally far the lower number comes first; a leader has no earlier neighbours.
         """
+        # Stable, which leaves the equally far in the order of their numbers.
         order = np.argsort(self.depths(), kind="stable").tolist()
         known = {agent: order[:place] for place, agent in enumerate(order)}
         return tuple(
@@ -249,8 +255,8 @@ class Graph:
         several = np.flatnonzero(np.bincount(counted, minlength=self.agents) > 1)
         if len(several):
             raise GraphError(
-                f"the graph is no tree: {_some(several)} more than one way to a leader, and so no "
-                "one parent; the feed-forward `relay` needs none."
+                f"the graph is no tree: {name_agents(several)} more than one way to a leader, "
+                "and so no one parent; the feed-forward `relay` needs none."
             )
         parents[child] = parent
         return tuple(parents.tolist())
@@ -293,24 +299,32 @@ class Graph:
         lost = np.flatnonzero(~reached)
         if len(lost):
             raise GraphError(
-                f"the graph is disconnected: {_some(lost)} no path to a leader ({_leaders(self)})."
+                f"the graph is disconnected: {name_agents(lost)} no path to a leader "
+                f"({_name_leaders(self)})."
             )
+        # Each piece has a leader of its own, and would be a formation of its own.
         apart = np.flatnonzero(label != label[0])
-        raise GraphError(f"the graph is disconnected: {_some(apart)} no path to agent 0.")
+        raise GraphError(f"the graph is disconnected: {name_agents(apart)} no path to agent 0.")
+
+
+def factor_inverse(L: sp.csr_array) -> spla.LinearOperator:
+    """Return x -> L^-1 x for a sparse positive definite matrix, which is factored here, once."""
+    # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
+    symmetric = {"SymmetricMode": True}
+    factor = spla.splu(sp.csc_array(L), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+    return spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
 
 
 def _extremes(L: sp.csr_array) -> Array:
     """Return the smallest and the largest eigenvalue of a sparse positive definite matrix."""
-    # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
-    symmetric = {"SymmetricMode": True}
-    factor = spla.splu(sp.csc_array(L), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
-    inverse = spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
+    # About 0 the smallest is far from the others, relative to itself; Lanczos on L finds it last.
+    inverse = factor_inverse(L)
     smallest = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
     largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
     return np.concatenate([smallest, largest])
 
 
-def _leaders(graph: Graph) -> str:
+def _name_leaders(graph: Graph) -> str:
     kind = "leader" if len(graph.leaders) == 1 else "leaders"
     return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"
 

@@ -1,4 +1,4 @@
-"""The eigenvalues by which a network's disagreement splits: all that gains and proofs ask of it."""
+"""The eigenvalues by which a network's disagreement splits, all that gains and proofs need."""
 
 from typing import NamedTuple
 

@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from typing import final
 
 import numpy as np
-import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
-from echelon.network.graph import Graph
+from echelon.network.graph import Graph, factor_inverse
 
 _DENSE = 400
 _ROUNDS = 30
@@ -35,7 +34,7 @@ def recommend_leaders(graph: Graph, count: int = 1) -> tuple[int, ...]:
     """
     if not 0 <= count < len(graph.followers):
         raise GraphError(
-            f"{count} more leaders are asked for, and from 0 to {len(graph.followers) - 1} of the "
+            f"{count} more leaders are requested, and from 0 to {len(graph.followers) - 1} of the "
             f"{len(graph.followers)} followers can become one."
         )
     chosen = list[int]()
@@ -55,7 +54,7 @@ def recommend_edges(graph: Graph, count: int = 1) -> tuple[tuple[int, int], ...]
     free = graph.agents * (graph.agents - 1) // 2 - len(graph.edges)
     if not 0 <= count <= free:
         raise GraphError(
-            f"{count} more edges are asked for, and from 0 to {free} pairs are not linked yet."
+            f"{count} more edges are requested, and from 0 to {free} pairs are not linked yet."
         )
     chosen = list[tuple[int, int]]()
     for _ in range(count):
@@ -65,6 +64,7 @@ def recommend_edges(graph: Graph, count: int = 1) -> tuple[tuple[int, int], ...]
 
 def _best_leader(graph: Graph) -> int:
     if len(graph.followers) <= _DENSE:
+        # The lower number on a tie.
         return max(graph.followers, key=lambda k: (_lambda_min(graph.with_leaders([k])), -k))
     large = _Large(graph)
     order = np.argsort(-large.mode, kind="stable")
@@ -75,14 +75,16 @@ def _best_leader(graph: Graph) -> int:
 
 def _best_edge(graph: Graph) -> tuple[int, int]:
     if len(graph.followers) <= _DENSE:
-        tried = _promising(graph, _slowest(graph), _MOST_TRIED)
+        tried = _rank_pairs(graph, _slowest_mode(graph), _MOST_TRIED)
         return max(tried, key=lambda pair: _lambda_min(graph.with_edges([pair])))
     large, mode = _Large(graph), np.zeros(graph.agents)
+    # A leader does not move, so its entry of the mode is 0.
     mode[list(graph.followers)] = large.mode
-    tried = _promising(graph, mode, large.tries)
+    tried = _rank_pairs(graph, mode, large.tries)
     place = {agent: row for row, agent in enumerate(graph.followers)}
     values = []
     for pair in tried:
+        # A leader's end of the edge is grounded, which takes its entry out of the vector.
         rows = [place[k] for k in pair if k in place]
         values.append(large.with_penalty(rows, [1.0, -1.0][: len(rows)], 1.0) if rows else 0.0)
     return tried[int(np.argmax(values))]
@@ -93,9 +95,10 @@ class _Large:
     """A large grounded Laplacian, factored once, and its lambda_min after a change of rank one."""
 
     def __init__(self, graph: Graph) -> None:
-        L = sp.csc_array(graph.grounded_laplacian())
-        self.solve = spla.splu(L).solve
-        self.mode = np.abs(spla.eigsh(L, k=1, sigma=0.0)[1][:, 0])
+        L = graph.grounded_laplacian()
+        inverse = factor_inverse(L)
+        self.solve = inverse.matvec
+        self.mode = np.abs(spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse)[1][:, 0])
         self.tries = max(_FEWEST_TRIED, min(_MOST_TRIED, _WORK // graph.agents))
 
     def with_penalty(self, rows: Sequence[int], entries: Sequence[float], slack: float) -> float:
@@ -106,15 +109,17 @@ class _Large:
         """
         a = np.zeros(len(self.mode))
         a[list(rows)] = entries
+        # A change of rank one moves the mode little, so a few rounds from it are enough.
         far, x, value = self.solve(a), self.mode, 0.0
         for _ in range(_ROUNDS):
+            # (L + a a'/s)^-1 = L^-1 - L^-1 a a'L^-1 / (s + a'L^-1 a).
             y = self.solve(x) - far * (far @ x) / (slack + a @ far)
             value = float(x @ x) / float(x @ y)
             x = y / np.linalg.norm(y)
         return value
 
 
-def _promising(graph: Graph, mode: Array, count: int) -> list[tuple[int, int]]:
+def _rank_pairs(graph: Graph, mode: Array, count: int) -> list[tuple[int, int]]:
     """Return the pairs without an edge that raise lambda_min most in first order."""
     # The far ends of the mode make the best pairs, so few agents are enough on a large graph.
     order = np.argsort(mode, kind="stable")
@@ -123,15 +128,17 @@ def _promising(graph: Graph, mode: Array, count: int) -> list[tuple[int, int]]:
     order = np.sort(order)
     i, j = (order[part] for part in np.triu_indices(len(order), 1))
     linked = set(map(tuple, graph.edges.tolist()))
+    # d lambda_min / dw = (v_i - v_j)^2 for a mode v of unit length.
     best = np.argsort(-np.abs(mode[i] - mode[j]), kind="stable")
     pairs = ((int(i[k]), int(j[k])) for k in best)
     return list(itertools.islice((pair for pair in pairs if pair not in linked), count))
 
 
-def _slowest(graph: Graph) -> Array:
+def _slowest_mode(graph: Graph) -> Array:
     """Return the mode (N,) of lambda_min, not negative, zero at the leaders."""
     mode = np.zeros(graph.agents)
     vectors = np.linalg.eigh(graph.grounded_laplacian().toarray())[1]
+    # The mode of lambda_min has one sign (Perron and Frobenius), which one `eigh` leaves open.
     mode[list(graph.followers)] = np.abs(vectors[:, 0])
     return mode
 

@@ -22,6 +22,7 @@ def casadi() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
+    # Here, since it comes with an extra, and takes long to load.
     try:
         import casadi
     except ImportError:
@@ -49,13 +50,17 @@ def casadi_function(
         ModelError: the function uses a primitive that is not known here.
     """
     ca = casadi()
+    # SX has a node for each scalar: a model of a dozen states is straight-line code, and is
+    # differentiated entry by entry.
     columns = [ca.SX.sym(f"a{k}", length) for k, length in enumerate(lengths)]
     operands = [_symbols(ca, column) for column in columns]
+    # A result that depends on no symbol is a plain number, and `SX(e)` makes it one of them.
     result = evaluate(function, operands, symbols(owner or name))[0]
     return ca.Function(name, columns, [ca.vertcat(*(ca.SX(e) for e in result.ravel()))])
 
 
 def _symbols(ca: Any, column: Any) -> np.ndarray:
+    # Filled afterwards: NumPy would take each SX for an array of its own.
     entries = np.empty(column.shape[0], object)
     entries[:] = ca.vertsplit(column) if len(entries) else []
     return entries
@@ -80,7 +85,7 @@ def symbols(owner: str) -> Algebra:
             "logarithms, rounding, comparisons and choices by `where`."
         )
 
-    # JAX reads a number that is not one outside of an array, unless told otherwise.
+    # What a gather reads beyond an array is not a number, as it is in JAX.
     return Algebra(_rules(casadi()), float, lambda numbers: numbers, lambda: float("nan"), unknown)
 
 
@@ -91,6 +96,7 @@ def _rules(ca: Any) -> dict[str, Rule]:
     """Return what each primitive of JAX means for symbols, beyond what the walk itself knows."""
     written: dict[str, Rule] = {
         "integer_pow": lambda params, x: each(lambda value: value ** params["y"], x),
+        # A symbol counts as finite; what is not, a solver finds out and reports.
         "is_finite": lambda params, x: np.full(x.shape, True),
         "round": functools.partial(_round, ca),
         "convert_element_type": functools.partial(_convert, ca),
@@ -118,6 +124,7 @@ def _functions(ca: Any) -> dict[str, Callable[..., object]]:
         "min": ca.fmin,
         "clamp": lambda low, value, high: ca.fmin(ca.fmax(low, value), high),
         "rsqrt": lambda value: 1.0 / ca.sqrt(value),
+        # CasADi's power of a negative number is not a number.
         "cbrt": lambda value: ca.sign(value) * ca.fabs(value) ** (1.0 / 3.0),
         "exp2": lambda value: ca.exp(np.log(2.0) * value),
         "logistic": lambda value: 1.0 / (1.0 + ca.exp(-value)),
@@ -134,6 +141,7 @@ def _choose(ca: Any, which: Any, first: Any, *others: Any) -> Any:
     """Return the case whose number is chosen; JAX numbers them from zero."""
     if not isinstance(which, ca.SX):
         return (first, *others)[int(which)]
+    # `if_else` evaluates all cases, as `where` does in JAX.
     result = first
     for number, case in enumerate(others, 1):
         result = ca.if_else(which == number, case, result)
@@ -145,6 +153,7 @@ def _round(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     to_even = int(params["rounding_method"]) == 1
 
     def one(value: Any) -> Any:
+        # CasADi has no rounding; on the size alone, both sides of zero are alike.
         size = ca.fabs(value)
         low = ca.floor(size)
         odd = ca.fmod(low, 2.0) == 1.0
@@ -161,5 +170,6 @@ def _convert(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     if kind == "b":
         return each(lambda value: value != 0.0, x)
     if kind in "iu":
+        # Toward zero, as JAX converts.
         return each(lambda value: ca.sign(value) * ca.floor(ca.fabs(value)), x)
     return x

@@ -102,6 +102,7 @@ class Plans(_Optimized):
             planning=self.options,
             limits=settings.limits,
         )
+        # One input a hold: the last interval may go beyond the run, and its end is not flown.
         inputs = np.stack([plan.inputs for plan in made.plans], axis=1)
         work = made.seconds, made.iterations, made.failures, made.setup_seconds
         stats = solver_stats("optimization", self.options.solver, *work)
@@ -132,11 +133,12 @@ class RecedingHorizon(_Optimized):
         return "the plans that the neighbours before it have just made, every period"
 
     def stepper(self, problem: Problem) -> Stepper:
-        """Make the solvers ready, and return what asks them.
+        """Make the solvers ready, and return what queries them.
 
         Raises:
             MissingExtraError: casadi is not installed.
         """
+        # A plan is made at whole steps of the run alone.
         hold = max(1, round(self.mpc.period / problem.settings.dt))
         pilots = _Pilots(problem, self.reference, self.mpc, hold)
         return HostStepper(problem, pilots, hold, pilots.work)
@@ -153,6 +155,7 @@ class _Pilots:
         self.problem, self.mpc, self.hold = problem, mpc, hold
         self.steps = max(1, round(mpc.horizon / dt))
         self.horizon = Horizon(problem.model, mpc, self.steps, dt, settings.limits)
+        # The last plan looks a horizon beyond the run, and so does the reference.
         periods = -(-settings.steps // hold)
         times = dt * np.arange(periods + self.steps + 1)
         self.reference = reference_targets(problem.model, reference, times)
@@ -188,6 +191,7 @@ class _Pilots:
     def _targets(self, agent: int, earlier: tuple[int, ...], share: Array, period: int) -> Course:
         """Return what an agent follows: the reference, or the mean of what its neighbours plan."""
         formation = self.problem.formation
+        # A leader alone has no neighbour before it, and knows the reference.
         if not earlier:
             span = slice(period, period + self.steps + 1)
             x, v = self.reference.states[span], self.reference.inputs[span]
@@ -203,10 +207,12 @@ class _Pilots:
         """Return an agent's plan, or its last one shifted where the solver fails."""
         began = time.perf_counter()
         last = self.courses.get(agent)
+        # Nothing is near the first plan, so that it takes several linearizations; those after it
+        # begin from the one before, and one is enough (real-time iteration).
         if last is None:
             near, most = Course(np.vstack([start, targets.states[1:]]), targets.inputs), _SETTLING
         else:
-            near, most = self.horizon.shifted(last, targets.inputs[-1]), self.mpc.iterations
+            near, most = self.horizon.shift(last, targets.inputs[-1]), self.mpc.iterations
         answer, count = Answer(None, ""), 0
         course = near
         while count < most:
@@ -215,8 +221,10 @@ class _Pilots:
                 break
             change = np.abs(answer.course.inputs - course.inputs).max()
             course = answer.course
+            # Plan and linearization agree: another program would find the same.
             if change < 1e-6:
                 break
+        # Before a failure may end the run: its time and attempts count as well.
         self.seconds.append(time.perf_counter() - began)
         self.iterations.append(count)
         if answer.course is not None:

@@ -1,6 +1,7 @@
 """Plans for a whole formation, made in the order of the graph: each knows those before it."""
 
 import time
+from collections.abc import Callable
 from typing import NamedTuple, final
 
 import numpy as np
@@ -82,7 +83,7 @@ def plan_formation(
             own = shifted_targets(model, targets, formation.offsets[agent])
             plans[agent] = desk.follow(agent, states[agent], own)
             continue
-        own = _beside(model, graph, formation, agent, {j: plans[j] for j in earlier})
+        own = _neighbour_targets(model, graph, formation, agent, {j: plans[j] for j in earlier})
         if planning.specification == "offset":
             plans[agent] = desk.follow(agent, states[agent], own)
         else:
@@ -117,7 +118,7 @@ def plan_tracking(
     return _Desk(model, planning, grid, limits).follow(0, start, targets)
 
 
-def _beside(
+def _neighbour_targets(
     model: ControlAffine,
     graph: Graph,
     formation: Formation,
@@ -127,6 +128,7 @@ def _beside(
     """Return the targets that the plans of earlier neighbours leave an agent."""
     states = np.stack([p.states - formation.displacement(agent, j) for j, p in plans.items()])
     inputs = np.stack([model.normalized(p.inputs) for p in plans.values()])
+    # Inputs are held between times, and targets have one at each: the last is held on.
     last = np.concatenate([inputs, inputs[:, -1:]], axis=1)
     return mean_targets(model, states, last, shares(graph, agent, tuple(plans)))
 
@@ -146,15 +148,11 @@ class _Desk:
 
     def follow(self, agent: int, start: Array, targets: Targets) -> Trajectory:
         """Return the plan of an agent that follows targets."""
-        if ("targets",) not in self._ready:
-            self._prepare(
-                ("targets",),
-                *(
-                    tracking(self.model, self.planning, self.grid, self.limits, fine)
-                    for fine in (False, True)
-                ),
-            )
-        return self._plan(agent, ("targets",), start, targets.outputs, targets)
+        key = ("targets",)
+        self._prepare(
+            key, lambda fine: tracking(self.model, self.planning, self.grid, self.limits, fine)
+        )
+        return self._plan(agent, key, start, targets.outputs, targets)
 
     def keep_apart(
         self,
@@ -175,26 +173,23 @@ class _Desk:
         """
         axes = list(self.model.position_indices())
         distances = np.array([np.linalg.norm(d[axes]) for d in wanted])
+        # In the key, since the distances are constants of the problem; all else is its data.
         key = ("distances", *distances.tolist())
-        if key not in self._ready:
-            self._prepare(
-                key,
-                *(
-                    spacing(self.model, self.grid, self.limits, fine, distances)
-                    for fine in (False, True)
-                ),
-            )
+        self._prepare(
+            key, lambda fine: spacing(self.model, self.grid, self.limits, fine, distances)
+        )
         known = np.hstack([p[:, axes] for p in places])
         return self._plan(agent, key, start, known, targets)
 
-    def _prepare(
-        self, key: tuple[object, ...], first: OptimalControl, second: OptimalControl
-    ) -> None:
+    def _prepare(self, key: tuple[object, ...], pose: Callable[[bool], OptimalControl]) -> None:
+        if key in self._ready:
+            return
         began, solver = time.perf_counter(), self.planning.solver
+        # These are IPOPT's own names; any other solver keeps its defaults.
         begun, resumed = (_PATIENCE, _PATIENCE | _RESUMED) if solver == "ipopt" else (None, None)
         finer = self.grid.hold > coarse(self.grid)
-        finely = Solver(second, solver, resumed) if finer else None
-        self._ready[key] = Solver(first, solver, begun), finely
+        finely = Solver(pose(True), solver, resumed) if finer else None
+        self._ready[key] = Solver(pose(False), solver, begun), finely
         self.setup_seconds += time.perf_counter() - began
 
     def _plan(
@@ -214,6 +209,8 @@ class _Desk:
             self.model.physical(targets.inputs[:-1]),
         )
         plan = self._attempt(agent, coarsely, start, known, targets, near, 1.0)
+        # Costly inputs keep the plan by the targets' own, where the problem is nearly quadratic;
+        # its solution is then a better place to begin.
         for factor in () if plan.solved else _EASIER:
             easier = self._attempt(agent, coarsely, start, known, targets, near, factor)
             near = (easier.states, easier.inputs)
@@ -222,6 +219,8 @@ class _Desk:
                 break
         if finely is not None:
             plan = self._attempt(agent, finely, start, known, targets, plan, 1.0)
+        # By what is missed, not by the solver's word: one that stopped short of its tolerance may
+        # well have found a plan.
         if plan.violations:
             raise PlanError(f"there is no plan for agent {agent}: {plan.message}")
         return plan
@@ -236,6 +235,7 @@ class _Desk:
         guess: Trajectory | tuple[Array, Array],
         factor: float,
     ) -> Trajectory:
+        # The factor is data, so that the easier problems need no solvers of their own.
         weight = np.full((len(known), 1), factor * self.planning.input_weight)
         plan = planner.solve(start, np.hstack([known, targets.inputs, weight]), guess)
         self.seconds[agent] += plan.seconds

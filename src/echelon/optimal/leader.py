@@ -15,9 +15,9 @@ from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.gains.gain import Gain
-from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import feedback
-from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.tracking import tracking_gain
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
@@ -83,20 +83,19 @@ class OptimalTracking(Law):
             PlanError: there is no plan, or the model cannot follow a reference.
             MissingExtraError: casadi is not installed.
         """
+        # `simulate` prepares every law, prepared or not, and a plan takes seconds.
         if self.states is not None:
             return self
-        riccati, gain = Riccati(coupling=1.0), self.gain
-        gain = riccati.solve(model, graph.spectrum()) if gain is None else gain
-        check_gain_fits(self, model, gain.P.shape, gain.R.shape)
+        gain = tracking_gain(self, model, graph, self.gain)
         times = grid(self.horizon, _STEP, self.planning.interval)
         targets = reference_targets(model, self.reference, times.times)
         start = targets.states[0] + model.per_state(dict(self.start_error))
         plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
-        unit = eqx.tree_at(lambda g: g.coupling, gain, 1.0)
         return eqx.tree_at(
             lambda law: (law.gain, law.states, law.inputs),
             self,
-            (unit, plan.states, plan.inputs),
+            (gain, plan.states, plan.inputs),
+            # None is an empty tree to JAX, and could not be replaced.
             is_leaf=lambda leaf: leaf is None,
         )
 
@@ -121,10 +120,13 @@ class OptimalTracking(Law):
         k = jnp.floor(t / span + 1e-4).astype(jnp.int32)
         held = jnp.clip(k, 0, count - 1)
         u = jnp.asarray(self.inputs, dtype)[held]
+        # The plan has states at the ends of intervals. Between them its held input is integrated,
+        # since interpolation would lose the order of the method.
         x, step = jnp.asarray(self.states, dtype)[held], jnp.maximum(t - held * span, 0.0)
         x = jax.lax.fori_loop(
             0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
         )
+        # Both are computed and one is taken: in a compiled step there is no other choice.
         planned = k < count
         return jnp.where(planned, x, x_r), jnp.where(planned, u, u_r)
 
@@ -139,8 +141,7 @@ class OptimalTracking(Law):
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""
         state, u = self.target(model, view.t)
-        if self.gain is None:
-            raise LawError("`OptimalTracking` has no gain yet; call `prepared` first.")
+        assert self.gain is not None  # `prepared` completes it together with the plan
         error = model.difference(view.x, state + view.offset)
         v = feedback(self.gain, model, view.x, error)
         return u - model.physical(v, trim=False), memory

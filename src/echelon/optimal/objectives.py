@@ -5,16 +5,17 @@ A leader's targets are its reference; a follower's are what the plans of its nei
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, final
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import PlanError, listing
+from echelon.core.errors import PlanError
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
+from echelon.optimal.check import check_choice, check_seconds, read_weights
 from echelon.optimal.problem import Constraint, OptimalControl, Stage
 
 SPECIFICATIONS = ("offset", "distance")
@@ -50,20 +51,14 @@ class TrackingOptions:
 
     def __post_init__(self) -> None:
         """Refuse what is out of range."""
-        if not 0.0 < self.interval < math.inf:
-            raise PlanError(
-                f"`interval` is {self.interval}, and must be a positive finite number of seconds."
-            )
+        check_seconds("interval", self.interval)
         if not 0.0 <= self.input_weight < math.inf:
             raise PlanError(
                 f"`input_weight` is {self.input_weight}, and must be finite and not negative."
             )
-        if self.specification not in SPECIFICATIONS:
-            raise PlanError(
-                f"`specification` is `{self.specification}`, allowed are {listing(SPECIFICATIONS)}."
-            )
+        check_choice("specification", self.specification, SPECIFICATIONS)
         if isinstance(self.output_weight, list | np.ndarray):
-            # A law holds this, and JAX asks of it that it can be hashed.
+            # A law holds this in a static field, which JAX compares by its hash.
             object.__setattr__(self, "output_weight", tuple(np.ravel(self.output_weight).tolist()))
 
     def weights(self, model: ControlAffine) -> Array:
@@ -72,18 +67,8 @@ class TrackingOptions:
         Raises:
             PlanError: they do not fit the model.
         """
-        count = len(model.output_names)
-        given = np.ones(count) if self.output_weight is None else self.output_weight
-        try:
-            weights = np.asarray(given, np.float64)
-        except (TypeError, ValueError):
-            weights = np.full(1, np.nan)
-        if weights.shape != (count,) or not (np.isfinite(weights) & (weights >= 0.0)).all():
-            raise PlanError(
-                f"`output_weight` is {self.output_weight}, and must be {count} finite numbers that "
-                f"are not negative, one for each of {listing(model.output_names)}."
-            )
-        return weights
+        given, names = self.output_weight, model.output_names
+        return read_weights("output_weight", np.ones(len(names)) if given is None else given, names)
 
 
 class Grid(NamedTuple):
@@ -116,6 +101,7 @@ def grid(horizon: float, dt: float, interval: float) -> Grid:
         )
     count = max(1, round(horizon / dt))
     hold = min(count, max(1, round(interval / dt)))
+    # Rounded up: a run that ended within an interval must have an input there.
     return Grid(-(-count // hold), hold, dt)
 
 
@@ -131,11 +117,11 @@ def tracking(
     factor on the input weights.
     """
     W, q = planning.weights(model), len(model.output_names)
-    spent = _spending(model)
+    input_cost = _input_cost(model)
 
     def stage(x: jax.Array, u: jax.Array, p: jax.Array) -> jax.Array:
         e = model.output(x) - p[:q]
-        return jnp.sum(jnp.asarray(W, x.dtype) * e * e) + spent(u, p[q:])
+        return jnp.sum(jnp.asarray(W, x.dtype) * e * e) + input_cost(u, p[q:])
 
     return _problem(model, times, limits, fine, stage, q + len(model.input_names) + 1)
 
@@ -161,25 +147,27 @@ def spacing(
             f"`{type(model).__name__}` has no position, so a distance has no meaning for it; "
             "use the specification `offset`."
         )
-    spent, count = _spending(model), len(distances) * len(axes)
+    input_cost, count = _input_cost(model), len(distances) * len(axes)
 
     def stage(x: jax.Array, u: jax.Array, p: jax.Array) -> jax.Array:
         apart = p[:count].reshape(len(distances), len(axes)) - x[None, np.array(axes)]
+        # Without a derivative where two coincide, which no wanted distance is near.
         off = jnp.sqrt(jnp.sum(apart * apart, axis=1)) - jnp.asarray(distances, x.dtype)
-        return jnp.sum(off * off) + spent(u, p[count:])
+        return jnp.sum(off * off) + input_cost(u, p[count:])
 
     return _problem(model, times, limits, fine, stage, count + len(model.input_names) + 1)
 
 
-def _spending(model: ControlAffine) -> Any:
+def _input_cost(model: ControlAffine) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """Return the cost of an input u given (its target's normalized input, factor)."""
+    # In normalized inputs, as deviations: a formation in motion costs nothing (theory page).
     R = np.asarray(model.weights[1])
 
-    def spent(u: jax.Array, p: jax.Array) -> jax.Array:
+    def cost(u: jax.Array, p: jax.Array) -> jax.Array:
         d = model.normalized(u) - p[:-1]
         return p[-1] * jnp.sum(jnp.asarray(R, u.dtype) * d * d)
 
-    return spent
+    return cost
 
 
 def _problem(
@@ -190,20 +178,23 @@ def _problem(
         times.steps * times.interval,
         times.steps,
         stage,
-        constraints=tuple(_within_chart(model)),
+        constraints=tuple(_chart_constraints(model)),
         limits=limits,
         parameters=parameters,
+        # The fine steps are those of `simulate`, so that the plan is the run.
         substeps=times.hold if fine else coarse(times),
     )
 
 
 def coarse(times: Grid) -> int:
     """Return the Runge-Kutta steps within an interval of a first solution."""
+    # Less 1e-9, so that a quotient one rounding above a whole number is not one more.
     return min(times.hold, max(1, math.ceil(times.interval / _SUBSTEP - 1e-9)))
 
 
-def _within_chart(model: ControlAffine) -> Any:
+def _chart_constraints(model: ControlAffine) -> Iterator[Constraint]:
     for name, (low, high) in model.chart.items():
         middle, half = 0.5 * (low + high), 0.5 * _INSIDE * (high - low)
         k = model.state_names.index(name)
+        # k=k, since a function made in a loop would see the last k.
         yield Constraint(f"range of {name}", lambda x, p, k=k: x[k], middle - half, middle + half)

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from echelon.core.errors import PlanError, listing
+from echelon.core.errors import PlanError
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.models.planar_quadrotor_linear import LinearPlanarQuadrotor
 from echelon.network.graph import Graph
+from echelon.optimal.check import check_choice
 from echelon.optimal.problem import Constraint, OptimalControl
 from echelon.optimal.solver import Trajectory, solve
 
@@ -63,11 +64,8 @@ class PlanarBaseline:
 
     def __post_init__(self) -> None:
         """Refuse an unknown option."""
-        for name, allowed in (("terminal", TERMINALS), ("separation", SEPARATIONS)):
-            if getattr(self, name) not in allowed:
-                raise PlanError(
-                    f"`{name}` is `{getattr(self, name)}`, allowed are {listing(allowed)}."
-                )
+        check_choice("terminal", self.terminal, TERMINALS)
+        check_choice("separation", self.separation, SEPARATIONS)
 
     @classmethod
     def literal(cls, **changes: Any) -> "PlanarBaseline":
@@ -82,6 +80,7 @@ class PlanarBaseline:
     @property
     def reference(self) -> Array:
         """The leader's reference states on the grid, (steps + 1, 6)."""
+        # The source gives the curve and T; a constant speed along y is what is left to assume.
         speed = 2.0 * np.pi / self.horizon
         y = np.linspace(-np.pi, np.pi, self.steps + 1)
         still = np.zeros_like(y)
@@ -92,15 +91,18 @@ class PlanarBaseline:
         """Return the leader's problem; its parameters are the reference's state."""
 
         def stage(x: State, u: Input, p: jax.Array) -> Scalar:
+            # (y, z) are states 0 and 2: Q is I on them, and R is I.
             return u @ u + jnp.sum((x - p)[0:3:2] ** 2)
 
         def terminal(x: State, p: jax.Array) -> Scalar:
+            # 0 x is an array, so that all three are summed alike.
             return jnp.sum({"origin": x, "error": x - p, "none": 0.0 * x}[self.terminal] ** 2)
 
         return self._problem(stage, terminal, (), 6)
 
     def follower(self, neighbours: int) -> OptimalControl:
         """Return the problem of a follower; its parameters are its neighbours' states in a row."""
+        # All but (y, z), whose place relative to a neighbour the distance leaves open.
         still = np.array([1, 3, 4, 5])
 
         def apart(x: State, p: jax.Array) -> jax.Array:
@@ -116,6 +118,7 @@ class PlanarBaseline:
             moving = (x[None] - p.reshape(neighbours, 6))[:, still]
             return jnp.sum({"origin": x, "error": moving, "none": 0.0 * x}[self.terminal] ** 2)
 
+        # Squares, which have derivatives everywhere; a distance has none at zero.
         d = self.distance**2
         kept = (Constraint("squared distance", apart, d, d),)
         constraints = kept if self.separation == "constraint" else ()
@@ -161,7 +164,7 @@ class PlanarBaseline:
                 continue
             first = plans[earlier[0]]
             known = np.hstack([plans[j].states for j in earlier])
-            # Flying beside the first neighbour is the guess: it meets all that is asked but the
+            # Flying along with the first neighbour is the guess: it meets all constraints but the
             # distances from others.
             guess = first.states + starts[agent] - starts[earlier[0]], first.inputs
             plans[agent] = solve(self.follower(len(earlier)), starts[agent], known, guess=guess)
@@ -177,6 +180,7 @@ class PlanarBaseline:
         The roll acceleration is drawn anew at each step and held over it. The agent is linear, so
         what the noise adds to the plan does not depend on the plan.
         """
+        # yddot = -g phi, phiddot = w: with w as a seventh, constant state the step is exact.
         flow = np.zeros((7, 7))
         flow[0, 1] = flow[2, 3] = flow[4, 5] = flow[5, 6] = 1.0
         flow[1, 4] = -self.model.gravity

@@ -1,7 +1,6 @@
 """An optimal control problem: a model, a cost and constraints over a horizon."""
 
 import dataclasses
-import numbers
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -9,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import PlanError, listing
+from echelon.core.errors import PlanError
 from echelon.core.types import Input, Scalar, State
 from echelon.models.model import ControlAffine, Limits
+from echelon.optimal.check import check_choice, check_seconds, check_whole
 
 Stage: TypeAlias = Callable[[State, Input, jax.Array], Scalar]
 """(x (n,), u (m,), p (k,)) -> cost per second."""
@@ -86,16 +86,11 @@ class OptimalControl:
             raise PlanError(
                 f"the model is {self.model!r}, and must be an instance of a `ControlAffine` class."
             )
-        if not (isinstance(self.horizon, numbers.Real) and 0.0 < self.horizon < np.inf):
-            raise PlanError(
-                f"`horizon` is {self.horizon}, and must be a positive finite number, s."
-            )
-        for name, least in (("steps", 1), ("substeps", 1), ("parameters", 0)):
-            _check_whole(name, getattr(self, name), least)
-        if self.transcription not in TRANSCRIPTIONS:
-            raise PlanError(
-                f"`transcription` is `{self.transcription}`, allowed are {listing(TRANSCRIPTIONS)}."
-            )
+        check_seconds("horizon", self.horizon)
+        check_whole("steps", self.steps, 1, "; the horizon must hold at least one step")
+        check_whole("substeps", self.substeps, 1)
+        check_whole("parameters", self.parameters, 0)
+        check_choice("transcription", self.transcription, TRANSCRIPTIONS)
         if self.limits is True:
             _check_known(self.model)
         _check_limits(self.bounds, len(self.model.input_names))
@@ -108,6 +103,7 @@ class OptimalControl:
     @property
     def nodes(self) -> int:
         """How many inputs the plan has: one a step, or one a time."""
+        # The trapezoidal rule needs the input at both ends of a step.
         return self.steps + (self.transcription == "collocation")
 
     @property
@@ -118,13 +114,8 @@ class OptimalControl:
         return self.model.input_limits if self.limits else None
 
 
-def _check_whole(name: str, value: object, least: int) -> None:
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
-        hint = "; the horizon must hold at least one step" if name == "steps" else ""
-        raise PlanError(f"`{name}` is {value}, and must be a whole number from {least} on{hint}.")
-
-
 def _check_known(model: ControlAffine) -> None:
+    # A plan keeps to inequalities, and none can be read off a function that clips.
     if model.input_limits is None and type(model).limit is not ControlAffine.limit:
         raise PlanError(
             f"`{type(model).__name__}` has a `limit`, and plans need it as `input_limits` too; add "

@@ -32,6 +32,8 @@ def violations(program: Program, g: Array) -> tuple[Violation, ...]:
     sizes = np.array([row.size for row in program.rows])
     amounts = sizes * np.maximum(program.low - g, g - program.high)
     worst: dict[str, Violation] = {}
+    # `~(<=)` and not `>`: what is not a number is missed. In the program's rows, which are divided
+    # by their size, all are forgiven alike.
     for k in np.flatnonzero(~(amounts <= FELT * sizes)):
         name, amount = program.rows[k].name, float(amounts[k])
         if name not in worst or not amount <= worst[name].amount:
@@ -58,12 +60,15 @@ def least_violations(program: Program, w: Array, p: Array) -> tuple[Violation, .
     place = ca.DM(np.eye(len(program.rows))[:, own])
     elastic = {
         "x": ca.vertcat(program.problem["x"], above, below),
+        # The sum of misses and not of squares: it leaves most at zero and so names the few that
+        # stand against each other.
         "f": ca.sum1(above) + ca.sum1(below),
         "g": program.problem["g"] + ca.mtimes(ca.sparsify(place), below - above),
         "p": program.problem["p"],
     }
     quiet = {"print_time": False, "error_on_fail": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     solver = ca.nlpsol("elastic", "ipopt", elastic, quiet)
+    # Slacks begin at 1: an interior solver starts off its bounds.
     free, slack = np.full(len(w), np.inf), np.ones(2 * len(own))
     solution: dict[str, Any] = solver(
         x0=np.concatenate([w, slack]),
@@ -76,6 +81,7 @@ def least_violations(program: Program, w: Array, p: Array) -> tuple[Violation, .
         return ()
     slacks = np.array(solution["x"]).ravel()[len(w) :]
     g = np.array(solution["g"]).ravel()
+    # The elastic row is g - above + below; this is g again.
     g[own] -= slacks[len(own) :] - slacks[: len(own)]
     return violations(program, g)
 
@@ -111,6 +117,7 @@ class Trajectory:
 
 
 _DEFAULTS: dict[str, dict[str, Any]] = {
+    # IPOPT would widen every bound by 1e-8, and a plan then leave the actuators' limits.
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.bound_relax_factor": 0.0},
     "fatrop": {"structure_detection": "auto", "fatrop.print_level": 0},
 }
@@ -124,7 +131,6 @@ class Solver:
         problem: what to solve.
         solver: a nonlinear solver of CasADi: `ipopt`, `fatrop`, `sqpmethod`, ...
         options: for it, by CasADi's names, on top of what makes it silent.
-        explain: whether to look, after a contradiction, for the least that must be missed.
 
     Raises:
         EchelonError: the model or the problem is malformed, or casadi is missing.
@@ -135,9 +141,8 @@ class Solver:
         problem: OptimalControl,
         solver: str = "ipopt",
         options: Mapping[str, Any] | None = None,
-        explain: bool = True,
     ) -> None:
-        self.problem, self.solver, self.explain = problem, solver, explain
+        self.problem, self.solver = problem, solver
         ca = casadi()
         if not ca.has_nlpsol(solver):
             known = ("ipopt", "fatrop", "sqpmethod")
@@ -146,6 +151,7 @@ class Solver:
             check_model(problem.model)
             self.program: Program = transcribe(problem)
         chosen = {"print_time": False, "error_on_fail": False, **_DEFAULTS.get(solver, {})}
+        # It splits the rows of a step into equations and inequalities, and must be given which.
         if solver == "fatrop":
             chosen["equality"] = (self.program.low == self.program.high).tolist()
         chosen |= options or {}
@@ -189,6 +195,7 @@ class Solver:
         """Return where the solver begins."""
         problem = self.problem
         shapes = (problem.steps + 1, len(x)), (problem.nodes, len(problem.model.input_names))
+        # Multipliers go with a plan of the same problem alone, so a bare guess has none.
         multipliers = {}
         if guess is None:
             states, inputs = (
@@ -203,6 +210,7 @@ class Solver:
         states = _numbers("guess.states", states, shapes[0])
         inputs = _numbers("guess.inputs", inputs, shapes[1])
         v, N = problem.model.normalized(inputs), problem.steps
+        # In the order of the program's variables: (x_k, v_k) step by step, the rest at the end.
         body = np.hstack([states[:N], v[:N]]).ravel()
         return {"x0": np.concatenate([body, states[N], v[N:].ravel()]), **multipliers}
 
@@ -216,7 +224,8 @@ class Solver:
         v = np.vstack([body[:, n:], tail[n:].reshape(-1, m)])
         solved, status = bool(stats["success"]), str(stats["return_status"])
         missed, least = violations(self.program, g), ()
-        if status in _CONTRADICTION and self.explain:
+        # Where it stopped is no answer to what is wrong: another point may miss much less.
+        if status in _CONTRADICTION:
             least = least_violations(self.program, w, data)
         return Trajectory(
             times=problem.dt * np.arange(N + 1),
@@ -312,9 +321,9 @@ def _message(
 ) -> str:
     usual = "Solve_Succeeded" if solved else status
     words = _WORDS.get(status, _WORDS.get(usual, f"it ended with the status `{status}`"))
-    told = f"{solver} {'solved' if solved else 'failed to solve'} the problem: {words}"
+    ending = f"{solver} {'solved' if solved else 'failed to solve'} the problem: {words}"
     if solved or not missed:
-        return f"{told}."
+        return f"{ending}."
     largest = "; ".join(f"`{v.name}` by {v.amount:.3g} at {v.time:.3g} s" for v in missed[:3])
     what = "what is missed at least" if least else "what is missed most"
-    return f"{told}; {what}: {largest}."
+    return f"{ending}; {what}: {largest}."

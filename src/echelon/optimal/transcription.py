@@ -69,6 +69,8 @@ def transcribe(problem: OptimalControl) -> Program:
     ca, parts = casadi(), _parts(problem)
     n, m = len(problem.model.state_names), len(problem.model.input_names)
     N, dt = problem.steps, problem.dt
+    # MX, whose nodes are whole functions: `map` calls one for all steps, so that the expression
+    # does not grow with the horizon. In the order of steps, its matrices are banded.
     body = ca.MX.sym("w", n + m, N)
     tail = ca.MX.sym("t", n + (m if problem.nodes > N else 0))
     start, p = ca.MX.sym("s", n), ca.MX.sym("p", problem.parameters, N + 1)
@@ -76,12 +78,14 @@ def transcribe(problem: OptimalControl) -> Program:
     v = ca.horzcat(body[n:, :], tail[n:]) if problem.nodes > N else body[n:, :]
     after = v[:, 1:] if problem.nodes > N else v
     ends = (x[:, :-1], v[:, :N], x[:, 1:], after)
+    # Half of dt for each end of a step; in shooting both ends have the step's own held input.
     cost = 0.5 * dt * ca.sum2(parts.stage.map(N)(*ends[:2], p[:, :-1]))
     cost += 0.5 * dt * ca.sum2(parts.stage.map(N)(*ends[2:], p[:, 1:]))
     cost += parts.terminal(x[:, -1], p[:, -1])
     gaps = parts.move.map(N)(*ends)
     limits = parts.limit.map(problem.nodes)(v)
     kept = parts.keep.map(N)(x[:, 1:], p[:, 1:])
+    # The first state is given, so that no constraint of the problem is put on it.
     first = ca.vertcat(gaps[:, 0], x[:, 0] - start, limits[:, 0])
     middle = ca.vec(ca.vertcat(gaps[:, 1:], limits[:, 1:N], kept[:, :-1]))
     closing = [limits[:, -1]] if problem.nodes > N else []
@@ -111,13 +115,16 @@ def _parts(problem: OptimalControl) -> _Parts:
     stage = _scalar("stage", casadi_function("stage", problem.stage, n, m, k))
     terminal = _scalar("terminal", casadi_function("terminal", problem.terminal, n, k))
     matrix = problem.bounds.matrix if problem.bounds else np.zeros((0, m))
+    # By size, since a solver forgives every row the same: of a torque limit of 5e-6 N m, 1e-8 is
+    # 0.2 % (theory page).
     matrix = np.array(matrix, float) / np.array([size for _, _, size in _limits(problem)])[:, None]
 
-    def joined(name: str, end: bool) -> Any:
+    def join(name: str, end: bool) -> Any:
         values = [f(x, p) for one, f in _constraints(problem) if one.end is end]
         return ca.Function(name, [x, p], [ca.vertcat(ca.SX(0, 1), *values)])
 
     if problem.transcription == "shooting":
+        # Solved by x_next = flow(x, u): as `simulate` steps, and so the plan is the run.
         gap = y - _flow(field, problem.substeps, problem.dt)(x, u)
     else:
         gap = y - x - 0.5 * problem.dt * (field(x, u) + field(y, physical(w)))
@@ -126,8 +133,8 @@ def _parts(problem: OptimalControl) -> _Parts:
         ca.Function("stage", [x, v, p], [stage(x, u, p)]),
         terminal,
         ca.Function("limit", [v], [ca.DM(matrix) @ u]),
-        joined("keep", False),
-        joined("end", True),
+        join("keep", False),
+        join("end", True),
     )
 
 
@@ -196,6 +203,7 @@ def _limits(problem: OptimalControl) -> list[tuple[float, float, float]]:
     sizes = (
         (low, high, max(abs(b) for b in (low, high, 0.0) if np.isfinite(b))) for low, high in pairs
     )
+    # Infinite bounds have no size, and limits that are both zero leave the row as it is.
     return [(low, high, size or 1.0) for low, high, size in sizes]
 
 

@@ -62,6 +62,7 @@ def _formation_error(flown: _Flown) -> "Figure":
 
 def _tracking_error(flown: _Flown) -> "Figure | None":
     found = {k: output_errors(_result(row)) for k, row in flown}
+    # The outputs begin with the position, so that a yaw is not added to metres.
     space = len(_result(flown[0][1]).measured)
     lines = {
         k: np.linalg.norm(errors[:, :space], axis=1)
@@ -75,10 +76,11 @@ def _tracking_error(flown: _Flown) -> "Figure | None":
     return _over_time([(k, row) for k, row in flown if k in lines], lines, text)
 
 
-def _alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
+def _count_alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
     """Return how many lines each stands for: laws that share a leader draw one over the other."""
     stands: dict[int, int] = {}
     for k, _ in flown:
+        # To the bit: laws that share a leader, who does not react to them, share its run.
         same = [j for j in stands if np.array_equal(lines[j], lines[k])]
         stands[same[0] if same else k] = stands.get(same[0], 0) + 1 if same else 1
     return stands
@@ -86,13 +88,15 @@ def _alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
 
 def _over_time(flown: _Flown, lines: dict[int, Array], text: str) -> "Figure":
     """Return errors on a logarithmic axis, no lower than the rounding of a metre."""
-    stands = _alike(flown, lines)
+    stands = _count_alike(flown, lines)
+    # A run that ended early has fewer frames, and the axis is that of the others.
     longest = max((_result(row) for _, row in flown), key=lambda result: result.times[-1])
     figure, (ax,) = draw.panels(longest.times, longest.settings.horizon, 1, 3.4)
     shown = []
     for k, row in flown:
         if k not in stands:
             continue
+        # Agents that agree to the bit have an error of zero, which a logarithm cannot show.
         values = np.maximum(lines[k], draw.FLOOR)
         keep = draw.thin(len(values))
         name = row.label if stands[k] == 1 else f"{row.label}, and {stands[k] - 1} alike"
@@ -110,13 +114,14 @@ def _approach(flown: _Flown) -> "Figure | None":
     axes = list(first.model.position_indices()[:2])
     if len(axes) < 2:
         return None
+    # All methods begin from the same deviations, so that the first can choose.
     follower = int(np.argmax(formation_errors(first)[0]))
     names, units = first.model.state_names, first.model.state_units
     figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
     start, goal = first.errors[:1, follower][:, axes], np.zeros((1, 2))
     drawn, cut = [start, goal], False
     for k, row in flown:
-        path, over = draw.bounded(_result(row).errors[:, follower][:, axes], start, goal)
+        path, over = draw.drop_runaways(_result(row).errors[:, follower][:, axes], start, goal)
         # One that leaves would shrink the others' ways to a dot.
         inside = np.abs(path).max(axis=1) <= 1.3 * np.abs(start).max()
         path, over = np.where(inside[:, None], path, np.nan), over or not inside.all()

@@ -15,9 +15,9 @@ from echelon.results.metrics import SETTLED, formation_errors, output_errors
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SNAPSHOTS = 6
+_SNAPSHOTS = 6  # times at which the graph of a few agents is drawn
 _EDGES = 5000  # A graph with more edges than this would be a black patch.
-_PANELS = 12
+_PANELS = 12  # what fits above each other on a page
 
 
 def figures(result: Result, lyapunov: Sequence[Array] | None = None) -> "dict[str, Figure]":
@@ -78,7 +78,7 @@ def _leader(result: Result) -> "Figure":
         return _states_over_time(result, [agent])
     keep = draw.thin(len(path))
     path, wanted = path[keep][:, axes], None if wanted is None else wanted[keep][:, axes]
-    path, cut = draw.bounded(path, path[:1], *([] if wanted is None else [wanted]))
+    path, cut = draw.drop_runaways(path, path[:1], *([] if wanted is None else [wanted]))
     figure, ax = _canvas(result, axes)
     if wanted is not None:
         draw.plot(ax, wanted, label="reference", **_REFERENCE)
@@ -97,7 +97,7 @@ def _trajectories(result: Result) -> "Figure":
         return _states_over_time(result, agents)
     paths, leader = result.states[:, :, axes], result.graph.leaders[0]
     wanted = _reference(result, leader)
-    paths, cut = draw.bounded(paths, paths[0], *([] if wanted is None else [wanted[:, axes]]))
+    paths, cut = draw.drop_runaways(paths, paths[0], *([] if wanted is None else [wanted[:, axes]]))
     figure, ax = _canvas(result, axes)
     keep = draw.thin(len(paths), len(agents))
     for agent in _leaders_first(result, agents):
@@ -119,9 +119,10 @@ def _snapshots(ax: Any, result: Result, paths: Array) -> None:
     size = 4.5 * draw.crowding(agents) ** 0.25
     for colour, group in _colours(result).items():
         places = paths[:, group]
-        draw.plot(ax, _listed(places[frames[1:-1]]), **draw.dots(".", colour, size))
+        draw.plot(ax, _flatten(places[frames[1:-1]]), **draw.dots(".", colour, size))
         draw.plot(ax, places[0], **draw.dots("o", colour, size, hollow=True))
         draw.plot(ax, places[-1], **draw.dots("s", colour, size))
+    # The legend explains the shapes once, in a colour that is nobody's.
     nowhere = np.full((1, paths.shape[2]), np.nan)
     for name, shape in (("start", "o"), ("end", "s")):
         look = draw.dots(shape, draw.EDGE, 4.5, hollow=name == "start")
@@ -131,17 +132,18 @@ def _snapshots(ax: Any, result: Result, paths: Array) -> None:
 def _graph(ax: Any, result: Result, places: Array, times: Array) -> None:
     """Draw the graph's edges between places (S, N, k) at S times, the later the darker."""
     ends = places[:, result.graph.edges]
+    # NaN lifts the pen, so that all edges of a time are one line and not thousands.
     gaps = np.full_like(ends[:, :, :1], np.nan)
     links = np.concatenate([ends, gaps], axis=2)
-    told = "graph" if len(times) < 3 else f"graph, every {times[1] - times[0]:.3g} s"
+    text = "graph" if len(times) < 3 else f"graph, every {times[1] - times[0]:.3g} s"
     crowd = draw.crowding(result.graph.agents)
     look = {"linewidth": 0.9 * crowd**0.18, "rasterized": result.graph.agents > 100, "zorder": 3}
     for k, shade in enumerate(np.linspace(0.65, float(draw.EDGE), len(times))):
-        name = told if k == len(times) - 1 else None
-        draw.plot(ax, _listed(links[k]), label=name, color=str(shade), **look)
+        name = text if k == len(times) - 1 else None
+        draw.plot(ax, _flatten(links[k]), label=name, color=str(shade), **look)
 
 
-def _listed(points: Array) -> Array:
+def _flatten(points: Array) -> Array:
     return points.reshape(-1, points.shape[-1])
 
 
@@ -182,7 +184,7 @@ def _states_over_time(result: Result, agents: Iterable[int]) -> "Figure":
     for k, ax in enumerate(panels):
         paths = result.states[:, agents, k, None]
         known = [] if wanted is None else [wanted[:, k, None]]
-        values, over = draw.bounded(paths, paths[0], *known)
+        values, over = draw.drop_runaways(paths, paths[0], *known)
         if wanted is not None and len(agents) == 1:
             draw.plot(ax, times, wanted[keep, k], label="reference", **_REFERENCE)
         for agent, line in zip(agents, values[keep].swapaxes(0, 1), strict=True):
@@ -201,11 +203,12 @@ def _tracking_error(result: Result) -> "Figure | None":
         return None
     model, keep, cut = result.model, draw.thin(len(errors)), False
     units = dict(zip(model.state_names, model.state_units, strict=True))
+    # Metres and radians share no axis; a dictionary keeps their order.
     kinds = list(dict.fromkeys(units.get(name, "") for name in model.output_names))
     figure, panels = _panels(result, len(kinds), 1.7)
     for k, name in enumerate(model.output_names):
         ax = panels[kinds.index(units.get(name, ""))]
-        values, over = draw.bounded(errors[keep, k, None], errors[:1, k, None])
+        values, over = draw.drop_runaways(errors[keep, k, None], errors[:1, k, None])
         colour = draw.COLOURS[k % len(draw.COLOURS)]
         draw.plot(ax, result.times[keep], values, label=name.replace("_", " "), color=colour)
         cut |= over
@@ -218,12 +221,14 @@ def _tracking_error(result: Result) -> "Figure | None":
 def _formation_error(result: Result) -> "Figure":
     """Return each follower's distance from its goal, on a logarithmic axis."""
     followers, many = list(result.graph.followers), result.graph.agents > draw.NAMED
+    # Agents that agree to the bit have an error of zero, which a logarithm cannot show.
     errors = np.maximum(formation_errors(result)[:, followers], draw.FLOOR)
     keep = draw.thin(len(errors), len(followers))
     times, errors, metric = result.times[keep], errors[keep], result.unit == "m"
     figure, (ax,) = _panels(result, 1, 3.2)
     for agent, line in zip(followers, errors.T, strict=True):
         draw.plot(ax, times, line, label=_name(result, agent, short=True), **_pen(result, agent))
+    # Of a swarm no line can be followed; the worst and the median can.
     if many:
         for name, of, dash in (("worst", np.max, "-"), ("median", np.median, "--")):
             look = {"color": draw.LEADER, "linestyle": dash}
@@ -237,8 +242,10 @@ def _formation_error(result: Result) -> "Figure":
 
 def _lyapunov(result: Result, value: Array, rate: Array) -> "Figure":
     """Return V, and how fast it falls or rises, on logarithmic axes."""
+    # V is a square, and so is its floor.
     keep, floor = draw.thin(len(value)), draw.FLOOR**2
     times, value, rate = result.times[keep], np.maximum(value[keep], floor), rate[keep]
+    # What is smaller is the rounding of V, which has both signs.
     moves = np.abs(rate) > floor
     figure, panels = _panels(result, 2 if moves.any() else 1, 2.0)
     draw.plot(panels[0], times, value, label="V", color=draw.LEADER)
@@ -280,6 +287,7 @@ def _pen(result: Result, agent: int) -> dict[str, Any]:
 
 
 def _leaders_first(result: Result, agents: Iterable[int]) -> list[int]:
+    # First drawn are first in the legend; `zorder` and not this decides who is on top.
     return sorted(agents, key=lambda agent: agent not in result.graph.leaders)
 
 

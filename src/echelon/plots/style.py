@@ -13,8 +13,8 @@ from echelon.core.types import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, told apart by colour-blind readers; its black is the leader's, and its
-# yellow is too pale for a line on white.
+# Okabe and Ito's palette, which colour-blind readers can distinguish; its black is the leader's,
+# and its yellow is too pale for a line on white.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LEADER, REFERENCE, EDGE = "black", "0.7", "0.3"
 
@@ -91,6 +91,7 @@ def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> di
         "markersize": size,
         "markerfacecolor": "white" if hollow else colour,
         "markeredgewidth": 0.2 * size,
+        # Above the lines, whose ends they mark.
         "zorder": 4,
     }
 
@@ -106,11 +107,12 @@ def plot(ax: Any, *columns: Array, **look: Any) -> None:
 
 def thin(frames: int, lines: int = 1) -> Array:
     """Return the frames to draw: all of them, or evenly spread ones with the first and the last."""
+    # A swarm shares the points of a figure, but a line of fewer than 100 would show corners.
     count = int(np.clip(_ALL_POINTS // max(lines, 1), 100, _POINTS))
     return np.unique(np.linspace(0, frames - 1, min(frames, count)).round().astype(int))
 
 
-def bounded(values: Array, *anchors: Array) -> tuple[Array, bool]:
+def drop_runaways(values: Array, *anchors: Array) -> tuple[Array, bool]:
     """Return values (..., k) with NaN where they have run away, and whether any has.
 
     Some have when they are a million times farther off than the anchors (..., k) reach; what is
@@ -118,6 +120,7 @@ def bounded(values: Array, *anchors: Array) -> tuple[Array, bool]:
     """
     known = np.concatenate([anchor.reshape(-1, values.shape[-1]) for anchor in anchors])
     low, high = known.min(axis=0), known.max(axis=0)
+    # Halved before they are added: a sum of two huge numbers may overflow.
     middle, reach = 0.5 * low + 0.5 * high, max(1.0, (0.5 * high - 0.5 * low).max())
     away = np.abs(values - middle).max(axis=-1)
     if away.max(initial=0.0) <= 1e6 * reach:

@@ -113,7 +113,7 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 def _trim_held(case: Case) -> Statement:
     """Within limits an agent holds its trim only if its actuators deliver that input."""
     model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_HELD
-    moved = case.parts.world.moved(model)
+    moved = case.parts.world.plant_for(model)
     if not case.settings.limits or moved.input_limits is None:
         text = "no limit acts on the inputs"
         return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)

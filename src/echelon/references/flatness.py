@@ -44,7 +44,7 @@ def reference_warnings(
     worst = int(np.argmax(ratios))
     if not ratios[worst] > 1.0:
         return ()
-    asked = ", ".join(
+    needed = ", ".join(
         f"{name} {value:.3g} {unit}".rstrip()
         for name, value, unit in zip(
             model.input_names, inputs[worst], model.input_units, strict=True
@@ -53,12 +53,13 @@ def reference_warnings(
     return (
         f"the reference `{type(reference).__name__}` is too fast for `{type(model).__name__}`: at "
         f"t = {times[worst]:.3g} s it needs {ratios[worst]:.3g} times what the actuators leave "
-        f"beyond the trim ({asked}); make it slower or smaller.",
+        f"beyond the trim ({needed}); make it slower or smaller.",
     )
 
 
 def flat_inputs(model: ControlAffine, reference: Reference, times: Array) -> Array:
     """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
+    # Up to four nested derivatives of a path leave float32 too few digits to judge limits by.
     with precision("float64"):
         return np.asarray(follow_at(model, reference, jnp.asarray(times))[1])
 
@@ -71,9 +72,11 @@ def demand(model: ControlAffine, inputs: Array) -> Array:
     if model.input_limits is None:
         return np.zeros(len(inputs))
     G, low, high = (np.asarray(part, float) for part in model.input_limits)
+    # What the trim takes is not free: at hover only the thrust beyond m g is room.
     held = G @ np.asarray(model.trim[1], float)
     moved = (inputs - np.asarray(model.trim[1], float)) @ G.T
     room = np.where(moved > 0.0, high - held, held - low)
+    # No room at all makes the demand infinite, and 0 / 0 is no demand.
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(moved == 0.0, 0.0, np.abs(moved) / np.maximum(room, 0.0)).max(axis=1)
 
@@ -96,6 +99,7 @@ def reference_targets(model: ControlAffine, reference: Reference | None, times: 
     Raises:
         PlanError: the model has no such map, or the reference is not finite.
     """
+    # Without a reference a leader stays at rest, which its trim is.
     if reference is None:
         x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
         return _targets(model, x, np.zeros((len(times), len(model.input_names))))

@@ -27,11 +27,12 @@ class Reference(eqx.Module):
 
         Their shape is (order + 1, len(coordinates)).
         """
+        # Before differentiating, so that what the model ignores costs no derivatives.
         picked = np.array([COORDINATES.index(name) for name in coordinates])
         return derivatives(lambda s: self(s)[picked], t, order)
 
 
-def finite(owner: Reference, **values: object) -> None:
+def check_finite(owner: Reference, **values: object) -> None:
     """Check that named parameters are finite numbers or vectors of the stated length.
 
     Each value is (number or sequence, length); length None means a plain number.
@@ -43,6 +44,7 @@ def finite(owner: Reference, **values: object) -> None:
         try:
             array = np.asarray(value, dtype=np.float64)
         except (TypeError, ValueError):
+            # What is no number fails the test below as NaN does, with the same sentence.
             array = np.array([np.nan])
         wanted = () if length is None else (length,)
         if array.shape != wanted or not np.isfinite(array).all():

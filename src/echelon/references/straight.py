@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Scalar
-from echelon.references.reference import Reference, finite, in_space
+from echelon.references.reference import Reference, check_finite, in_space
 
 _Vector = tuple[float, ...]
 
@@ -17,10 +17,11 @@ class Hover(Reference):
 
     def __check_init__(self) -> None:
         """Refuse what is not finite."""
-        finite(self, position=(self.position, 3), yaw=(self.yaw, None))
+        check_finite(self, position=(self.position, 3), yaw=(self.yaw, None))
 
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point."""
+        # In the precision of t, which is that of the run.
         return in_space(jnp.asarray(self.position, t.dtype), self.yaw)
 
 
@@ -33,7 +34,7 @@ class Line(Reference):
 
     def __check_init__(self) -> None:
         """Refuse what is not finite."""
-        finite(self, start=(self.start, 3), velocity=(self.velocity, 3), yaw=(self.yaw, None))
+        check_finite(self, start=(self.start, 3), velocity=(self.velocity, 3), yaw=(self.yaw, None))
 
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from echelon.core.errors import ReferenceError
 from echelon.core.types import Array, Scalar
-from echelon.references.reference import Reference, finite, in_space
+from echelon.references.reference import Reference, check_finite, in_space
 
 
 class Waypoints(Reference):
@@ -40,16 +40,19 @@ class Waypoints(Reference):
         t, p = np.asarray(times, dtype=np.float64), np.asarray(points, dtype=np.float64)
         _check(t, p)
         self.yaw = yaw
-        finite(self, yaw=(yaw, None))
+        check_finite(self, yaw=(yaw, None))
         self.knots, self.coefficients = _fit(t, p)
 
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""
         knots = jnp.asarray(self.knots, t.dtype)
         held = jnp.clip(t, knots[0], knots[-1])
+        # At the last knot there is no piece to the right, so the one to its left holds.
         piece = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
         s = held - knots[piece]
         value = jnp.zeros(3, t.dtype)
+        # Horner, in the time since the piece's own knot: powers of t would lose digits late in a
+        # flight.
         for coefficient in jnp.asarray(self.coefficients, t.dtype)[:, piece]:
             value = value * s + coefficient
         return in_space(value, self.yaw)
@@ -74,9 +77,13 @@ def _check(times: np.ndarray, points: np.ndarray) -> None:
 
 def _fit(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the knots (K,) and the coefficients (8, K - 1, 3), highest power first."""
+    # Imported here: splines load slowly, and few references need them.
     from scipy.interpolate import make_interp_spline
 
+    # A spline of degree 7 through K points has K + 6 coefficients: three conditions more at each
+    # end.
     rest = [(order, np.zeros(3)) for order in (1, 2, 3)]
     spline = make_interp_spline(times, points, k=7, bc_type=(rest, rest))
+    # Taylor's coefficients at each knot, which JAX evaluates without SciPy.
     powers = [spline.derivative(k)(times[:-1]) / math.factorial(k) for k in range(7, 0, -1)]
     return times, np.stack([*powers, points[:-1]])

@@ -39,7 +39,7 @@ from echelon.scenario.scenario import Fault, Scenario, refuse
 from echelon.scenario.sections import GainSpec
 from echelon.scenario.yaml import joined
 from echelon.world.disturbance import Disturbance
-from echelon.world.plant import check_plant, varied
+from echelon.world.plant import check_plant, vary_parameters
 from echelon.world.world import World
 
 
@@ -247,7 +247,7 @@ def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
     spec = scenario.plant
     if spec is None:
         return None
-    plant = varied(model, spec.parameters, spec.scale)
+    plant = vary_parameters(model, spec.parameters, spec.scale)
     check_model(plant)
     check_plant(model, plant)
     return plant

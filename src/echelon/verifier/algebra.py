@@ -51,12 +51,15 @@ def spectrum(graph: SavedGraph, edges: Array) -> Array:
 
 def rightmost(matrix: Array) -> tuple[float, float]:
     """Return the largest real part of an eigenvalue, and what rounding may make of it."""
+    # Without the units of the states, which would inflate the bound of the rounding.
     balanced = scipy.linalg.matrix_balance(matrix, permute=False)[0]
     found: Any = scipy.linalg.eig(balanced, left=True, right=True)
     values, left, right = found
     at = int(np.argmax(values.real))
+    # A simple eigenvalue moves by the perturbation over the cosine of its two vectors (Wilkinson).
     cosine = abs(np.vdot(left[:, at], right[:, at]))
     rounding = 50.0 * _EPS * float(np.linalg.norm(balanced))
+    # Near a Jordan block that says too much: one of four moves by about the fourth root.
     return float(values[at].real), min(rounding / max(cosine, 1e-300), 1e-2 * rounding**0.25)
 
 
@@ -65,7 +68,9 @@ def observable(A: Array, C: Array) -> int:
     basis = np.zeros((len(A), 0))
     block = C.T
     while block.size and basis.shape[1] < len(A):
+        # Columns of unit length, so that one tolerance does for all powers of A.
         block = block / np.maximum(np.linalg.norm(block, axis=0), 1e-300)
+        # Twice, since once leaves rounding of the size of what was taken away.
         for _ in range(2):
             block = block - basis @ (basis.T @ block)
         left, singular, _ = np.linalg.svd(block, full_matrices=False)
@@ -80,10 +85,12 @@ def growth(P: Array, As: Array, Ws: Array, strength: float) -> tuple[float, floa
 
     It is the largest over all A (K, n, n) and W (K, n, n) of a pair.
     """
+    # With P = L L' the determinant vanishes at the eigenvalues of L^-1 (...) L^-T.
     root = scipy.linalg.solve_triangular(np.linalg.cholesky(P), np.eye(len(P)), lower=True)
     turned, held = P @ As, strength * P @ Ws @ P
     slope = root @ (turned + turned.swapaxes(1, 2) - held) @ root.T
     values = np.linalg.eigvalsh(0.5 * (slope + slope.swapaxes(1, 2)))[:, -1]
+    # Rounding is of the terms before they cancel, hence absolute values throughout.
     parts = np.abs(P) @ np.abs(As) + 0.5 * np.abs(held)
     sizes = np.abs(root) @ (parts + parts.swapaxes(1, 2)) @ np.abs(root.T)
     whole = float(np.linalg.norm(sizes, axis=(1, 2)).max())

@@ -44,6 +44,7 @@ def model_of(saved: SavedModel) -> ControlAffine | NoModel:
     A class of any other module is not imported: reading a file must not run what it names.
     """
     module, _, name = saved.path.partition(":")
+    # With the dot, since other packages may begin with the same letters.
     if not (module + ".").startswith("echelon.models."):
         return NoModel(f"`{name}` is not bundled; `verify(path, model)` takes it", False)
     if saved.parameters is None:
@@ -66,6 +67,7 @@ def model_of(saved: SavedModel) -> ControlAffine | NoModel:
 
 
 def _frozen(value: object) -> object:
+    # As a dimension it would be a model too large to hold; as a parameter its float is the same.
     if isinstance(value, int) and abs(value) > _MOST_DIMENSIONS:
         return float(value)
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
@@ -94,6 +96,7 @@ def _slopes(
         return model.drift(x) + model.input_map(x) @ (u + S @ v)
 
     def both(x: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        # The synthesis differentiates forwards: a fault of either mode would show.
         return jax.jacrev(velocity)(x, v), model.input_map(x) @ S
 
     return jax.vmap(both)(states, inputs)
@@ -109,12 +112,14 @@ class Points(NamedTuple):
 
 def points(saved: SavedGain, region: SavedRegion) -> Points:
     """Return points at which to doubt a promise: corners of its domain, a lattice, and others."""
+    # A file must be judged alike every time.
     random = np.random.default_rng(0)
     low = np.concatenate([region.lower, region.input_lower])
     high = np.concatenate([region.upper, region.input_upper])
     used = np.flatnonzero(np.isfinite(low) & np.isfinite(high) & (low < high))
     ends = np.stack([low[used], high[used]])
     parts = [_corners(ends, random)]
+    # Quarters of the ranges hold corners and middles, where symmetric functions are extreme.
     for fractions in (random.integers(0, 5, (_EACH, len(used))) / 4.0, None):
         some = random.uniform(size=(_EACH, len(used))) if fractions is None else fractions
         parts.append(ends[0] + some * (ends[1] - ends[0]))
@@ -156,9 +161,11 @@ def farthest_outside(hull: Array, error: Array, samples: Array) -> float:
     corners, wanted = hull.reshape(len(hull), -1), samples.reshape(len(samples), -1)
     low, spread = corners.min(axis=0), np.ptp(corners, axis=0)
     size = np.abs(corners).max(axis=0)
+    # An entry that hardly varies is measured by its size, or rounding would look like distance.
     unit = np.where(size > 0.0, np.maximum(spread, 1e-3 * size), 1.0)
     corners, wanted, allowed = (corners - low) / unit, (wanted - low) / unit, error.ravel() / unit
     moving = spread > 0.0
+    # The row of ones asks for weights that add to one.
     system = np.vstack([corners[:, moving].T, np.ones(len(corners))])
     worst = float((np.abs(wanted - corners[0]) - allowed)[:, ~moving].max(initial=0.0))
     for sample in wanted[:, moving]:

@@ -22,6 +22,7 @@ def rows_of(matrix: Array) -> Rows:
 
 def is_positive_definite(matrix: Rows) -> bool:
     """Tell exactly whether a symmetric matrix is positive definite."""
+    # Sylvester's criterion speaks of symmetric matrices alone.
     if any(matrix[i][j] != matrix[j][i] for i in range(len(matrix)) for j in range(i)):
         return False
     # A positive factor on a row changes the sign of no minor.
@@ -30,6 +31,7 @@ def is_positive_definite(matrix: Rows) -> bool:
         (pivot, *tail), *below = rest
         if pivot <= 0:
             return False
+        # Bareiss: what is left are minors, which the pivot before divides without a remainder.
         rest = [
             [(pivot * x - row[0] * y) // last for x, y in zip(row[1:], tail, strict=True)]
             for row in below
@@ -50,6 +52,7 @@ def product(left: Rows, right: Rows) -> Rows:
 
 
 def _dot(row: Iterable[Fraction], column: Iterable[Fraction]) -> Fraction:
+    # Fractions are slow, and most entries of these matrices zero.
     return sum((x * y for x, y in zip(row, column, strict=True) if x and y), Fraction(0))
 
 
@@ -63,6 +66,7 @@ def inverse(matrix: Rows) -> Rows:
     size = len(matrix)
     work = [[*row, *(Fraction(i == j) for j in range(size))] for i, row in enumerate(matrix)]
     for k in range(size):
+        # The pivots of a positive definite matrix are positive, so no rows are exchanged.
         work[k] = [x / work[k][k] for x in work[k]]
         for i in range(size):
             if i != k and work[i][k]:
@@ -97,6 +101,7 @@ def first_unproved(
     metric, moved = rows_of(P), rows_of(abs(error))
     pull = product(metric, rows_of(B))
     held = product(product(pull, inverse(rows_of(R))), transposed(pull))
+    # |P dA| <= |P| error for every dA within +- error.
     spread = product(rows_of(abs(P)), moved)
     fixed = [
         [strength * held[i][j] - 2 * Fraction(rate) * metric[i][j] for j in range(len(metric))]

@@ -117,6 +117,7 @@ class _Part:
 
     def whole(self, key: str, least: int = 0) -> int:
         value, name = self.entry(key)
+        # JSON's true is an integer to Python.
         if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 10**9:
             raise self.fault(name, f"must be a whole number from {least} on (to 1e9)")
         return value
@@ -151,6 +152,7 @@ class _Part:
     def bounds(self, key: str, size: int, absent: float) -> Array:
         """Return numbers, some of which may be None for an infinite bound."""
         value, name = self.entry(key)
+        # JSON has no infinity, so a bound that is absent is null.
         numbers = [absent if x is None else x for x in value] if isinstance(value, list) else []
         fine = all(x is None or _is_number(x) for x in value) if len(numbers) == size else False
         if not fine:
@@ -161,6 +163,7 @@ class _Part:
 def _is_number(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
+    # Python's JSON reads NaN and Infinity too, and neither passes.
     return -_LARGEST <= value <= _LARGEST
 
 
@@ -183,6 +186,7 @@ def read(file: PathLike) -> SavedGain:
         GainError: it cannot be read, is no JSON, no gain, or lacks a part; the part is named.
     """
     top = _Part(file, _json(file), "the file")
+    # The whole needs a name where it is no mapping; the names of its entries need no prefix.
     top.name = ""
     if top.told.get("format") != _FORMAT:
         raise GainError(
@@ -259,8 +263,10 @@ def _graph(told: _Part) -> SavedGraph:
 
 def _region(told: _Part, n: int, m: int) -> SavedRegion:
     domain, theorem = told.part("domain"), told.text("theorem", _THEOREMS)
+    # Each A with its g S R^-1 (g S)' to the right.
     wide = 2 * n if theorem == "T2" else n
     return SavedRegion(
+        # A linearization says nothing of a domain.
         kind=told.text("kind", _KINDS[:3]),
         theorem=theorem,
         rate=told.number("rate"),
@@ -278,10 +284,12 @@ def _region(told: _Part, n: int, m: int) -> SavedRegion:
 def _unpacked(told: _Part, n: int, wide: int) -> Array:
     """Return the matrices of which the file holds one whole, and the changes of the others."""
     base = told.array("base", n, wide)
+    # One matrix only; an empty list has no second axis to check.
     if told.entry("places")[0] == []:
         return base[None]
     places = told.array("places", -1, 2)
     values = told.array("values", -1, len(places))
+    # Places are read as floats, and must be what indices can be.
     inside = (places == np.floor(places)) & (places >= 0) & (places < [n, wide])
     if not inside.all() or not len(values):
         raise told.fault(f"{told.name}.places", f"must be entries of a {n} x {wide} matrix")

@@ -23,6 +23,7 @@ _TIGHT = 1e-9
 """A number that was recomputed may differ by this part of itself, and by rounding."""
 _ROUNDING = 1e-12
 """Rounding of eigenvalues, as a part of the largest of them."""
+# Exact minors of n rows take n^3 products of integers that grow with n.
 _EXACT_FOLLOWERS = 60
 _SAMPLED = 0.02
 """New samples may be this part slower than a rate that samples promised."""
@@ -73,6 +74,7 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verified:
         GainError: the file is no gain, or lacks a part.
     """
     saved, findings = read(path), list[Finding]()
+    # Numbers of a false file may overflow: what is not finite fails the comparisons that follow.
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -143,6 +145,7 @@ def _graph(graph: SavedGraph, saved: SavedGain) -> Iterator[Finding]:
     if graph.edges is None:
         text = "the file holds no edges of so large a graph"
         yield Finding("graph spectrum", _shown(float(stored[0])), "", "not checked", text)
+    # Fewer edges than followers cannot reach all; said before a matrix of that size is made.
     elif not _is_graph(graph.edges) or followers > len(graph.edges):
         text = "an edge links no two agents, is given twice or has no positive weight, or some are"
         text += " missing"
@@ -186,6 +189,7 @@ def _linearized(facts: _Facts) -> Iterator[Finding]:
     K = saved.coupling * facts.weighted @ saved.P
     found = [algebra.rightmost(facts.closed - value * K) for value in facts.eigenvalues]
     slowest = max(value for value, _ in found)
+    # Of modes that are equally slow, but for rounding, the worst conditioned sets the slack.
     slack = max(slack for value, slack in found if value >= slowest - slack)
     yield _same("slowest mode, 1/s", saved.abscissa, slowest, slack)
     yield from _edge(facts)
@@ -204,8 +208,11 @@ def _edge(facts: _Facts) -> Iterator[Finding]:
     if saved.method == "given":
         yield _said(claim, False, saved.edge, "none", "no edge is known of a given gain")
         return
+    # The edge of `contraction` rests on the strength that it found, so only its inequality can be
+    # checked.
     if known is not None:
         yield _same(claim, saved.edge, known / facts.low)
+    # The inequality is monotone in the coupling, so that at the edge speaks for all above it.
     strength = 2.0 * saved.edge * facts.low
     growth, slack = algebra.growth(saved.P, facts.closed[None], facts.weighted[None], strength)
     text = "largest eigenvalue of the inequality there, in the metric of P"
@@ -235,6 +242,8 @@ def _regional(facts: _Facts) -> Iterator[Finding]:
 
 def _spread(facts: _Facts) -> float:
     """Return what it costs the radius of a monotone drift that g may vary."""
+    # sum delta_i'P delta_i is bounded by V = delta'(L kron P) delta over lambda_min, and V by
+    # lambda_max.
     return float(np.sqrt(facts.eigenvalues[0] / facts.eigenvalues[-1]))
 
 
@@ -281,6 +290,7 @@ def _rate(facts: _Facts, region: SavedRegion) -> Iterator[Finding]:
     else:
         yield _same(claim, region.rate, found, slack, "eigenvalues")
     size, lost = np.abs(region.hull).max(axis=0), region.error
+    # Samples are what they are; corners are rounded exact ones.
     allowed = _ROUNDING * size.max() if region.kind == "vertices" else 0.0
     fine = bool((lost >= 0.0).all() and lost.max() <= allowed)
     yield _said("error of the corners", fine, float(lost.max()), text="no more than rounding")
@@ -313,11 +323,13 @@ def _proof(facts: _Facts, region: SavedRegion) -> Iterator[Finding]:
     if graph.edges is not None and few:
         rows = algebra.grounded_rows(graph, graph.edges)
         for k in range(len(rows)):
+            # lambda_min > low exactly when L_g - low I is positive definite.
             rows[k][k] -= low
         fine = exact.is_positive_definite(rows)
         yield _said("lambda_min, proved", fine, facts.low, float(low), "exact minors")
     strength = 0 * low if region.theorem == "A5" else 2 * Fraction(saved.coupling) * low
     numbers = (saved.P, saved.model.B, saved.R, region.hull, region.error, strength, region.rate)
+    # A negative error would relax the inequality instead of tightening it.
     failed = None if (region.error >= 0.0).all() else 0
     failed = exact.first_unproved(*numbers) if failed is None else failed
     text = "exact minors" if failed is None else f"corner {failed} is not negative definite"
@@ -364,6 +376,7 @@ def _on_the_domain(facts: _Facts, region: SavedRegion, model: ControlAffine) -> 
         gap = float(np.abs(found.maps - saved.model.B).max())
         fine = gap <= _ROUNDING * float(np.abs(saved.model.B).max())
         yield _said(f"g is constant ({region.theorem})", fine, "", f"{gap:.3g} apart", count)
+    # Under T2 the hull is of pairs, since A and g turn together.
     pairs = [found.jacobians, weighted] if region.theorem == "T2" else [found.jacobians]
     if region.kind == "samples":
         gap = equations.farthest_from_all(region.hull, np.dstack(pairs)[: points.corners])
@@ -374,6 +387,7 @@ def _on_the_domain(facts: _Facts, region: SavedRegion, model: ControlAffine) -> 
         text = f"of {count}, in ranges of the entries"
         yield _said("Jacobians lie in the hull", outside <= _TIGHT, "0", outside, text)
     rate, slack = _rate_at(facts, region, found.jacobians, weighted)
+    # Samples promise nothing between them, and new ones may be a little worse.
     slower = _SAMPLED * abs(region.rate) if region.kind == "samples" else 0.0
     least = region.rate * (1.0 - _TIGHT) - slack - slower
     yield _said(f"rate at {count}, 1/s", rate >= least, region.rate, rate, "with their own g")

@@ -1,4 +1,4 @@
-"""Wind and noise: what acts on the agents although no law asked for it.
+"""Wind and noise: what acts on the agents although no law requested it.
 
 Draws are keyed by seed, time and agent, so a law, the number of agents, the frames that are stored
 and the precision change nothing of them.
@@ -19,6 +19,7 @@ from echelon.core.numerics import Field
 from echelon.core.types import Array, Input, State
 from echelon.models.model import ControlAffine
 
+# Folded into the key, so that one seed draws wind and noise independently.
 _WIND, _NOISE = 0, 1
 
 
@@ -100,10 +101,12 @@ class Disturbance:
         noise = plant.physical(np.diag(_by_input(plant, self.input_rms)), trim=False).T
         return Wind(
             constant=plant.per_state(self.constant),
+            # None and not zeros, so that a step without draws is compiled without them.
             rms=rms if rms.any() else None,
             noise=noise if noise.any() else None,
             # The two halves of the seed, since a precision could cut it to its lower one.
             key=np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32),
+            # Whole steps: a wind that changed within one would cost the integrator its order.
             window=np.asarray(max(1, round(self.hold / dt)), np.int32),
             common=self.common,
         )
@@ -128,6 +131,7 @@ class Wind(eqx.Module):
         constant = jnp.asarray(self.constant)
         if self.rms is None:
             return constant
+        # Agent 0's draw for all; the product keeps it traced.
         draw = self._draw(_WIND, step, 0 * agent if self.common else agent, len(self.rms))
         return constant + jnp.asarray(self.rms) * draw
 
@@ -138,14 +142,16 @@ class Wind(eqx.Module):
         return jnp.asarray(self.noise) @ self._draw(_NOISE, step, agent, len(self.noise))
 
     def _draw(self, part: int, step: jax.Array, agent: jax.Array, size: int) -> jax.Array:
+        # By name, as JAX's default generator is a setting of the user.
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl="threefry2x32")
+        # Keyed by where and when, and not carried on: no draw depends on the ones before.
         for number in (part, step // jnp.asarray(self.window), agent):
             key = jax.random.fold_in(key, number)
         # Drawn in float32 whatever the precision, which would otherwise change the draws.
         return jax.random.normal(key, (size,), jnp.float32).astype(float)
 
 
-def disturbed(plant: ControlAffine, wind: Wind | None, step: jax.Array, agent: jax.Array) -> Field:
+def disturb(plant: ControlAffine, wind: Wind | None, step: jax.Array, agent: jax.Array) -> Field:
     """Return (x, u) -> xdot of an agent during a step, wind and noise included."""
     if wind is None:
         return plant.velocity

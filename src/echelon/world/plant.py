@@ -11,7 +11,7 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.models.model import ControlAffine
 
 
-def varied(
+def vary_parameters(
     model: ControlAffine, parameters: Mapping[str, Any], scale: Mapping[str, float]
 ) -> ControlAffine:
     """Return a model with some parameters replaced and some multiplied by a factor.
@@ -31,7 +31,7 @@ def varied(
             )
     changes = dict(parameters)
     for parameter, factor in scale.items():
-        scaled = _scaled(getattr(model, parameter), factor)
+        scaled = _scale_value(getattr(model, parameter), factor)
         if scaled is None:
             raise ModelError(
                 f"`{parameter}` of `{name}` is {getattr(model, parameter)!r}, which no factor can "
@@ -39,14 +39,16 @@ def varied(
             )
         changes[parameter] = scaled
     try:
+        # It runs the model's own checks, so that no plant is made that cannot be.
         return dataclasses.replace(model, **changes)
     except (TypeError, ValueError) as error:
-        told = (str(error).splitlines() or ["no message"])[0].rstrip(".")
-        raise ModelError(f"`{name}` cannot be made with these parameters: {told}.") from error
+        message = (str(error).splitlines() or ["no message"])[0].rstrip(".")
+        raise ModelError(f"`{name}` cannot be made with these parameters: {message}.") from error
 
 
-def _scaled(value: Any, factor: float) -> Any:
+def _scale_value(value: Any, factor: float) -> Any:
     """Return a number, an array, or nested tuples of numbers times a factor; None where neither."""
+    # True is a number to Python, and a switch has no size.
     if isinstance(value, bool | str):
         return None
     if isinstance(value, numbers.Real):
@@ -54,7 +56,7 @@ def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, np.ndarray):
         return factor * value
     if isinstance(value, tuple | list):
-        scaled = tuple(_scaled(entry, factor) for entry in value)
+        scaled = tuple(_scale_value(entry, factor) for entry in value)
         return None if any(entry is None for entry in scaled) else scaled
     return None
 
@@ -79,24 +81,25 @@ def differences(model: ControlAffine, plant: ControlAffine) -> str:
     name = f"`{type(plant).__name__}`"
     if type(plant) is not type(model):
         return f"{name} for `{type(model).__name__}`"
-    told = [
-        f"`{field.name}` {_short(getattr(plant, field.name))} "
-        f"for {_short(getattr(model, field.name))}"
+    changed = [
+        f"`{field.name}` {_format_value(getattr(plant, field.name))} "
+        f"for {_format_value(getattr(model, field.name))}"
         for field in dataclasses.fields(plant)
-        if _plain(getattr(plant, field.name)) != _plain(getattr(model, field.name))
+        if _as_lists(getattr(plant, field.name)) != _as_lists(getattr(model, field.name))
     ]
-    return ", ".join(told) or f"{name}, which is no different"
+    return ", ".join(changed) or f"{name}, which is no different"
 
 
-def _plain(value: Any) -> Any:
+def _as_lists(value: Any) -> Any:
     """Return lists for tuples and arrays."""
+    # Arrays compare entry by entry, and lists as a whole.
     value = value.tolist() if isinstance(value, np.ndarray) else value
-    return list(map(_plain, value)) if isinstance(value, tuple | list) else value
+    return list(map(_as_lists, value)) if isinstance(value, tuple | list) else value
 
 
-def _short(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """Return a parameter as text with the digits that a person reads."""
-    value = _plain(value)
+    value = _as_lists(value)
     if isinstance(value, list):
-        return f"({', '.join(map(_short, value))})"
+        return f"({', '.join(map(_format_value, value))})"
     return f"{value:.6g}" if isinstance(value, numbers.Real) else str(value)

@@ -13,7 +13,7 @@ from echelon.world.plant import check_plant, differences
 @final
 @dataclasses.dataclass(frozen=True)
 class World:
-    """What differs from the model, and what acts on the agents beside their inputs.
+    """What differs from the model, and what acts on the agents besides their inputs.
 
     Args:
         plant: the agents as they are, where they differ from the model: these move, and have these
@@ -29,7 +29,7 @@ class World:
         """Whether the agents are as the model says, and nothing disturbs them."""
         return self.plant is None and self.disturbance is None
 
-    def moved(self, model: ControlAffine) -> ControlAffine:
+    def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return what moves: the plant, or the model where no other is given."""
         return model if self.plant is None else self.plant
 
@@ -47,6 +47,7 @@ class World:
             )
         if self.plant is None:
             return ()
+        # First: the names of a malformed plant may be no names to compare.
         warnings = check_model(self.plant)
         check_plant(model, self.plant)
         return warnings

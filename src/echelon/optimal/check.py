@@ -1,0 +1,61 @@
+"""The numbers and names that problems and solvers are given, checked alike."""
+
+import math
+import numbers
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from echelon.core.errors import PlanError, listing
+from echelon.core.types import Array
+
+
+def check_seconds(name: str, value: float) -> None:
+    """Check that a time is positive and finite.
+
+    Raises:
+        PlanError: it is not.
+    """
+    # By its type first: a comparison with a word would raise an error of Python's own.
+    if not (isinstance(value, numbers.Real) and 0.0 < value < math.inf):
+        raise PlanError(f"`{name}` is {value}, and must be a positive finite number of seconds.")
+
+
+def check_whole(name: str, value: object, least: int, hint: str = "") -> None:
+    """Check that a count is a whole number from `least` on.
+
+    Raises:
+        PlanError: it is not; `hint` ends the message.
+    """
+    # `True` is an integer to Python, and never meant as a count.
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < least:
+        raise PlanError(f"`{name}` is {value}, and must be a whole number from {least} on{hint}.")
+
+
+def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
+    """Check that an option is one of those allowed.
+
+    Raises:
+        PlanError: it is not.
+    """
+    if value not in allowed:
+        raise PlanError(f"`{name}` is `{value}`, allowed are {listing(allowed)}.")
+
+
+def read_weights(name: str, given: Any, owners: Sequence[str]) -> Array:
+    """Return a weight for each of the owners, float64.
+
+    Raises:
+        PlanError: they are not as many finite numbers, or one is negative.
+    """
+    try:
+        weights = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        weights = np.full(1, np.nan)  # refused below, where the message is
+    if weights.shape != (len(owners),) or not (np.isfinite(weights) & (weights >= 0.0)).all():
+        raise PlanError(
+            f"`{name}` is {given}, and must be {len(owners)} finite numbers that are not negative, "
+            f"one for each of {listing(owners)}."
+        )
+    return weights
