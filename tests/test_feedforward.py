@@ -332,9 +332,7 @@ def test_the_report_promises_the_modes_that_parents_leave():
     )
     # s^2 + sqrt 3 s + 1 has its roots at -sqrt 3 / 2 +- i / 2.
     text = " ".join(report(run).split())
-    assert (
-        "slowest mode -0.866 1/s at coupling 1 (guaranteed for linear agents from 0.5 on)" in text
-    )
+    assert "slowest mode is -0.866 1/s at coupling 1; from 0.5 on every mode decays." in text
     assert "Each follower is told: neighbours' states, its parent's input of the same step." in text
 
 

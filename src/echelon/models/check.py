@@ -2,12 +2,13 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.numerics import precision
+from echelon.models.linearization import at_trim
 from echelon.models.model import ControlAffine
 
 # Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
@@ -51,16 +52,8 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     _check_names(model, name)
     x, u = _trim(model, name, n, m)
     _check_values(model, name, x, u)
-    # Step by step each operation would be compiled for itself, which takes seconds.
-    residual, _ = _at_trim(model, jnp.asarray(x), jnp.asarray(u))
-    _check_trim(model, name, np.asarray(residual))
+    _check_trim(model, name, u)
     return (*_low_precision(model, name), *_weak_actuators(model, name))
-
-
-@eqx.filter_jit
-def _at_trim(model: ControlAffine, x: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return f(x) + g(x) u and what the actuators deliver of u."""
-    return model.velocity(x, u), model.limit(u)
 
 
 def _check_names(model: ControlAffine, name: str) -> None:
@@ -130,20 +123,12 @@ def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray)
     for (what, function), shape in zip(functions.items(), ((n,), (n, m), (q,)), strict=True):
         _check_shape(name, what, _shape(name, what, function, x), shape)
     _check_shape(name, "limit", _shape(name, "limit", model.limit, u), (m,))
-    for what, (value, jacobian) in _with_jacobians(model, jnp.asarray(x)).items():
-        for which, array in ((f"`{what}`", value), (f"the Jacobian of `{what}`", jacobian)):
+    there = at_trim(model)
+    slopes = (there.drift_slope, there.input_slope, there.output_slope)
+    for what, value, slope in zip(functions, there[:3], slopes, strict=True):
+        for which, array in ((f"`{what}`", value), (f"the Jacobian of `{what}`", slope)):
             if not np.isfinite(array).all():
                 raise ModelError(f"{which} of `{name}` is not finite at the trim {x.tolist()}.")
-
-
-@eqx.filter_jit
-def _with_jacobians(model: ControlAffine, x: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return f, g and h with their Jacobians at x.
-
-    They are compiled together, since compiling is most of the cost.
-    """
-    functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
-    return {name: (function(x), jax.jacfwd(function)(x)) for name, function in functions.items()}
 
 
 def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ...]:
@@ -172,8 +157,9 @@ def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, .
         raise ModelError(f"`{what}` of `{name}` has shape {got}, and must have shape {shape}.")
 
 
-def _check_trim(model: ControlAffine, name: str, residual: np.ndarray) -> None:
+def _check_trim(model: ControlAffine, name: str, u: np.ndarray) -> None:
     """Check |f(x*) + g(x*) u*| <= 1e-9 in the model's units."""
+    residual = at_trim(model).drift + at_trim(model).input_map @ u
     worst = int(np.argmax(np.abs(residual)))
     if abs(residual[worst]) > _TRIM_TOLERANCE:
         raise ModelError(
@@ -185,10 +171,11 @@ def _check_trim(model: ControlAffine, name: str, residual: np.ndarray) -> None:
 
 def trim_shortfall(model: ControlAffine, wanted: np.ndarray | None = None) -> dict[str, Shortfall]:
     """Return which inputs of a trim the actuators cut, by name; `wanted` (m,) is another's trim."""
-    x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
-    u = u if wanted is None else jnp.asarray(wanted)
-    asked, delivered = np.asarray(u).tolist(), np.asarray(_at_trim(model, x, u)[1]).tolist()
-    triples = zip(model.input_names, delivered, asked, strict=True)
+    asked, delivered = np.asarray(model.trim[1], float), at_trim(model).delivered
+    if wanted is not None and (wanted != asked).any():
+        with precision("float64"):
+            asked, delivered = wanted, np.asarray(model.limit(jnp.asarray(wanted)))
+    triples = zip(model.input_names, delivered.tolist(), asked.tolist(), strict=True)
     return {name: Shortfall(got, wanted) for name, got, wanted in triples if got != wanted}
 
 

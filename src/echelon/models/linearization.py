@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
-from echelon.core.types import Array, State
+from echelon.core.types import Array, Input, State
 from echelon.models.model import ControlAffine
 
 
@@ -28,36 +28,58 @@ class Linearization(NamedTuple):
         return self if K is None else Linearization(self.A - self.B @ K, self.B)
 
 
-@kept
-def linearize(model: ControlAffine) -> Linearization:
-    """Return A = d(f + g u*)/dx and B = g S at the trim, read-only.
+class AtTrim(NamedTuple):
+    """A model's functions at its trim (x*, u*), float64 and read-only.
 
-    They are computed once for a model, in float64 whatever the caller's precision.
+    Attributes:
+        drift, input_map, output: f (n,), g (n, m), h (q,).
+        drift_slope, input_slope, output_slope: their Jacobians, with n as the last dimension more.
+        delivered: what the actuators make of u*, (m,).
     """
+
+    drift: Array
+    input_map: Array
+    output: Array
+    drift_slope: Array
+    input_slope: Array
+    output_slope: Array
+    delivered: Array
+
+
+@kept
+def at_trim(model: ControlAffine) -> AtTrim:
+    """Return all that is asked of a model at its trim, compiled together.
+
+    Compiling is most of the cost. It is computed once for a model, in float64 whatever the caller's
+    precision.
+    """
+    x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are kept in files, so they must not depend on the precision of the run that needs them.
     with precision("float64"):
-        A, B = _slopes(model, jnp.asarray(np.asarray(model.trim[0], float)))
-    return Linearization(_freeze(A), _freeze(B))
+        return AtTrim(*map(_freeze, _evaluate(model, jnp.asarray(x), jnp.asarray(u))))
 
 
 @eqx.filter_jit
-def _slopes(model: ControlAffine, x: State) -> tuple[jax.Array, jax.Array]:
-    return jax.jacfwd(model.normalized_drift)(x), model.normalized_input_map(x)
+def _evaluate(model: ControlAffine, x: State, u: Input) -> list[jax.Array]:
+    functions = (model.drift, model.input_map, model.output)
+    slopes = [jax.jacfwd(function)(x) for function in functions]
+    return [*(function(x) for function in functions), *slopes, model.limit(u)]
+
+
+@kept
+def linearize(model: ControlAffine) -> Linearization:
+    """Return A = d(f + g u*)/dx and B = g S at the trim, read-only; computed once for a model."""
+    there = at_trim(model)
+    B = there.input_map @ np.asarray(model.input_scale, float)
+    return Linearization(_freeze(there.drift_slope + trim_slopes(model).sum(0)), _freeze(B))
 
 
 @kept
 def trim_slopes(model: ControlAffine) -> Array:
     """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: what each trim input puts into A."""
-    with precision("float64"):
-        slopes = _input_slopes(model, jnp.asarray(np.asarray(model.trim[0], float)))
     # d(g u*)/dx = sum_k u*_k dg_k/dx: an input scaled by s scales its own term alone.
-    u = np.asarray(model.trim[1], np.float64)
-    return _freeze(u[:, None, None] * np.moveaxis(np.asarray(slopes), 1, 0))
-
-
-@eqx.filter_jit
-def _input_slopes(model: ControlAffine, x: State) -> jax.Array:
-    return jax.jacfwd(model.input_map)(x)
+    u = np.asarray(model.trim[1], float)
+    return _freeze(u[:, None, None] * np.moveaxis(at_trim(model).input_slope, 1, 0))
 
 
 def _freeze(values: jax.Array | Array) -> Array:

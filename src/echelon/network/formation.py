@@ -3,8 +3,7 @@
 With it stands what the graph and the model make of the offsets: rigidity and symmetry.
 """
 
-import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import numpy as np
 
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
-from echelon.core.types import Array, State, States
+from echelon.core.types import Array, States
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
@@ -232,11 +231,15 @@ def _describe_change(model: ControlAffine, offset: np.ndarray) -> str | None:
     base = np.asarray(model.trim[0], float)
     # Near the trim, so that no angle leaves its chart.
     states = base + np.random.default_rng(0).uniform(-0.5, 0.5, (_SAMPLES, len(base)))
-    found = _compare_shifted(model, jnp.asarray(states), jnp.asarray(offset))
-    for name, (here, change) in found.items():
+    both = jnp.asarray(np.concatenate([states, states + offset]))
+    for name, (values, slopes) in _local(model, both).items():
+        here, there = np.split(np.asarray(values), 2)
+        # A change that happens to vanish at a state rarely vanishes with its slope.
+        turned = np.abs(np.diff(np.split(np.asarray(slopes), 2), axis=0))[0].max(axis=-1)
+        change = np.maximum(np.abs(there - here), turned)
         # Each entry against its own size: an inertia makes some entries of g tens of thousands.
-        entries = np.asarray(change) / np.maximum(1.0, np.abs(here).max(axis=0))
-        per_state = np.asarray(change).reshape(_SAMPLES, len(base), -1).max(axis=(0, 2))
+        entries = change / np.maximum(1.0, np.abs(here).max(axis=0))
+        per_state = change.reshape(_SAMPLES, len(base), -1).max(axis=(0, 2))
         if not entries.max() <= _SYMMETRY_TOLERANCE:
             state = model.state_names[int(np.argmax(per_state))]
             return f"it changes the {name} of `{state}` by up to {per_state.max():.3g}"
@@ -244,19 +247,10 @@ def _describe_change(model: ControlAffine, offset: np.ndarray) -> str | None:
 
 
 @eqx.filter_jit
-def _compare_shifted(
-    model: ControlAffine, states: States, offset: State
-) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """Return f and g at states (S, n), each with what the offset changes of it or of its Jacobian.
-
-    The change has the shape of f or g.
-    """
-
-    def change(function: Callable[[State], jax.Array], x: State) -> tuple[jax.Array, jax.Array]:
-        here, there = function(x), function(x + offset)
-        # A change that happens to vanish at a state rarely vanishes with its slope.
-        slopes = jnp.abs(jax.jacfwd(function)(x + offset) - jax.jacfwd(function)(x))
-        return here, jnp.maximum(jnp.abs(there - here), slopes.max(axis=-1))
-
+def _local(model: ControlAffine, states: States) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Return f and g at states (S, n), each with its Jacobian."""
     parts = {"drift": model.drift, "input map": model.input_map}
-    return {name: jax.vmap(functools.partial(change, part))(states) for name, part in parts.items()}
+    return {
+        name: (jax.vmap(part)(states), jax.vmap(jax.jacfwd(part))(states))
+        for name, part in parts.items()
+    }

@@ -152,25 +152,22 @@ def because(best: Design, tried: tuple[Design, ...], dt: float) -> str:
 def _why(best: Design, others: list[Design], rivals: list[Design], dt: float) -> str:
     """Return what sets a design apart from its rivals, those with which it shares the step."""
     assert best.promise is not None
-    _, strength, theorem, rate = best.merit(dt)
+    _, *argument, rate = best.merit(dt)
     if not others:
         return "it is the only one whose loop is stable"
     if not rivals:
         return f"of {1 + len(others)} stable loops it alone holds the scenario's step"
-    among = f"of {1 + len(rivals)} stable loops"
+    loops = f"{1 + len(rivals)} stable loops"
     if len(rivals) < len(others):
-        among += f" that {'hold' if best.step > dt else 'do not hold'} the scenario's step"
+        loops += f" that {'hold' if best.step > dt else 'do not hold'} the scenario's step"
     region = best.promise.region
     if region is None:
-        return (
-            f"{among}, none with more than a promise at the trim, its slowest mode is the "
-            f"fastest, {-rate:.3g} 1/s"
-        )
-    told = f"{region.rate:.3g} 1/s on its domain ({region.kind}, {region.theorem})"
-    alike = [d for d in rivals if d.merit(dt)[1:3] == (strength, theorem)]
-    return f"{among} it promises most: {told}" + (
-        f", the fastest of {1 + len(alike)} by that argument" if alike else ""
-    )
+        text = f"of {loops}, none with more than a promise at the trim, its slowest mode is the "
+        return f"{text}fastest, {-rate:.3g} 1/s"
+    alike = 1 + sum([*d.merit(dt)[1:3]] == argument for d in rivals)
+    text = f"it promises most of {loops}: {rate:.3g} 1/s on its domain "
+    text += f"({region.kind}, {region.theorem})"
+    return text if alike == 1 else f"{text}, the fastest of {alike} by that argument"
 
 
 def _tried(method: type[Method], arguments: dict[str, Any], built: Built) -> Design:
