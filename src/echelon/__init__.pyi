@@ -33,7 +33,6 @@ from .engine.simulate import simulate as simulate
 from .gains.file import load_gain as load_gain
 from .gains.file import save_gain as save_gain
 from .gains.gain import Gain as Gain
-from .gains.gain import Method as Method
 from .gains.gain import synthesize as synthesize
 from .models.model import ControlAffine as ControlAffine
 from .network.formation import Formation as Formation
