@@ -271,7 +271,7 @@ def random_system(seed: int, number: int) -> System:
     return System(number, family, plant, model, *_graph(rng), *_domain(rng, n, m, bent))
 
 
-def random_method(system: System, name: str, rng: np.random.Generator) -> ech.Method:
+def random_method(system: System, name: str, rng: np.random.Generator) -> ech.gains.Method:
     """Return a gain method with random settings.
 
     Some ask for a coupling below what the theorem needs; no promise may come of it.

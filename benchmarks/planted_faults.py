@@ -46,7 +46,7 @@ class Soft(ech.ControlAffine):
         return jnp.array([[0.0], [1.0]], x.dtype)
 
 
-Case = tuple[ech.ControlAffine, ech.Graph, ech.Method]
+Case = tuple[ech.ControlAffine, ech.Graph, ech.gains.Method]
 
 SMALL: dict[str, Case] = {
     "riccati, pendulum": (ech.models.Pendulum(), LINE, ech.gains.Riccati()),

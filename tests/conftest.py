@@ -2,14 +2,22 @@
 
 import os
 import sys
+from pathlib import Path
 
-import jax
-import pytest
-from beartype import beartype
-from hypothesis import settings
-from jaxtyping import install_import_hook
+# Most of what the tests take is compiling. The workers, the processes that they start, and the next
+# run of the tests share what was compiled; JAX reads the environment when it is imported.
+COMPILED = Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(COMPILED))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
-# What one test compiled must not stand in for what another is to compile.
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from beartype import beartype  # noqa: E402
+from hypothesis import settings  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
+
+# The command line's own cache is another matter, which its own tests turn on.
 os.environ["ECHELON_CACHE"] = "off"
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

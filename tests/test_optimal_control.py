@@ -107,7 +107,7 @@ def test_a_plan_meets_pontryagin_s_conditions_to_the_order_of_the_grid():
 # ---- the plan and the simulation ----
 
 
-class Played(ech.Law):
+class Played(ech.laws.Law):
     """A law that plays an input held over each step of a plan."""
 
     inputs: np.ndarray

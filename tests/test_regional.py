@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.certificates import Domain
 from echelon.certificates.jacobians import has_constant_input_map, jacobians
 from echelon.certificates.lmi import robust_lqr
 from echelon.certificates.region import contracting_region, pairs_on, radius
@@ -57,11 +58,11 @@ def test_a_robust_gain_is_proved_and_no_sample_contradicts_it(robust):
     assert (region.kind, region.theorem) == (Kind.PROOF, Theorem.T1)
     assert region.rate >= 0.2 and np.linalg.cond(robust.P) <= 500
     low = LINE.spectrum().low
-    assert rate_seen(model, robust, ech.Domain.about(model, TILT), low, 60) >= region.rate
+    assert rate_seen(model, robust, Domain.about(model, TILT), low, 60) >= region.rate
 
 
 def test_the_certified_set_fits_into_the_domain(robust):
-    domain = ech.Domain.about(ech.models.QuadrotorThrust(), TILT)
+    domain = Domain.about(ech.models.QuadrotorThrust(), TILT)
     r = robust.certificate.region.radius
     assert r == radius(domain, robust.P)
     W = np.linalg.inv(robust.P)
@@ -74,8 +75,8 @@ def test_the_certified_set_fits_into_the_domain(robust):
 def test_only_a_constant_input_map_gives_the_nonlocal_theorem():
     euler, thrust = ech.models.QuadrotorEuler(), ech.models.QuadrotorThrust()
     with precision("float64"):
-        assert has_constant_input_map(thrust, ech.Domain.about(thrust, TILT))
-        assert not has_constant_input_map(euler, ech.Domain.about(euler, TILT))
+        assert has_constant_input_map(thrust, Domain.about(thrust, TILT))
+        assert not has_constant_input_map(euler, Domain.about(euler, TILT))
 
 
 def with_its_own_map(model, gain, domain, low):
@@ -103,14 +104,14 @@ def with_its_own_map(model, gain, domain, low):
 def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
     model, bounds = ech.models.PlanarQuadrotor(), {"roll": tilt, "thrust": 1.0}
     region = (gain := ech.synthesize(model, LINE, ech.gains.RobustLQR(bounds))).certificate.region
-    seen = with_its_own_map(model, gain, ech.Domain.about(model, bounds), LINE.spectrum().low)
+    seen = with_its_own_map(model, gain, Domain.about(model, bounds), LINE.spectrum().low)
     assert region is None or (region.theorem is Theorem.T2 and 0.0 < region.rate <= seen + 1e-12)
     assert tilt > 0.3 or region is not None
 
 
 def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
     model, low = ech.models.QuadrotorEuler(), LINE.spectrum().low
-    domain = ech.Domain.about(model, TILT)
+    domain = Domain.about(model, TILT)
     gain = ech.synthesize(model, LINE, ech.gains.RobustLQR(TILT))
     region = gain.certificate.region
     assert (region.theorem, region.kind, region.radius) == (Theorem.T2, Kind.VERTICES, None)
@@ -131,7 +132,7 @@ def test_a_coupling_below_what_the_metric_needs_is_promised_its_own_rate_only():
     full = ech.synthesize(model, LINE, ech.gains.Contraction(bounds, rate=0.5, exact=False))
     half = ech.gains.Contraction(bounds, rate=0.5, exact=False, coupling=0.5 * full.coupling)
     gain = ech.synthesize(model, LINE, half)
-    seen = with_its_own_map(model, gain, ech.Domain.about(model, bounds), LINE.spectrum().low)
+    seen = with_its_own_map(model, gain, Domain.about(model, bounds), LINE.spectrum().low)
     assert full.certificate.region.rate >= 0.5 * (1 - 1e-5)
     assert gain.certificate.edge == full.certificate.edge
     region = gain.certificate.region
@@ -146,7 +147,7 @@ def test_a_pendulum_is_monotone_up_to_the_angle_of_the_closed_form():
     region = gain.certificate.region
     assert region.theorem is Theorem.A5 and region.kind is Kind.VERTICES
     with precision("float64"):
-        found = jacobians(pendulum, ech.Domain.about(pendulum, {"angle": 0.99 * edge}))
+        found = jacobians(pendulum, Domain.about(pendulum, {"angle": 0.99 * edge}))
     for A in found.matrices:
         assert np.linalg.eigvalsh(gain.P @ A + A.T @ gain.P).max() <= 1e-7 * np.abs(gain.P).max()
     told = sentence(
@@ -206,7 +207,7 @@ def test_a_contraction_gain_is_the_weakest_and_keeps_its_rate():
     region = gain.certificate.region
     assert region.kind is Kind.PROOF and region.rate >= 0.5 * (1 - 1e-5)
     low = LINE.spectrum().low
-    assert rate_seen(model, gain, ech.Domain.about(model, {"angle": 1.0}), low) >= region.rate
+    assert rate_seen(model, gain, Domain.about(model, {"angle": 1.0}), low) >= region.rate
 
 
 DOMAINS = {
@@ -230,12 +231,12 @@ DOMAINS = {
 @pytest.mark.parametrize("name", DOMAINS)
 def test_a_bad_domain_has_its_sentence(name):
     bounds, told = DOMAINS[name]
-    assert sentence(lambda: ech.Domain.about(ech.models.Quadrotor(), bounds)) == told
+    assert sentence(lambda: Domain.about(ech.models.Quadrotor(), bounds)) == told
 
 
 def test_a_domain_needs_known_names_and_all_bounds_that_matter():
     euler = ech.models.QuadrotorEuler()
-    told = sentence(lambda: ech.Domain.about(euler, {"rol": 0.1}))
+    told = sentence(lambda: Domain.about(euler, {"rol": 0.1}))
     assert "did you mean `roll`?" in told
     told = sentence(lambda: ech.synthesize(euler, LINE, ech.gains.RobustLQR({"roll": 0.1})))
     assert told.startswith("the domain leaves `pitch` unbounded")
@@ -307,7 +308,7 @@ class Yielding(ech.ControlAffine):
 
 
 def test_samples_stand_at_all_corners_and_need_the_bounds_that_matter():
-    domain = ech.Domain.about(Yielding(), {"place": (-1.0, 0.5)})
+    domain = Domain.about(Yielding(), {"place": (-1.0, 0.5)})
     with precision("float64"):
         found = jacobians(Yielding(), domain)
     assert found.kind is Kind.SAMPLES and not found.error.any()

@@ -22,7 +22,6 @@ from . import (
     references as references,
 )
 from .archive.run import save_run as save_run
-from .certificates.domain import Domain as Domain
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome
@@ -34,10 +33,7 @@ from .engine.simulate import simulate as simulate
 from .gains.file import load_gain as load_gain
 from .gains.file import save_gain as save_gain
 from .gains.gain import Gain as Gain
-from .gains.gain import Method as Method
 from .gains.gain import synthesize as synthesize
-from .laws.law import Law as Law
-from .laws.law import LocalView as LocalView
 from .models.model import ControlAffine as ControlAffine
 from .network.formation import Formation as Formation
 from .network.graph import Graph as Graph
@@ -45,7 +41,6 @@ from .plots.run import figures as figures
 from .plots.run import save_figures as save_figures
 from .promises.promise import Promise as Promise
 from .promises.promise import promise as promise
-from .references.reference import Reference as Reference
 from .reports.comparison import comparison_report as comparison_report
 from .reports.run import report as report
 from .results.dataset import (
