@@ -4,14 +4,16 @@ import json
 import os
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
 
 import echelon as ech
 from echelon.cli.app import app
-from echelon.reports.comparison import comparison_report, verdict
-from echelon.studies.compare import LABELS, Comparison
+from echelon.reports.comparison import comparison_mapping, comparison_report, verdict
+from echelon.results.metrics import FollowerMetrics, LeaderMetrics, Metrics
+from echelon.studies.compare import LABELS, Comparison, Row
 
 LAWS = ("literal", "riccati-relay", "riccati", "inner-loop")
 SHORT = ["simulation.horizon=1.0"]
@@ -67,6 +69,50 @@ def test_the_paragraph_names_the_row_with_the_least_number(planar):
     best = min(whole, key=whole.__getitem__)
     assert f"{best} has the smallest error over the whole run" in text
     assert "do not bring every follower within 1 cm" in text
+
+
+def row_of(label, settles, effort, computing):
+    """A method of one follower, with the numbers that the paragraph reads."""
+    follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
+    numbers = Metrics(LeaderMetrics(None, None, {}), (follower,), (), None, 0.0, 1.0)
+    return Row(label, types.SimpleNamespace(computing=computing), numbers)
+
+
+def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
+    rows = (
+        row_of("slow", None, 1.0, 1e-3),
+        row_of("a", 2.0, 5.0, 2e-3),
+        row_of("b", 3.0, 6.0, 9e-3),
+    )
+    text = " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
+    assert "Of those that settle, a asks the least of the inputs (5; next b, 6)." in text
+    assert "Of those that settle, a takes the least computing, b 4 times as much." in text
+    text = " ".join(verdict(Comparison("mine", rows[1:], 5.0, 1.0, ())))
+    assert "Of those" not in text and "a asks the least of the inputs (5; next b, 6)." in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "labels"),
+    [
+        ([], ["riccati-relay"]),
+        (["follower.gain={method: inner-loop, coupling: 5.0}"], ["inner-loop-relay"]),
+        (["follower.feedforward=parent"], ["riccati-parent"]),
+        (["follower.gain={method: given, P: identity}"], ["given-relay"]),
+        (["follower.trim=false"], ["riccati-relay, own"]),
+    ],
+)
+def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
+    short = ["simulation.horizon=0.02", "report.steady_window=0.01"]
+    scenario = ech.load_scenario("planar-quadrotor", [*short, *changes])
+    found = ech.compare(scenario, only=("riccati-relay", "inner-loop", "own"))
+    assert [row.label for row in found.rows] == [
+        *("riccati-relay", "inner-loop"),
+        *(label for label in labels if label != "riccati-relay"),
+    ]
+    told = comparison_mapping(found)["methods"]
+    for row in found.rows:
+        result = row.flight.result
+        assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
 
 
 def test_a_law_of_ones_own_flies_beside_the_methods():

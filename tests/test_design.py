@@ -105,7 +105,17 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelo
     assert steps["riccati"] < steps["inner-loop"]
     between = 0.5 * (steps["riccati"] + steps["inner-loop"])
     assert recommended(tried, 0.005).method == "riccati"
-    assert recommended(tried, between).method == "inner-loop"
+    best = recommended(tried, between)
+    assert best.method == "inner-loop"
+    assert "because of 2 stable loops it alone holds the scenario's step" in (
+        because(best, tried, between)
+    )
+    # The table has a faster one, and the sentence does not say otherwise.
+    assert -best.promise.loop.slowest < max(-d.promise.loop.slowest for d in tried if d.stable)
+    assert (
+        f"its slowest mode is the fastest, {recommended(tried, 0.005).promise.loop.slowest:.3g}"
+        in (because(recommended(tried, 0.005), tried, 0.005))
+    )
     long = recommended(tried, 1.0)
     assert "it needs a step below" in because(long, tried, 1.0)
 

@@ -94,7 +94,7 @@ QUICK = [
     ("van-der-pol", "inner-loop", "none"),
     ("integrators", "contraction", "relay-velocity"),
     ("integrators", "riccati", "parent"),
-    ("unicycle", "given", "relay"),
+    ("van-der-pol", "given", "none"),
 ]
 
 

@@ -232,11 +232,15 @@ def _condition(P: Array) -> float:
     return float(high / low) if low > 0.0 else np.inf
 
 
-def falls(P: Array, As: Array) -> bool:
-    """Return whether no P^-1 (P A_k + A_k'P) has an eigenvalue above what rounding makes."""
+def falls(P: Array, As: Array, error: float | None = None) -> bool:
+    """Return whether no P^-1 (P A_k + A_k'P) has an eigenvalue above what an error makes of it.
+
+    The error is relative to the entries, and that of rounding when left out.
+    """
+    error = 4.0 * len(P) * np.finfo(float).eps if error is None else error
     inverse = np.abs(np.linalg.inv(np.linalg.cholesky(P)))
     size = inverse @ _drift(np.abs(P), np.abs(As), None, 0.0) @ inverse.T
-    return -2.0 * rate_of(P, As) <= 4.0 * len(P) * np.finfo(float).eps * size.sum(-1).max()
+    return -2.0 * rate_of(P, As) <= error * float(size.sum(-1).max())
 
 
 def _measure(P: Array, As: Array, S: Array | None, rho: float) -> Metric:

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from echelon.certificates.certificate import Certificate, certify
-from echelon.certificates.lmi import rate_of
+from echelon.certificates.lmi import falls
 from echelon.certificates.margins import ClosedLoop, slowest_between
 from echelon.core.linear import held_radius, longest_step
 from echelon.core.types import Array
@@ -25,7 +25,7 @@ SHOWN = 32
 _FEW = 8  # modes that a longest step is sought with, the extreme ones among them
 _DENSE = 400
 _SLACK = 1e-9
-"""Relative; what rounding makes of the inequality behind an edge, which is often tight."""
+"""Relative; what a solver leaves of the inequality behind an edge, which is often tight."""
 
 
 class Loop(NamedTuple):
@@ -144,8 +144,8 @@ def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
     if claim.edge is None:
         return None
     rho = 2.0 * claim.edge * claim.lambda_min
-    rate = rate_of(gain.P, linear.A[None], linear.B, gain.R, rho)
-    return 0.5 * rho / low if rate >= -_SLACK * max(1.0, np.linalg.norm(linear.A, 2)) else None
+    closed = linear.A - 0.5 * rho * linear.B @ gain.R_inverse @ linear.B.T @ gain.P
+    return 0.5 * rho / low if falls(gain.P, closed[None], _SLACK) else None
 
 
 def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:

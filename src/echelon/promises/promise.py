@@ -7,6 +7,7 @@ integrator, feed-forward, limits and starts that run; what a gain says of itself
 
 import dataclasses
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, cast, final
 from weakref import WeakKeyDictionary
 
@@ -198,7 +199,7 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         loop=loop,
         region=certificate,
         certified=found,
-        hypotheses={cast(Hypothesis, line.statement): line for line in lines},
+        hypotheses=MappingProxyType({cast(Hypothesis, x.statement): x for x in lines}),
         domain="" if certificate is None else certificate.domain.in_words(parts.model),
         condition="" if case.matched else ", once the leader's input rests at its trim",
         without=case.disturbed,

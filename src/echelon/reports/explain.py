@@ -33,7 +33,7 @@ def _story(result: Result, numbers: Metrics, found: Promise) -> Iterator[str]:
     """Tell the outcome and how the formation did."""
     yield result.message
     if result.outcome is Outcome.DIVERGED:
-        yield from _why_growth(found)
+        yield from _why_growth(result, found)
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
     error = formation_errors(result)[:, list(result.graph.followers)]
@@ -45,18 +45,20 @@ def _story(result: Result, numbers: Metrics, found: Promise) -> Iterator[str]:
             f"The formation error grows: {first:.3g}{unit} at the start, "
             f"{last:.4g}{unit} at {result.times[-1]:g} s."
         )
-        yield from _why_growth(found)
+        yield from _why_growth(result, found)
         return
     yield from _settling(result, numbers, found, unit)
     yield from _lag(result, numbers, found, unit)
 
 
-def _why_growth(found: Promise) -> Iterator[str]:
-    """Name the causes among what a promise rests on."""
-    causes = tuple(f"Cause: {each.explanation}." for each in found.causes)
-    yield from causes
-    if found.promised and not causes:
-        yield "The promise is of starts near enough to the goals, and these were not."
+def _why_growth(result: Result, found: Promise) -> Iterator[str]:
+    """Name the causes among what a promise rests on, or what it leaves out."""
+    yield from (f"Cause: {each.explanation}." for each in found.causes)
+    limited = float(result.saturated.max())
+    if found.promised:
+        left = found.without or "the starts were not near enough to the goals"
+        left = f"{left}; a limit acted in {100.0 * limited:.3g} % of the steps" if limited else left
+        yield f"What is promised does not reach this run: {left}."
 
 
 def _settling(result: Result, numbers: Metrics, found: Promise, unit: str) -> Iterator[str]:
