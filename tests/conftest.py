@@ -22,6 +22,19 @@ os.environ["ECHELON_CACHE"] = "off"
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+
+
+def pytest_configure(config):
+    """Let the quick tests compile quickly.
+
+    Most of the time of the tests is that of compiling programs which run for a millisecond. Without
+    its optimizer, and by the older of its two emitters, XLA needs a third of the time for one. What
+    is not only the quick tests (`-m slow`, `-m ""`) compiles as it does for users.
+    """
+    if config.option.markexpr == "not slow":
+        os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)  # which JAX reads when it first runs
+
 
 def check_shapes(function):
     """Check what is declared with a shape; a wrong type is for echelon to refuse, as for a user."""

@@ -4,6 +4,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,11 +25,16 @@ def test_the_attacked_plant_is_the_model(number):
     plant, rng = system.plant, np.random.default_rng(number)
     n, m = plant.B.shape
     x, w = rng.uniform(-1.0, 1.0, n), rng.uniform(-1.0, 1.0, m)
+    model = system.model
+
+    @jax.jit
+    def values(x, w):
+        slope = model_jacobian(model)(x, w)
+        return slope, model.normalized_drift(x), model.normalized_input_map(x)
+
     with precision("float64"):
-        there = jnp.asarray(x + np.array(system.model.trim[0]))
-        slope = np.asarray(model_jacobian(system.model)(there, jnp.asarray(w)))
-        drift = np.asarray(system.model.normalized_drift(there))
-        G = np.asarray(system.model.normalized_input_map(there))
+        there = jnp.asarray(x + np.array(model.trim[0]))
+        slope, drift, G = map(np.asarray, values(there, jnp.asarray(w)))
     assert np.allclose(plant.drift(x[None])[0], drift, 1e-10, 1e-12)
     assert np.allclose(np.broadcast_to(plant.input_map(x[None]), (1, n, m))[0], G, 1e-12, 1e-14)
     bent = np.einsum("iaj,a->ij", plant.g.slope(n).at(x[None])[0], w)
@@ -44,12 +50,17 @@ def test_a_plant_with_its_loop_closed_is_the_plant_under_that_input():
     assert np.allclose(plant.closed(K).drift(x), wanted)
 
 
-def test_no_promise_for_random_systems_is_false():
+@pytest.mark.parametrize(
+    ("every", "least"),
+    [(3, 8), pytest.param(1, 20, marks=pytest.mark.slow)],
+    ids=["a third", "all"],
+)
+def test_no_promise_for_random_systems_is_false(every, least):
     # Agents of one shape compile once; the study has all.
-    numbers = [k for k in range(400) if random_system(11, k).plant.B.shape == (3, 2)][:20]
+    numbers = [k for k in range(400) if random_system(11, k).plant.B.shape == (3, 2)][::every]
     records = [record for number in numbers for record in study(11, number, 3)]
     attacked = [record for record in records if "margin" in record]
-    assert len(attacked) >= 20 and {r["theorem"] for r in attacked} == {"T1", "T2", "A5"}
+    assert len(attacked) >= least and {r["theorem"] for r in attacked} == {"T1", "T2", "A5"}
     assert {r["kind"] for r in attacked} == {"proof", "vertices"}
     assert [(r["number"], r["method"], r["violations"]) for r in attacked if r["violations"]] == []
 
