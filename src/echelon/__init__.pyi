@@ -33,7 +33,9 @@ from .engine.simulate import simulate as simulate
 from .gains.file import load_gain as load_gain
 from .gains.file import save_gain as save_gain
 from .gains.gain import Gain as Gain
+from .gains.gain import Method as Method
 from .gains.gain import synthesize as synthesize
+from .laws.law import Law as Law
 from .models.model import ControlAffine as ControlAffine
 from .network.formation import Formation as Formation
 from .network.graph import Graph as Graph
@@ -41,6 +43,7 @@ from .plots.run import figures as figures
 from .plots.run import save_figures as save_figures
 from .promises.promise import Promise as Promise
 from .promises.promise import promise as promise
+from .references.reference import Reference as Reference
 from .reports.comparison import comparison_report as comparison_report
 from .reports.run import report as report
 from .results.dataset import (
