@@ -236,6 +236,7 @@ def test_a_slice_that_is_none_is_one_sentence(asked, sentence):
 # ---- pictures ----
 
 
+@pytest.mark.slow
 def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
     call = ("design", "mine.yaml", "--method", "robust-lqr", "--figures", "figs")
     code, out, err = echelon(*call)

@@ -24,7 +24,8 @@ from echelon.scenario.registry import METHODS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUN = ["README.md", "tutorial.md", "extending.md"]
+SLOW = pytest.param("tutorial.md", marks=pytest.mark.slow, id="tutorial.md")
+RUN = ["README.md", SLOW, "extending.md"]
 
 FENCE = re.compile(
     r"^(?P<mark><!-- not executed -->\s+)?^```(?P<language>\w+)(?: title=\"(?P<title>[^\"]+)\")?\n"

@@ -60,6 +60,7 @@ def test_every_coupling_and_every_connected_graph_is_stable(gains, name, edges, 
         assert np.linalg.eigvals(mode).real.max() < 0.0
 
 
+@pytest.mark.slow
 def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
     model, graph = AGENTS["quadrotor"], ech.Graph.path(4)
     result = simulate(

@@ -86,6 +86,7 @@ def test_the_weights_left_out_are_the_model_s_on_what_it_shows():
 # ---- the swarm ----
 
 
+@pytest.mark.slow
 def test_quadrotors_close_up_within_their_motors_limits():
     result = swarm(horizon=1.6, initial={"position": 0.5, "attitude": 0.2}, store_every=2)
     assert result.outcome is ech.Outcome.COMPLETED
@@ -98,6 +99,7 @@ def test_quadrotors_close_up_within_their_motors_limits():
     assert figures.failures == 0 and figures.solves == 4 * 80
 
 
+@pytest.mark.slow
 def test_wind_does_not_add_up_as_it_does_open_loop():
     wind = ech.Disturbance(constant={"vx": 1.0})
     given = {"horizon": 0.6, "initial": None, "disturbance": wind, "store_every": 10}
@@ -109,6 +111,7 @@ def test_wind_does_not_add_up_as_it_does_open_loop():
     assert closed.world.disturbance is wind
 
 
+@pytest.mark.slow
 def test_agents_renamed_fly_the_same():
     order = [0, 3, 1, 2]
     renamed = relabelled(TREE, order)

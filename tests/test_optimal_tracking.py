@@ -37,6 +37,7 @@ def rmse(result):
     return ech.metrics(result).leader.rmse
 
 
+@pytest.mark.slow
 def test_it_errs_less_than_tracking_and_still_less_without_limits():
     usual, best = led(ech.laws.Tracking(LOOP)), led(LAW)
     free = led(prepared(limits=False), limits=False)

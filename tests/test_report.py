@@ -34,6 +34,7 @@ def test_the_literal_law_names_its_cause(literal):
     assert "Warning" not in text and "Assumption 5 fails" in text
 
 
+@pytest.mark.slow
 def test_the_lag_without_feed_forward_is_told():
     text = " ".join(
         ech.report(run("paper", "follower.feedforward=none", "simulation.horizon=20")).split()

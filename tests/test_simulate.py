@@ -83,6 +83,7 @@ def flight():
     return graph, gain, start, fly
 
 
+@pytest.mark.slow
 def test_rk4_agrees_with_dop853_on_a_formation_of_quadrotors(flight):
     graph, gain, start, fly = flight
     run = fly()
