@@ -70,7 +70,7 @@ def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCerti
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
-    return 2.0 * gain.coupling * parts.graph.spectrum().low
+    return 2.0 * gain.coupling * parts.graph.spectrum().proved
 
 
 def _withheld(
