@@ -14,9 +14,9 @@ import numpy as np
 
 from echelon.core.types import Array
 
-_ROUNDS = 8
+_EFFORT = 1200
 _FEW = 150
-"""Up to so many followers the vector is sharpened, in a second at most."""
+"""Up to so many followers the vector is sharpened, in `_EFFORT` / n rounds: some seconds at most."""
 _DIGITS = 60
 _SHARP = 1.0 - 1e-9
 
@@ -48,7 +48,7 @@ def least_eigenvalue_bound(matrix: Grounded, vector: Array, near: float) -> floa
     """
     tried = [Fraction(max(abs(x), 1e-300)) for x in vector.tolist()]
     best, above = _quotients(matrix, tried)
-    for _ in range(_ROUNDS if matrix.size <= _FEW else 0):
+    for _ in range(_EFFORT // matrix.size if matrix.size <= _FEW else 0):
         if best >= _SHARP * min(above, near) > 0:
             break
         # Inverse iteration: L^-1 has positive entries only, so x stays positive.
