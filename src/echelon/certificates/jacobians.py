@@ -15,7 +15,7 @@ from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
-from echelon.enclosure.hull import Box, slope_hull
+from echelon.enclosure.hull import Box, slope_columns, slope_hull
 from echelon.enclosure.polynomial import OpenError
 from echelon.enclosure.slopes import JumpError
 from echelon.models.model import ControlAffine
@@ -113,13 +113,39 @@ def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
     def entries(x: jax.Array, v: jax.Array) -> jax.Array:
         return model.normalized_input_map(x).reshape(-1)
 
+    found = _constant_columns(entries, *_boxes(model, domain))
+    return found is not None and bool(found.all())
+
+
+def offsets_are_symmetries(model: ControlAffine, domain: Domain, offsets: Array) -> bool:
+    """Tell whether f and g are proved not to notice the offsets (N, n) of a formation on a domain.
+
+    f(x + d) = f(x), and g likewise, wherever x lies in the domain: f and g have the slope 0 in
+    every state that d moves, from x to x + d.
+    """
+    moved = (offsets != offsets[0]).any(axis=0)
+    away = offsets - offsets[0]
+    low, high = np.minimum(away.min(axis=0), 0.0), np.maximum(away.max(axis=0), 0.0)
+    # Agents stand in the domain, and their goals' places without offsets within reach of them.
+    wider = Domain(domain.lower - high, domain.upper - low, domain.input_lower, domain.input_upper)
+
+    def entries(x: jax.Array, v: jax.Array) -> jax.Array:
+        return jnp.concatenate([model.drift(x), model.input_map(x).reshape(-1)])
+
+    found = _constant_columns(entries, *_boxes(model, wider))
+    return found is not None and bool(found[moved].all())
+
+
+def _constant_columns(function: _OfState, states: Box, inputs: Box) -> Array | None:
+    """Return (n,) in which states a function is proved to have no slope; None for no enclosure."""
+    found = np.zeros(len(states.lower), bool)
     try:
         with precision("float64"):
-            hull = slope_hull(entries, *_boxes(model, domain))
+            zero = slope_columns(function, states, inputs)
     except GainError:
-        return False
-    # g is proved constant where the hull of its slopes is the matrix 0 alone.
-    return not (hull.vertices.any() or hull.error.any())
+        return None
+    found[list(zero)] = True
+    return found
 
 
 def _boxes(model: ControlAffine, domain: Domain) -> tuple[Box, Box]:

@@ -12,7 +12,7 @@ from echelon.core.errors import GainError
 from echelon.core.types import Array
 from echelon.enclosure.hull import Hull
 from echelon.models.model import ControlAffine
-from echelon.models.secants import check_slopes, find_jump
+from echelon.models.secants import find_gap, find_jump
 
 _SAMPLES = 400
 _SEGMENTS = 64
@@ -53,6 +53,7 @@ def sample_jacobians(
 
     at = jax.jit(jax.vmap(matrix))
     found = np.asarray(at(jnp.asarray(base + both)))
+    _check_finite(model, base + both, found)
     for k in np.flatnonzero(~np.isfinite(domain.lower) | ~np.isfinite(domain.upper)):
         for far in _FAR:
             moved = base + both + np.where(np.arange(len(base)) == k, far, 0.0)
@@ -60,6 +61,19 @@ def sample_jacobians(
                 raise unbounded_error(model, model.state_names[k])
     _check_samples(model, base + inside, velocity)
     return found
+
+
+def _check_finite(model: ControlAffine, points: Array, found: Array) -> None:
+    """Refuse matrices (K, n, n) that are not numbers, at points (K, n + m)."""
+    bad = np.flatnonzero(~np.isfinite(found).all(axis=(1, 2)))
+    if len(bad):
+        names = (*model.state_names, *model.input_names)
+        pairs = zip(names, points[bad[0]].tolist(), strict=True)
+        where = ", ".join(f"{name} {value:.4g}" for name, value in pairs)
+        raise GainError(
+            f"the Jacobian of `{type(model).__name__}` is not finite inside the domain, for one at "
+            f"{where}; make the domain smaller."
+        )
 
 
 def _points(domain: Domain) -> tuple[Array, Array]:
@@ -93,7 +107,7 @@ def _check_samples(model: ControlAffine, points: Array, velocity: _OfState) -> N
             f"{jump.after[model.state_names.index(state)]:.4g}, and nothing is promised across a "
             "jump; make the domain smaller, or the model continuous."
         )
-    gap = check_slopes(entries, points[:_SEGMENTS])
+    gap = find_gap(entries, points[:_SEGMENTS])
     if gap is not None:
         raise GainError(
             f"the derivative that JAX finds of `{name}` is {gap.said:.4g} inside the domain where "

@@ -127,6 +127,21 @@ def slope_hull(
     return _hull_of(found, atoms)
 
 
+def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
+    """Return in which entries of x a function (x, v) -> (k,) has the slope 0 all over a box.
+
+    Nothing is multiplied out, so that slopes elsewhere may be as many as they like.
+
+    Raises:
+        OpenError: the function bends with an entry that the box leaves open.
+        GainError: as in `slope_hull`.
+    """
+    atoms = Atoms()
+    x, v = _variables(atoms, states, inputs, ())
+    slopes = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    return tuple(k for k in range(len(x)) if not any(p.terms for p in slopes[:, k]))
+
+
 def _values(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
     """Return the values (k, l) of a matrix function, polynomials."""
     [found] = evaluate(function, [x, v], polynomials(atoms))

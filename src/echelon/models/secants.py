@@ -63,40 +63,8 @@ def find_jump(function: _Function, starts: Array, ends: Array) -> Jump | None:
     return Jump(low[k], high[k], int(entry), float(changes[-1][k, entry]))
 
 
-class Slopes(NamedTuple):
-    """Slopes (..., k, n) of a function by differences to both sides."""
-
-    forward: Array
-    backward: Array
-
-    @property
-    def middle(self) -> Array:
-        """The slopes by central differences."""
-        return 0.5 * (self.forward + self.backward)
-
-
-def difference_slopes(function: _Function, points: Array, step: float) -> Slopes:
-    """Return slopes at points (K, n) by differences over `step` times max(1, |x|)."""
-    points = np.asarray(points, float)
-    n = points.shape[1]
-    # A power of two, so that x + h - x is h.
-    h = 2.0 ** np.round(np.log2(step * np.maximum(1.0, np.abs(points))))
-    moves = np.eye(n)[None] * h[:, None, :]
-    with precision("float64"):
-        values = jax.jit(jax.vmap(function))
-        at, up, down = (
-            np.asarray(values(jnp.asarray(x.reshape(-1, n))))
-            for x in (points, points[:, None] + moves, points[:, None] - moves)
-        )
-    up, down = (x.reshape(len(points), n, -1) for x in (up, down))
-    scale = h[:, :, None]
-    pair = ((up - at[:, None]) / scale, (at[:, None] - down) / scale)
-    forward, backward = (np.moveaxis(x, 1, 2) for x in pair)
-    return Slopes(forward, backward)
-
-
 class Gap(NamedTuple):
-    """A derivative that JAX says of an entry, and what differences show."""
+    """A derivative that JAX says of an entry in a variable, and what differences show."""
 
     said: float
     seen: float
@@ -104,11 +72,74 @@ class Gap(NamedTuple):
     variable: int
 
 
-_WIDE, _NARROW = 1e-4, 1e-6
+_STEPS = (1e-4, 1e-6)
 _TOLERANCE = 1e-3
 
 
-def check_slopes(function: _Function, points: Array) -> Gap | None:
+class Sides(NamedTuple):
+    """Slopes (2, k, n) of a function at a point, over a wide step and a hundredth of it.
+
+    What is only curved shows less as steps get shorter, and what bends, jumps or is no derivative
+    shows the same or more.
+    """
+
+    forward: Array
+    backward: Array
+
+    def gap(self, said: Array) -> Gap | None:
+        """Return where a derivative (k, n) is most clearly no slope, or None."""
+        # Where it bends, any slope between those of the sides is as good.
+        low, high = np.minimum(*self), np.maximum(*self)
+        away = said - np.clip(said, low, high)
+        no_slope = self._stays(away, 1.0 + np.abs(said).max()) & ~self.jumps()
+        stays = np.where(no_slope, np.abs(away[1]), 0.0)
+        if not stays.any():
+            return None
+        entry, variable = np.unravel_index(np.argmax(stays), stays.shape)
+        seen = 0.5 * (self.forward + self.backward)[1, entry, variable]
+        return Gap(float(said[entry, variable]), float(seen), int(entry), int(variable))
+
+    def bends(self) -> Array:
+        """Return (k, n) whether the slopes of both sides differ, or the values do."""
+        scale = 1.0 + np.minimum(np.abs(self.forward[1]), np.abs(self.backward[1])).max()
+        return self._stays(self.forward - self.backward, scale) | self.jumps()
+
+    def jumps(self) -> Array:
+        """Return (k, n) whether values differ between the sides, however near."""
+        wide, narrow = (np.maximum(np.abs(f), np.abs(b)) for f, b in zip(*self, strict=True))
+        # A jump over a step a hundred times shorter is a slope a hundred times steeper.
+        return narrow > 50.0 * (wide + 1e-3)
+
+    @staticmethod
+    def _stays(away: Array, scale: float) -> Array:
+        wide, narrow = np.abs(away)
+        return (narrow > _TOLERANCE * scale) & (narrow > 0.1 * wide)
+
+
+def stencil(point: Array) -> Array:
+    """Return (1 + 4 n, n) a point (n,), and what lies around it for its `sides`."""
+    steps = [np.diag(_widths(point, step)) for step in _STEPS]
+    moves = np.concatenate([m for step in steps for m in (step, -step)])
+    return np.concatenate([point[None], point + moves])
+
+
+def sides(point: Array, values: Array) -> Sides:
+    """Return the slopes at a point (n,) from the values (1 + 4 n, k) of its `stencil`."""
+    n, here = len(point), values[0]
+    around = values[1:].reshape(len(_STEPS), 2, n, -1)
+    widths = np.array([_widths(point, step) for step in _STEPS])[:, :, None]
+    # What is not finite is found by whoever checks values, and compares as false here.
+    with np.errstate(invalid="ignore", over="ignore"):
+        forward, backward = (around[:, 0] - here) / widths, (here - around[:, 1]) / widths
+    return Sides(np.moveaxis(forward, 1, 2), np.moveaxis(backward, 1, 2))
+
+
+def _widths(point: Array, step: float) -> Array:
+    # A power of two, so that x + h - x is h.
+    return 2.0 ** np.round(np.log2(step * np.maximum(1.0, np.abs(point))))
+
+
+def find_gap(function: _Function, points: Array) -> Gap | None:
     """Return where JAX's derivative of a function is not its slope, or None where it is.
 
     Args:
@@ -116,24 +147,8 @@ def check_slopes(function: _Function, points: Array) -> Gap | None:
         points: (K, n), where to look.
     """
     with precision("float64"):
-        said = np.asarray(jax.jit(jax.vmap(jax.jacfwd(function)))(jnp.asarray(points, float)))
-    wide, narrow = (difference_slopes(function, points, h).middle for h in (_WIDE, _NARROW))
-    gaps = np.where(_persist(said - wide, said - narrow, said), np.abs(said - narrow), 0.0)
-    if not gaps.any():
-        return None
-    k, entry, variable = np.unravel_index(np.argmax(gaps), gaps.shape)
-    jax_s, seen = (float(a[k, entry, variable]) for a in (said, narrow))
-    return Gap(jax_s, seen, int(entry), int(variable))
-
-
-def find_bends(function: _Function, point: Array) -> Array:
-    """Return (k, n) whether the slopes of a function at a point (n,) differ between its sides."""
-    wide, narrow = (difference_slopes(function, point[None], h) for h in (_WIDE, _NARROW))
-    far, near = ((s.forward - s.backward)[0] for s in (wide, narrow))
-    return _persist(far, near, narrow.middle[0])
-
-
-def _persist(wide: Array, narrow: Array, slopes: Array) -> Array:
-    """Tell which gaps stay as differences get a hundred times narrower, and so are no curvature."""
-    scale = 1.0 + np.abs(slopes).max()
-    return (np.abs(narrow) > _TOLERANCE * scale) & (np.abs(narrow) > 0.1 * np.abs(wide))
+        around = jnp.asarray(np.stack([stencil(point) for point in points]))
+        values = np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(around))
+        said = np.asarray(jax.jit(jax.vmap(jax.jacfwd(function)))(jnp.asarray(points)))
+    found = (sides(p, v).gap(s) for p, v, s in zip(points, values, said, strict=True))
+    return next((gap for gap in found if gap is not None), None)

@@ -16,7 +16,7 @@ from echelon.core.types import Array
 
 _EFFORT = 1200
 _FEW = 150
-"""Up to so many followers the vector is sharpened, in `_EFFORT` / n rounds: some seconds at most."""
+"""Up to so many followers the vector is sharpened, in `_EFFORT` / n rounds: seconds at most."""
 _DIGITS = 60
 _SHARP = 1.0 - 1e-9
 
