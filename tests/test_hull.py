@@ -824,7 +824,7 @@ def test_secants_of_what_bends_lie_in_the_hull(system):
     assert_secants_lie_in_the_hull(function, box, hull, seed)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @settings(max_examples=1000)
 @given(system=bent())
 def test_no_hull_of_a_thousand_is_left_by_a_secant(system):
