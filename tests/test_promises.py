@@ -105,7 +105,7 @@ def test_all_who_tell_of_a_promise_say_the_same(scenario, method, feedforward, t
 
 
 def combinations():
-    """All of them; one feed-forward in turn of each scenario and method is slow, the rest a study."""
+    """All of them: of each scenario and method one feed-forward in turn, the rest as a study."""
     words = list(map(str, Feedforward))
     for i, scenario in enumerate(sorted(ech.bundled_scenarios())):
         for j, method in enumerate(METHODS):
