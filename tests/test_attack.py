@@ -17,6 +17,7 @@ from echelon.core.words import Theorem
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from attack import attack, promise_of, study  # noqa: E402
 from attack_systems import random_system  # noqa: E402
+from zoo import study as try_specimen  # noqa: E402
 
 
 @pytest.mark.parametrize("number", [1, 2, 5])
@@ -125,3 +126,13 @@ def test_a_drift_that_contracts_by_itself_takes_any_coupling():
     model, graph = ech.models.Linear(-np.eye(2), np.eye(2)), ech.Graph.path(3)
     gain = ech.synthesize(model, graph, ech.gains.Contraction({"x1": 1.0}, rate=0.5))
     assert gain.coupling > 0.0 and gain.certificate.region.rate >= 0.5
+
+
+# ---- awkward agents ----
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(100, marks=pytest.mark.slow)])
+def test_no_promise_for_an_awkward_agent_is_false(count):
+    found = [try_specimen(3, number) for number in range(count)]
+    assert [r for r in found if r.get("violations")] == []
+    assert count < 100 or sum("promised" in r for r in found) >= 10

@@ -90,3 +90,8 @@ def test_what_has_no_rule_and_what_lies_outside_is_for_the_algebra_to_say():
         evaluate(lambda x: jax.jit(jnp.sin)(x), [fractions("1")], FRACTIONS)
     with pytest.raises(IndexError, match="outside"):
         evaluate(lambda x: x.at[jnp.array([3])].get(mode="fill"), [fractions("1")], FRACTIONS)
+
+
+def test_what_no_result_depends_on_is_not_evaluated():
+    [found] = evaluate(lambda x: (jnp.sin(x), x + x)[1], [fractions("1/3")], FRACTIONS)
+    assert found.tolist() == [Fraction(2, 3)]

@@ -82,10 +82,20 @@ def walk(
         return algebra.lift(np.asarray(variable.val)) if literal else values[variable]
 
     # Equations stand in order and assign once, so one pass binds every variable before its use.
-    for equation in jaxpr.eqns:
+    for equation in _used(jaxpr):
         results = _apply(equation, [read(v) for v in equation.invars], algebra)
         values |= dict(zip(equation.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
+
+
+def _used(jaxpr: Any) -> list[Any]:
+    """Return the equations on which the results depend, as a trace keeps all that was written."""
+    wanted, found = {v for v in jaxpr.outvars if not hasattr(v, "val")}, []
+    for equation in reversed(jaxpr.eqns):
+        if wanted.intersection(equation.outvars):
+            wanted.update(v for v in equation.invars if not hasattr(v, "val"))
+            found.append(equation)
+    return found[::-1]
 
 
 def _apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
