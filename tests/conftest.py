@@ -25,7 +25,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Tracing makes millions of small objects that live; looking through them all, again and again, for
 # those that died in a circle takes a tenth of the time.
-gc.set_threshold(200_000, 50, 100)
+gc.set_threshold(20_000, 10, 10)
 
 QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
