@@ -214,13 +214,13 @@ def limits(**changes):
 FALSE = {
     "a complex drift": (
         {"drift": lambda self, x: x * 1j},
-        "`drift` of `Tank` returns complex128 numbers, and must return those of its argument, "
-        "float64; write `jnp.asarray(..., x.dtype)`.",
+        "`drift` of `Tank` has the type complex128, and must have that of its argument, float64; "
+        "write `jnp.asarray(..., x.dtype)`.",
     ),
     "a drift of truth values": (
         {"drift": lambda self, x: x > 0.0},
-        "`drift` of `Tank` returns bool numbers, and must return those of its argument, "
-        "float64; write `jnp.asarray(..., x.dtype)`.",
+        "`drift` of `Tank` has the type bool, and must have that of its argument, float64; write "
+        "`jnp.asarray(..., x.dtype)`.",
     ),
     "a drift in single precision": (
         {"drift": single},

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from echelon.core.errors import EchelonError
 from echelon.core.types import Array
 
 
@@ -103,10 +104,20 @@ def check_function(
         Exception: the one that `fault` makes, for the first fault found.
     """
     found = traced(fault, what, function, *arguments, advice=advice)
-    value = found.result
+    check_array(fault, what, found.result, shape)
+
+
+def check_array(
+    fault: Callable[[str], Exception], what: str, value: Any, shape: tuple[int, ...]
+) -> None:
+    """Check that what a trace returns is one array of a shape, of float64 or whole numbers.
+
+    Raises:
+        Exception: the one that `fault` makes.
+    """
     if not hasattr(value, "shape"):
         raise fault(
-            f"{what} returns a {type(value).__name__}, and must return one array, such as "
+            f"{what} has the type `{type(value).__name__}`, and must be one array, such as "
             "`jnp.stack([...])` makes."
         )
     if value.shape != shape:
@@ -114,8 +125,8 @@ def check_function(
     # Whole numbers are exact, and JAX multiplies them with any other.
     if value.dtype != np.float64 and not np.issubdtype(value.dtype, np.integer):
         raise fault(
-            f"{what} returns {value.dtype} numbers, and must return those of its argument, "
-            "float64; write `jnp.asarray(..., x.dtype)`."
+            f"{what} has the type {value.dtype}, and must have that of its argument, float64; "
+            "write `jnp.asarray(..., x.dtype)`."
         )
 
 
@@ -133,6 +144,9 @@ def traced(
     """
     try:
         found = trace(function, *arguments)
+    # A sentence of our own, which says more than its place would.
+    except EchelonError:
+        raise
     # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
     except Exception as error:
         raise fault(f"{what} fails with {in_short(error)}; {advice}.") from error

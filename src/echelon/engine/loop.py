@@ -140,10 +140,11 @@ def control(loop: Loop, now: Moment) -> Control:
     t = now.step.astype(x.dtype) * loop.motion.dt
 
     def act(law: Law, who: Any, sent: jax.Array, memory: Memory) -> _Acted:
-        view = LocalView(t, x[who], offsets[who], z[who], sent)
         # One time for all; of everything else, an agent sees its own row and no other.
-        axes = LocalView(None, 0, 0, 0, 0)  # type: ignore[arg-type]
-        wanted, memory = jax.vmap(law.update, in_axes=(None, axes, 0))(loop.model, view, memory)
+        def one(x: Any, offset: Any, z: Any, sent: Any, memory: Memory) -> tuple[Any, Memory]:
+            return law.update(loop.model, LocalView(t, x, offset, z, sent), memory)
+
+        wanted, memory = jax.vmap(one)(x[who], offsets[who], z[who], sent, memory)
         return _Acted(wanted, loop.motion.deliver(wanted), memory)
 
     # Nobody is before a leader whose input it could be sent.

@@ -29,6 +29,7 @@ from echelon.engine.settings import Settings
 from echelon.engine.simulate import Progress, simulate
 from echelon.gains.file import load_gain
 from echelon.gains.gain import Gain, synthesize
+from echelon.laws.check import prepare_law
 from echelon.laws.law import Law
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
@@ -306,7 +307,7 @@ def _follower(
             offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)
         if "gain" not in offers:
             return None
-    return cls(**_offered(cls, offers)).prepared(model, graph)
+    return prepare_law(cls(**_offered(cls, offers)), model, graph)
 
 
 def _leader(
@@ -339,7 +340,7 @@ def _leader(
             offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)
         if "gain" not in offers:
             return None
-    return cls(**_offered(cls, offers)).prepared(model, graph)
+    return prepare_law(cls(**_offered(cls, offers)), model, graph)
 
 
 def _settings(scenario: Scenario) -> Settings:
