@@ -1,5 +1,6 @@
 """A domain: the box of states and inputs on which a certificate is wanted."""
 
+import numbers
 from collections.abc import Mapping
 from typing import TypeAlias, final
 
@@ -99,7 +100,14 @@ class Domain:
 
 
 def _interval(name: str, bound: Bound) -> tuple[float, float]:
-    low, high = (-bound, bound) if isinstance(bound, (int, float)) else tuple(bound)
+    pair = (-bound, bound) if isinstance(bound, (int, float)) else bound
+    ends = np.asarray(pair, object)
+    if ends.shape != (2,) or not all(isinstance(end, numbers.Real) for end in ends):
+        raise GainError(
+            f"the domain of `{name}` is {bound}, and must be a half-width or a pair "
+            "`[lower, upper]`."
+        )
+    low, high = map(float, ends)
     if not (np.isfinite([low, high]).all() and low < high):
         raise GainError(
             f"the domain of `{name}` is [{low:g}, {high:g}], and must be finite with its lower end "

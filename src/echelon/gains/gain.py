@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.certificate import Certificate, RegionCertificate, certify
-from echelon.core.errors import GainError
+from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
@@ -139,7 +139,7 @@ class Method(eqx.Module):
             check_coupling(self.coupling)
         # Every method works on the same A and B, of normalized inputs: entries of like size.
         linear = linearize(model)
-        P, R, rho, region, inner = self.feedback(model, linear)
+        P, R, rho, region, inner = self._found(model, linear)
         # Before the certificate, which solves with R, and takes eigenvalues of what P makes.
         check_definite("P", P)
         check_definite("R", R)
@@ -147,11 +147,49 @@ class Method(eqx.Module):
         edge = None if rho is None else rho / (2.0 * spectrum.low)
         # A coupling of zero was refused above, and an edge of zero means that any coupling does.
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
+        _check_strength(coupling * spectrum.high, linear, P, R)
         promised = None if region is None else region(coupling, spectrum)
         # The consensus law acts on what the inner loop leaves: c scales no part of that loop.
         closed = linear.with_inner(inner)
         certificate = certify(closed, spectrum, P, R, coupling, edge, promised)
         return Gain(P, R, coupling, self.name, certificate, inner)
+
+    def _found(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return what the method finds, after checking that it is what a method returns."""
+        found, name = self.feedback(model, linear), type(self).__name__
+        if not isinstance(found, Feedback):
+            raise GainError(
+                f"`feedback` of `{name}` returns a `{type(found).__name__}`, and must return a "
+                "`Feedback`."
+            )
+        n, m = linear.B.shape
+        for what, shape in (("P", (n, n)), ("R", (m, m)), ("inner", (m, n))):
+            matrix = getattr(found, what)
+            if np.shape(matrix) != shape and not (matrix is None and what == "inner"):
+                raise GainError(
+                    f"`{what}` that `feedback` of `{name}` returns has shape {np.shape(matrix)}, "
+                    f"and must have shape {shape}."
+                )
+        if found.rho is not None and not 0.0 <= found.rho < np.inf:
+            raise GainError(
+                f"`rho` that `feedback` of `{name}` returns is {found.rho}, and must be finite "
+                "and not negative."
+            )
+        return found
+
+
+def _check_strength(strength: float, linear: Linearization, P: Array, R: Array) -> None:
+    """Check that the fastest mode of the closed loop is a number that can be computed with."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        fed_back = strength * (linear.B @ np.linalg.solve(R, linear.B.T @ P))
+        # Eigenvalues and norms square it.
+        known = np.isfinite(fed_back**2).all()
+    if not known:
+        raise GainError(
+            f"the feedback is too strong to compute with: the coupling times the graph's largest "
+            f"eigenvalue is {strength:.3g}, P goes up to {np.abs(P).max():.3g}; make `coupling`, "
+            "the edges' weights or P smaller."
+        )
 
 
 def check_coupling(coupling: float) -> None:
@@ -179,6 +217,7 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
     if not method.name:
         raise GainError(f"`{type(method).__name__}` has no `name`, and every gain method must.")
     # JAX would differentiate in float32, which no test of stabilizability at 1e-9 survives.
+    check_kind("graph", graph, Graph, GraphError)
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph.spectrum())

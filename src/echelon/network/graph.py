@@ -189,13 +189,25 @@ class Graph:
         """Return the eigenvalues of the grounded Laplacian; computed once.
 
         All of them up to 400 followers, beyond that the smallest and the largest.
+
+        Raises:
+            GraphError: the weights are too far apart for the smallest to be known.
         """
         if self._spectrum is None:
             L, count = self.grounded_laplacian(), len(self.followers)
             eigenvalues = np.linalg.eigvalsh(L.toarray()) if count <= _DENSE else _extremes(L)
+            self._check_spectrum(eigenvalues)
             eigenvalues.setflags(write=False)
             self._spectrum = Spectrum(eigenvalues, count)
         return self._spectrum
+
+    def _check_spectrum(self, eigenvalues: Array) -> None:
+        """Check that rounding has left the smallest eigenvalue, which is positive."""
+        if not (eigenvalues.min() > 0.0 and eigenvalues.max() < np.inf):
+            raise GraphError(
+                "the smallest eigenvalue of the graph is lost in rounding: its weights go from "
+                f"{self.weights.min():.3g} to {self.weights.max():.3g}; bring them closer together."
+            )
 
     def parent_spectrum(self) -> Spectrum:
         """Return the eigenvalues where each agent of a tree is sent its parent's input.

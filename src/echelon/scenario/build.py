@@ -80,6 +80,7 @@ def build(scenario: Scenario) -> Built:
     Raises:
         ScenarioError: one line for each part that cannot be made, with its place in the file.
     """
+    _check_scenario(scenario)
     faults = _Faults(scenario)
     with precision("float64"):
         model = graph = None
@@ -94,6 +95,13 @@ def build(scenario: Scenario) -> Built:
         faults.settle()
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
+        )
+
+
+def _check_scenario(scenario: object) -> None:
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError(
+            f"`scenario` is {scenario!r}, and must be a `Scenario`, as `load_scenario` returns it."
         )
 
 
@@ -138,6 +146,7 @@ def run(scenario: Scenario, progress: Progress | None = None, built: Built | Non
     Raises:
         ScenarioError: a part cannot be made.
     """
+    _check_scenario(scenario)
     result = simulate(*(build(scenario) if built is None else built), progress)
     told = {f"version_{name}": text for name, text in versions().items()}
     return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
