@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map
 from runs import simulate
 
+from echelon.certificates.domain import Domain
 from echelon.core import numerics
-from echelon.core.errors import LawError
-from echelon.gains import FixedGain, Riccati
+from echelon.core.errors import EchelonError, LawError
+from echelon.gains import FixedGain, InnerLoop, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Law, LocalView, Tracking, TrimInput
 from echelon.models import (
@@ -21,11 +22,13 @@ from echelon.models import (
     PlanarQuadrotor,
     Quadrotor,
     SingleIntegrator,
+    Unicycle,
     UnicyclePoint,
 )
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Lemniscate, Line
+from echelon.results.lyapunov import lyapunov
 
 LINE = Graph.path(4)
 QUAD = Quadrotor()
@@ -281,6 +284,52 @@ def test_the_corollary_s_sign_is_wrong_the_error_that_vanishes_is_e_plus_d():
     assert np.abs(d).max() == 1.0
     assert e + d == pytest.approx(np.zeros((3, 2)), abs=1e-9)
     assert d - e == pytest.approx(2.0 * d, abs=1e-9)
+
+
+# ---- angles ----
+
+TURNED = [
+    (Unicycle(), FixedGain(), 2),
+    (UnicyclePoint(ahead=0.4), FixedGain(), 2),
+    (QUAD, InnerLoop(), 8),
+]
+
+
+@pytest.mark.parametrize(("model", "method", "angle"), TURNED, ids=lambda m: type(m).__name__)
+def test_an_agent_that_begins_a_whole_turn_off_moves_as_one_that_does_not(model, method, angle):
+    graph, n = Graph.path(2), len(model.state_names)
+    gain = synthesize(model, graph, method)
+    runs = []
+    for turns in (0.0, 1.0):
+        start = np.zeros((2, n))
+        start[1, :2], start[1, angle] = (0.2, -0.1), 0.3 + 2.0 * np.pi * turns
+        runs.append(
+            simulate(
+                model,
+                graph,
+                Formation(np.zeros((2, n))),
+                leader=TrimInput(),
+                follower=Consensus(gain),
+                initial=start,
+                horizon=1.0,
+                dt=0.01,
+            )
+        )
+    plain, turned = runs
+    away = turned.states - plain.states
+    away[:, 1, angle] -= 2.0 * np.pi
+    assert np.abs(away).max() < 1e-9
+    assert lyapunov(turned).value == pytest.approx(lyapunov(plain).value, abs=1e-9)
+
+
+def test_a_domain_of_half_a_turn_is_refused_where_differences_wind():
+    with pytest.raises(EchelonError) as caught:
+        Domain.about(QUAD, {"yaw": 1.6})
+    assert str(caught.value) == (
+        "the domain of `yaw` is 3.2 wide, and `Quadrotor` takes differences of it the shorter way "
+        "round; allowed is less than half a turn in all."
+    )
+    Domain.about(QUAD, {"yaw": 1.5, "attitude": 0.5})
 
 
 # ---- a law of one's own ----

@@ -4,9 +4,11 @@ import numbers
 from collections.abc import Mapping
 from typing import TypeAlias, final
 
+import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import GainError, did_you_mean, listing
+from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 
@@ -56,6 +58,7 @@ class Domain:
                 lower[name], upper[name] = low, high
         state = np.array([model.per_state(lower, -np.inf), model.per_state(upper, np.inf)])
         _check_chart(model, state)
+        _check_turns(model, state)
         return cls(*state, *inputs)
 
     def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Array, Array]:
@@ -126,6 +129,20 @@ def _check_name(model: ControlAffine, name: str) -> None:
         raise GainError(
             f"the domain names `{name}`, and `{type(model).__name__}` has {listing(allowed)}"
             f"{did_you_mean(name, allowed)}."
+        )
+
+
+def _check_turns(model: ControlAffine, state: Array) -> None:
+    """Check that two agents in the domain differ by what laws take for their difference."""
+    ends = np.asarray(model.trim[0], float) + np.where(np.isfinite(state).all(0), state, 0.0)
+    with precision("float64"):
+        taken = np.asarray(model.difference(*map(jnp.asarray, ends[::-1])))
+    wide = ends[1] - ends[0]
+    for k in np.flatnonzero(np.abs(taken - wide) > 1e-9 * (1.0 + np.abs(wide))):
+        raise GainError(
+            f"the domain of `{model.state_names[k]}` is {wide[k]:.4g} wide, and "
+            f"`{type(model).__name__}` takes differences of it the shorter way round; allowed is "
+            "less than half a turn in all."
         )
 
 

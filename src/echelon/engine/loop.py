@@ -135,7 +135,7 @@ def control(loop: Loop, now: Moment) -> Control:
     x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
     y = x - offsets
     # What was sent is what is: this network neither delays nor loses.
-    z = loop.exchange(y, y)
+    z = loop.exchange(y, y, jax.vmap(loop.model.difference))
     # From the step number, since a sum of many dt would gather rounding.
     t = now.step.astype(x.dtype) * loop.motion.dt
 

@@ -73,7 +73,9 @@ class Gain(eqx.Module):
         if self.inner is None:
             return jnp.zeros(len(model.input_names), x.dtype)
         # About the trim, where the loop gives nothing: the trim input stays the law's to add.
-        return -jnp.asarray(self.inner, x.dtype) @ (x - jnp.asarray(model.trim[0], x.dtype))
+        return -jnp.asarray(self.inner, x.dtype) @ model.difference(
+            x, jnp.asarray(model.trim[0], x.dtype)
+        )
 
 
 class Feedback(NamedTuple):

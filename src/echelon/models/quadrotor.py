@@ -14,7 +14,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, Limits, Rows, check_positive, diagonal
+from echelon.models.model import ControlAffine, Limits, Rows, check_positive, diagonal, wound
 from echelon.models.rigid_body import (
     body_rates,
     check_inertia,
@@ -177,6 +177,10 @@ class Quadrotor(ControlAffine):
     def output(self, x: State) -> Output:
         """Return position and yaw."""
         return jnp.concatenate([x[:3], x[8:9]])
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y with the angles the shorter way round."""
+        return wound(x - y, 6, 7, 8)
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).
