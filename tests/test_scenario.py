@@ -134,6 +134,7 @@ def test_defaults():
                 "rate": None,
                 "exact": None,
                 "symmetry_weight": None,
+                "python": None,
                 "file": None,
             },
             "feedforward": "relay",

@@ -50,6 +50,12 @@ def OneOf(names: Iterable[str]) -> Allowed:
     return Allowed(are(listed), listed, core_schema.literal_schema(listed))
 
 
+def OwnOr(names: Iterable[str]) -> Allowed:
+    """Mark what is a name of a registry table or a class of the user's own."""
+    listed = list(names)
+    return Allowed(f"{are(listed)}, or `python: file.py:Class`", listed)
+
+
 def _weighted(edge: object) -> object:
     """Return an edge with its weight, 1 unless it is given."""
     if not isinstance(edge, list) or len(edge) not in (2, 3):

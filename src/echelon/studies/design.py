@@ -136,7 +136,7 @@ def _built(scenario: Scenario) -> Built:
         faults: tuple[Fault, ...] = getattr(error, "faults", ())
         own = scenario.follower.gain
         # A file that is not there was meant to be, while a method that fails has its row.
-        if own.file is not None or {fault.field for fault in faults} != {"follower.gain"}:
+        if own.file or own.python or {fault.field for fault in faults} != {"follower.gain"}:
             raise
     follower = scenario.follower.model_copy(update={"gain": GainSpec(method="given", P="identity")})
     return build(scenario.model_copy(update={"follower": follower}))
@@ -255,7 +255,8 @@ def _advice(gain: Gain, parts: Parts) -> str:
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
     """Return what the scenario says of this method, and its domain for those that need one."""
-    if spec is not None and spec.method == method.name and spec.file is None:
+    made = spec is not None and spec.file is None and spec.python is None
+    if spec is not None and made and spec.method == method.name:
         return {**method.usual, **spec.arguments}
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region
