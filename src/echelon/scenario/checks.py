@@ -19,7 +19,7 @@ _TRACKS = ("tracking", "optimal-tracking")
 """The leader laws that follow a reference."""
 
 # Of these two keys a section has one at most; True where it must have one.
-_SOURCES: dict[str, tuple[str, str, bool]] = {
+SOURCES: dict[str, tuple[str, str, bool]] = {
     "model": ("name", "python", True),
     "graph": ("edges", "name", True),
     "formation": ("offsets", "name", False),
@@ -74,7 +74,7 @@ def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
 
 
 def _sources(data: Part) -> Iterator[Finding]:
-    for name, (one, other, required) in _SOURCES.items():
+    for name, (one, other, required) in SOURCES.items():
         part = data.get(name)
         if not isinstance(part, dict):
             continue

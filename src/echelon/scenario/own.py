@@ -28,7 +28,8 @@ def own_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
     file = (folder / path).resolve()
     if not file.is_file():
         raise ScenarioError(
-            f"the file `{file}` does not exist; a `python` path is relative to the scenario file."
+            f"the file `{file}` does not exist; a `python` path is relative to the scenario file, "
+            "and on the command line to the working folder."
         )
     module = _imported(file)
     classes = {key: value for key, value in vars(module).items() if _is_own(value, kind)}
