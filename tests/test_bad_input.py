@@ -300,8 +300,9 @@ MODELS = {
     ),
     "unknown parameters": (
         lambda: Quadrotor.named("crazyfly"),
-        "parameters `crazyfly` are unknown for `Quadrotor`, allowed are `crazyflie`, `paper` (did "
-        "you mean `crazyflie`?).",
+        "parameters `crazyfly` are unknown for `Quadrotor`, allowed are `crazyflie`, "
+        "`crazyflie-2.1+`, `crazyflie-legacy`, `crazyflie-thrust-kit`, `paper` (did you mean "
+        "`crazyflie`?).",
     ),
     "no dimension": (
         lambda: SingleIntegrator(0),

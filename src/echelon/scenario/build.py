@@ -174,6 +174,16 @@ def _offered(make: Callable[..., Any], offers: Mapping[str, Any]) -> dict[str, A
 def _checked(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the given parameters, after checking that `make` takes each and has all it needs."""
     allowed = inspect.signature(make).parameters
+    _known(make, what, given)
+    for name, parameter in allowed.items():
+        if parameter.default is inspect.Parameter.empty and name not in given:
+            raise ScenarioError(f"`{what}` needs the parameter `{name}`, which is missing.")
+    return dict(given)
+
+
+def _known(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the given parameters, after checking that `make` takes each."""
+    allowed = inspect.signature(make).parameters
     for name in given:
         if name not in allowed:
             verb = "is" if len(allowed) == 1 else "are"
@@ -181,10 +191,7 @@ def _checked(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> d
             raise ScenarioError(
                 f"got the parameter `{name}` of `{what}`, {taken}{did_you_mean(name, allowed)}."
             )
-    for name, parameter in allowed.items():
-        if parameter.default is inspect.Parameter.empty and name not in given:
-            raise ScenarioError(f"`{what}` needs the parameter `{name}`, which is missing.")
-    return dict(given)
+    return given
 
 
 class _Part(NamedTuple):
@@ -236,19 +243,22 @@ def _model(scenario: Scenario) -> ControlAffine:
         raise ModelError(
             f"`allow_unphysical` has no meaning for `{part.what}`, which has no such parameter."
         )
-    if isinstance(spec.parameters, str):
-        return _named_set(part, spec.parameters, extra)
-    return part._replace(given={**(spec.parameters or {}), **extra}).made()
+    given = spec.parameters or {}
+    given = {"set": given} if isinstance(given, str) else dict(given)
+    if "set" in given and "set" not in _accepted(part.cls):
+        return _named_set(part, given.pop("set"), {**given, **extra})
+    return part._replace(given={**given, **extra}).made()
 
 
-def _named_set(part: _Part, name: str, changes: Mapping[str, Any]) -> ControlAffine:
+def _named_set(part: _Part, name: object, changes: Mapping[str, Any]) -> ControlAffine:
     """Return a model with a named set of parameters, some of them changed."""
     named = getattr(part.cls, "named", None)
     if named is None:
         raise ModelError(
             f"`{part.what}` has no named parameter sets, and got `{name}`; give a mapping."
         )
-    return named(name, **_checked(part.cls, part.what, changes))
+    with own_code(f"`{part.what}` cannot be made with these parameters"):
+        return named(name, **_known(part.cls, part.what, changes))
 
 
 def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:

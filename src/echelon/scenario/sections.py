@@ -46,7 +46,8 @@ class ModelSpec(BaseModel, **_either("name", "python")):
     python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
     parameters: Parameters = None
-    """Name of a set of parameters, or the parameters, in the model's units."""
+    """Name of a set of parameters, or the parameters, in the model's units; with the key `set` they
+    change those of a named set."""
     allow_unphysical: bool = False
     """Accept parameters that no body can have."""
 
