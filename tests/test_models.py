@@ -537,10 +537,9 @@ def test_the_crazyflies_of_today_carry_the_firmware_s_numbers(name, grams, newto
     assert model.inertia == Quadrotor.crazyflie().inertia
     with numerics.precision("float64"):
         assert check_model(model) == ()  # hovering is within reach
-        # Full yaw at hover: the motors of one turning sense take what the others give up.
+        # Full yaw: the collective gives way, so two motors give all and two give nothing.
         most = np.asarray(model.limit(jnp.asarray([model.mass * 9.81, 0.0, 0.0, 1.0])))[3]
-    room = min(model.mass * 9.81 / 4, newtons - model.mass * 9.81 / 4)
-    assert most == pytest.approx(4.0 * metres * room)
+    assert most == pytest.approx(2.0 * metres * newtons)
 
 
 def test_a_named_quadrotor_takes_changes():
