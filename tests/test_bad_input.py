@@ -465,6 +465,14 @@ GAINS = {
         "eigenvalue is 1e+308, P goes up to 1.73; make `coupling`, the edges' weights or P "
         "smaller.",
     ),
+    "a weight beyond numbers": (
+        lambda: synthesize(CART, PAIR, Riccati(Q=[1.0, 1e155])),
+        "`Q` goes up to 1e+155, and must stay below 1e+75.",
+    ),
+    "a P beyond numbers": (
+        lambda: gain_of(CART, P=[1.0, 1e155]),
+        "`P` goes up to 1e+155, and must stay below 1e+75.",
+    ),
     "weights of other states": (
         lambda: synthesize(DoubleIntegrator(2), PAIR, InnerLoop(symmetry_weight=(1, 2, 3))),
         "`symmetry_weight` is (1, 2, 3), and must be one positive number, or 2, one for each "

@@ -76,7 +76,7 @@ def _shortens(equation: Any) -> bool:
 
 def _bits(value: Any) -> bytes:
     # Keys of random numbers are no numbers of NumPy's.
-    if jax.dtypes.issubdtype(getattr(value, "dtype", None), jax.dtypes.extended):
+    if jax.numpy.issubdtype(getattr(value, "dtype", np.dtype(float)), jax.dtypes.extended):
         value = jax.random.key_data(value)
     array: Array = np.asarray(value)
     return array.tobytes()

@@ -57,7 +57,7 @@ class Settings(NamedTuple):
         """
         for name in ("horizon", "dt"):
             value = getattr(self, name)
-            if not (isinstance(value, numbers.Real) and 0.0 < value < math.inf):
+            if not (isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf):
                 raise SimulationError(
                     f"`{name}` is {value}, and must be a positive finite number of seconds."
                 )

@@ -149,7 +149,7 @@ class Method(eqx.Module):
         edge = None if rho is None else rho / (2.0 * spectrum.low)
         # A coupling of zero was refused above, and an edge of zero means that any coupling does.
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
-        _check_strength(coupling * spectrum.high, linear, P, R)
+        check_strength(coupling * spectrum.high, linear, P, R)
         promised = None if region is None else region(coupling, spectrum)
         # The consensus law acts on what the inner loop leaves: c scales no part of that loop.
         closed = linear.with_inner(inner)
@@ -167,9 +167,11 @@ class Method(eqx.Module):
         n, m = linear.B.shape
         for what, shape in (("P", (n, n)), ("R", (m, m)), ("inner", (m, n))):
             matrix = getattr(found, what)
-            if np.shape(matrix) != shape and not (matrix is None and what == "inner"):
+            if what == "inner" and matrix is None:
+                continue
+            if (got := np.shape(matrix)) != shape:  # type: ignore[arg-type]
                 raise GainError(
-                    f"`{what}` that `feedback` of `{name}` returns has shape {np.shape(matrix)}, "
+                    f"`{what}` that `feedback` of `{name}` returns has shape {got}, "
                     f"and must have shape {shape}."
                 )
         if found.rho is not None and not 0.0 <= found.rho < np.inf:
@@ -180,12 +182,16 @@ class Method(eqx.Module):
         return found
 
 
-def _check_strength(strength: float, linear: Linearization, P: Array, R: Array) -> None:
-    """Check that the fastest mode of the closed loop is a number that can be computed with."""
+def check_strength(strength: float, linear: Linearization, P: Array, R: Array) -> None:
+    """Check that what is fed back at a strength c lambda can be computed with.
+
+    Raises:
+        GainError: it cannot.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         fed_back = strength * (linear.B @ np.linalg.solve(R, linear.B.T @ P))
-        # Eigenvalues and norms square it.
-        known = np.isfinite(fed_back**2).all()
+        # Norms square P B R^-1 B'P.
+        known = np.isfinite((P @ fed_back) ** 2).all()
     if not known:
         raise GainError(
             f"the feedback is too strong to compute with: the coupling times the graph's largest "

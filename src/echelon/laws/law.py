@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from echelon.core.errors import LawError
@@ -44,7 +45,7 @@ class LocalView(eqx.Module):
     def __check_init__(self) -> None:
         """Refuse to lose digits without a word."""
         # Verbs choose a precision, and trace. Who calls a law by hand has none that was chosen.
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(self))
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self))
         if not traced and jnp.result_type(float) != np.float64:
             raise LawError(
                 "a `LocalView` is made where JAX computes in float32, and a law would return 7 "

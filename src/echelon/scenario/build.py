@@ -133,11 +133,16 @@ def _with_laws(
         graph,
         cast(Formation, formation),
         Laws(cast(Law, leader), cast(Law, follower)),
-        initial={**(scenario.initial.spread or {}), **(scenario.initial.states or {})},
+        initial=_initial(scenario),
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
     return Built(parts, _settings(scenario))
+
+
+def _initial(scenario: Scenario) -> Any:
+    """Return spreads by state or group, and states by agent, in one mapping."""
+    return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
 
 
 def run(scenario: Scenario, progress: Progress | None = None, built: Built | None = None) -> Result:
