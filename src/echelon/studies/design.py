@@ -1,11 +1,13 @@
 """All gain methods on one scenario, side by side, and one of them recommended."""
 
 import time
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from echelon.certificates import margins
+from echelon.certificates.domain import Domain
 from echelon.core.errors import (
     EchelonError,
     GainError,
@@ -19,6 +21,7 @@ from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain, Method, synthesize
 from echelon.laws.consensus import Consensus
+from echelon.models.model import ControlAffine
 from echelon.promises.promise import Promise, promise
 from echelon.promises.statement import Hypothesis
 from echelon.scenario import registry
@@ -128,6 +131,10 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     return Designs(tried, best, why, built.settings)
 
 
+_ALWAYS = GainSpec(method="given", P="identity")
+"""A gain that there is for every model."""
+
+
 def _built(scenario: Scenario) -> Built:
     """Build a scenario; where its own gain alone cannot be made, with one that always can."""
     try:
@@ -138,8 +145,20 @@ def _built(scenario: Scenario) -> Built:
         # A file that is not there was meant to be, while a method that fails has its row.
         if own.file or own.python or {fault.field for fault in faults} != {"follower.gain"}:
             raise
-    follower = scenario.follower.model_copy(update={"gain": GainSpec(method="given", P="identity")})
-    return build(scenario.model_copy(update={"follower": follower}))
+        follower = scenario.follower.model_copy(update={"gain": _ALWAYS})
+        built = build(scenario.model_copy(update={"follower": follower}))
+        # A domain that is none is a mistake, and not what a method fails at.
+        if own.domain is not None and not _is_domain(built.parts.model, own.domain):
+            raise
+        return built
+
+
+def _is_domain(model: ControlAffine, bounds: Mapping[str, Any]) -> bool:
+    try:
+        Domain.about(model, bounds)
+    except GainError:
+        return False
+    return True
 
 
 def _chooses(method: type[Method]) -> bool:
