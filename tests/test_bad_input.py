@@ -209,8 +209,8 @@ GRAPHS = {
     ),
     "weights that rounding cannot tell apart": (
         lambda: Graph.from_edges([(0, 1, 1e-300), (1, 2)]).spectrum(),
-        "the smallest eigenvalue of the graph is lost in rounding: its weights go from 1e-300 to "
-        "1; bring them closer together.",
+        "the weights of the graph lie between 1e-300 and 1, too far apart to tell its smallest "
+        "eigenvalue from 0; bring them nearer to each other.",
     ),
     "edges for a graph": (
         lambda: synthesize(CART, [(0, 1)], Riccati()),
