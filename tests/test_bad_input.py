@@ -1,5 +1,8 @@
 """Bad input from Python: each fault has its sentence, and none passes or fails in another way."""
 
+from typing import Any
+
+import jax.numpy as jnp
 import networkx as nx
 import numpy as np
 import pytest
@@ -13,9 +16,10 @@ from echelon.core.errors import (
     LawError,
     ModelError,
     ReferenceError,
+    ScenarioError,
     SimulationError,
 )
-from echelon.gains import FixedGain, Riccati
+from echelon.gains import Feedback, FixedGain, InnerLoop, Method, Riccati, RobustLQR
 from echelon.gains.gain import synthesize
 from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.models import (
@@ -32,7 +36,18 @@ from echelon.models import (
 )
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
-from echelon.references import Circle, FigureEight, Hover, Lemniscate, Line, Waypoints
+from echelon.references import (
+    Circle,
+    FigureEight,
+    Hover,
+    Lemniscate,
+    Line,
+    Reference,
+    Waypoints,
+)
+from echelon.scenario.build import build
+from echelon.scenario.build import run as run_scenario
+from echelon.world.disturbance import Disturbance
 
 NAN, INF = float("nan"), float("inf")
 QUAD, CART, ONE = Quadrotor(), DoubleIntegrator(1), SingleIntegrator(1)
@@ -54,6 +69,39 @@ def run(model=ONE, graph=PAIR, **options):
 
 def gain_of(model, graph=PAIR, **options):
     return synthesize(model, graph, FixedGain(**options))
+
+
+class Own(Method):
+    """A gain method that returns what it is told."""
+
+    found: Any
+    name = "own"
+
+    def feedback(self, model, linear):
+        return self.found
+
+
+class Flat(Reference):
+    """A reference in the plane alone."""
+
+    def __call__(self, t):
+        return jnp.stack([t, t])
+
+
+class HalfFlat(SingleIntegrator):
+    """An agent whose flatness map forgets the input."""
+
+    dimension: int = 1
+
+    def flat(self, derivatives):
+        return derivatives[0]
+
+
+class LongFlat(HalfFlat):
+    """An agent whose flatness map is another agent's."""
+
+    def flat(self, derivatives):
+        return jnp.zeros(2), derivatives[1]
 
 
 # What is done -> the kind of error, and the whole sentence.
@@ -151,6 +199,23 @@ GRAPHS = {
         lambda: Graph.geometric(3, 1e-6),
         "the graph is disconnected: agents 1, 2 have no path to a leader (leader 0).",
     ),
+    "a leader that is no list": (
+        lambda: Graph.ring(4, leaders=0),
+        "`leaders` is 0, and must be a list of agents, such as [0].",
+    ),
+    "leaders by name": (
+        lambda: Graph.ring(4, leaders="0"),
+        "`leaders` is '0', and must be a list of agents, such as [0].",
+    ),
+    "weights that rounding cannot tell apart": (
+        lambda: Graph.from_edges([(0, 1, 1e-300), (1, 2)]).spectrum(),
+        "the weights of the graph lie between 1e-300 and 1, too far apart to tell its smallest "
+        "eigenvalue from 0; bring them nearer to each other.",
+    ),
+    "edges for a graph": (
+        lambda: synthesize(CART, [(0, 1)], Riccati()),
+        "`graph` is a `list`, and must be a `Graph`.",
+    ),
     "directed networkx graph": (
         lambda: Graph.from_networkx(nx.DiGraph([(0, 1)])),
         "the networkx graph is directed, and must be undirected.",
@@ -173,6 +238,11 @@ FORMATIONS = {
     "wrong length without a position": (
         lambda: Formation.from_offsets(VanDerPol(), PATH, {1: (1, 0, 0)}),
         "the offset of agent 1 has 3 numbers, and must have 2 (all states).",
+    ),
+    "a list of offsets": (
+        lambda: Formation.from_offsets(QUAD, PATH, [[0, 0]]),
+        "the offsets are a `list`, and must be a mapping from agents to offsets, such as "
+        "{1: (1.0, 0.0)}; a whole matrix is `Formation(offsets)`.",
     ),
     "NaN in an offset": (
         lambda: Formation.from_offsets(QUAD, PATH, {1: (1, NAN, 0)}),
@@ -230,8 +300,9 @@ MODELS = {
     ),
     "unknown parameters": (
         lambda: Quadrotor.named("crazyfly"),
-        "parameters `crazyfly` are unknown for `Quadrotor`, allowed are `crazyflie`, `paper` (did "
-        "you mean `crazyflie`?).",
+        "parameters `crazyfly` are unknown for `Quadrotor`, allowed are `crazyflie`, "
+        "`crazyflie-2.1+`, `crazyflie-legacy`, `crazyflie-thrust-kit`, `paper` (did you mean "
+        "`crazyflie`?).",
     ),
     "no dimension": (
         lambda: SingleIntegrator(0),
@@ -301,6 +372,38 @@ REFERENCES = {
         lambda: Hover(position=(0.0, NAN, 1.0)),
         "`position` of `Hover` is (0.0, nan, 1.0), and must be 3 finite numbers.",
     ),
+    "a radius of text": (
+        lambda: Circle(radius="1"),
+        "`radius` of `Circle` is 1, and must be a finite number.",
+    ),
+    "a yaw that is true": (
+        lambda: Hover(yaw=True),
+        "`yaw` of `Hover` is True, and must be a finite number.",
+    ),
+    "a radius of more digits than NumPy has": (
+        lambda: Circle(radius=10**23),
+        "`radius` of `Circle` is 100000000000000000000000, and must be a finite number.",
+    ),
+    "times of words": (
+        lambda: Waypoints(["0", "1"], [[0, 0, 0]] * 2),
+        "`times` of `Waypoints` is ['0', '1'], and must be at least 2 increasing times.",
+    ),
+    "points of different lengths": (
+        lambda: Waypoints([0.0, 1.0], [[0, 0, 0], [1, 1]]),
+        "`points` of `Waypoints` is [[0, 0, 0], [1, 1]], and must be 2 finite points (x, y, z).",
+    ),
+    "a function for a reference": (
+        lambda: Tracking(lambda t: t),
+        "`reference` is a `function`, and must be a `Reference`.",
+    ),
+    "nothing for a reference": (
+        lambda: Tracking(None),
+        "`reference` is a `NoneType`, and must be a `Reference`.",
+    ),
+    "a reference of two coordinates": (
+        lambda: run(leader=Tracking(Flat())),
+        "the point of `Flat` has shape (2,), and must have shape (4,).",
+    ),
     "times that stand": (
         lambda: Waypoints([0.0, 1.0, 1.0], [[0, 0, 0]] * 3),
         "`times` of `Waypoints` is [0.0, 1.0, 1.0], and must be at least 2 increasing times.",
@@ -339,6 +442,50 @@ GAINS = {
     "P by a wrong name": (
         lambda: gain_of(CART, P="identiy"),
         "`P` is `identiy`, and must be a matrix, a diagonal or `identity`.",
+    ),
+    "a method without a result": (
+        lambda: synthesize(CART, PAIR, Own(None)),
+        "`feedback` of `Own` returns a `NoneType`, and must return a `Feedback`.",
+    ),
+    "a method that returns a matrix": (
+        lambda: synthesize(CART, PAIR, Own(np.eye(2))),
+        "`feedback` of `Own` returns a `ndarray`, and must return a `Feedback`.",
+    ),
+    "a method with a P of another size": (
+        lambda: synthesize(CART, PAIR, Own(Feedback(np.eye(3), np.eye(1), 1.0))),
+        "`P` that `feedback` of `Own` returns has shape (3, 3), and must have shape (2, 2).",
+    ),
+    "a method with a negative strength": (
+        lambda: synthesize(CART, PAIR, Own(Feedback(np.eye(2), np.eye(1), -1.0))),
+        "`rho` that `feedback` of `Own` returns is -1.0, and must be finite and not negative.",
+    ),
+    "a coupling beyond numbers": (
+        lambda: synthesize(CART, PAIR, Riccati(coupling=1e308)),
+        "the feedback is too strong to compute with: the coupling times the graph's largest "
+        "eigenvalue is 1e+308, P goes up to 1.73; make `coupling`, the edges' weights or P "
+        "smaller.",
+    ),
+    "a weight beyond numbers": (
+        lambda: synthesize(CART, PAIR, Riccati(Q=[1.0, 1e155])),
+        "`Q` goes up to 1e+155, and must stay below 1e+75.",
+    ),
+    "a P beyond numbers": (
+        lambda: gain_of(CART, P=[1.0, 1e155]),
+        "`P` goes up to 1e+155, and must stay below 1e+75.",
+    ),
+    "weights of other states": (
+        lambda: synthesize(DoubleIntegrator(2), PAIR, InnerLoop(symmetry_weight=(1, 2, 3))),
+        "`symmetry_weight` is (1, 2, 3), and must be one positive number, or 2, one for each "
+        "symmetric state.",
+    ),
+    "a domain of three numbers": (
+        lambda: synthesize(CART, PAIR, RobustLQR(domain={"position": (0, 1, 2)})),
+        "the domain of `position` is (0, 1, 2), and must be a half-width or a pair "
+        "`[lower, upper]`.",
+    ),
+    "a domain of words": (
+        lambda: synthesize(CART, PAIR, RobustLQR(domain={"position": "wide"})),
+        "the domain of `position` is wide, and must be a half-width or a pair `[lower, upper]`.",
     ),
     "negative R": (
         lambda: gain_of(CART, R=[-1.0]),
@@ -409,6 +556,14 @@ LAWS = {
         "the law `agreement` is made for `SingleIntegrator`, and the model is "
         "`DoubleIntegrator`; use `consensus`.",
     ),
+    "a flat map that returns a state alone": (
+        lambda: run(HalfFlat(), leader=Tracking(Hover())),
+        "`flat` of `HalfFlat` must return two things, a state and an input.",
+    ),
+    "a flat map of another state": (
+        lambda: run(LongFlat(), leader=Tracking(Hover())),
+        "the state that `flat` of `LongFlat` makes has shape (2,), and must have shape (1,).",
+    ),
     "tracking without a flat map": (
         lambda: run(Pendulum(), leader=Tracking(Hover())),
         "the law `tracking` cannot lead `Pendulum`, which defines no `flat` map; use `passive`, "
@@ -428,6 +583,14 @@ SIMULATIONS = {
     "NaN step": (
         lambda: run(dt=NAN),
         "`dt` is nan, and must be a positive finite number of seconds.",
+    ),
+    "a horizon of text": (
+        lambda: run(horizon="1"),
+        "`horizon` is 1, and must be a positive finite number of seconds.",
+    ),
+    "limits by word": (
+        lambda: run(limits="no"),
+        "`limits` is 'no', and must be True or False.",
     ),
     "infinite horizon": (
         lambda: run(horizon=INF),
@@ -580,3 +743,18 @@ def test_nothing_is_lost_by_a_refusal():
     start[1] = 1.0
     again = run(graph=graph, initial=start)
     assert again.states[-1].tolist() == [[0.0], [1.0]]
+
+
+def test_a_disturbance_that_outlasts_every_run_is_one_draw():
+    winds = [Disturbance(rms={"x": 1.0}, hold=hold) for hold in (1.0, 1e308)]
+    short, long = (run(horizon=0.5, disturbance=wind) for wind in winds)
+    assert np.array_equal(short.states, long.states)
+
+
+@pytest.mark.parametrize("verb", [build, run_scenario])
+def test_a_name_is_no_scenario(verb):
+    with pytest.raises(ScenarioError) as caught:
+        verb("paper")
+    assert str(caught.value) == (
+        "`scenario` is 'paper', and must be a `Scenario`, as `load_scenario` returns it."
+    )

@@ -53,6 +53,35 @@ def parts_of(scenario):
 # ---- the table ----
 
 
+def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go():
+    rows = {row.method: row for row in ech.design(ech.load_scenario("van-der-pol")).designs}
+    reason = rows["robust-lqr"].reason
+    assert reason == (
+        "give `follower.gain={method: robust-lqr, domain: {position: HALF_WIDTH, ...}}` to try it"
+    )
+    advice = reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
+    gain = ech.load_scenario("van-der-pol", [advice]).follower.gain
+    assert gain.method == "robust-lqr" and gain.domain == {"position": 0.5}
+
+
+def test_a_scenario_whose_own_gain_cannot_be_made_has_the_other_methods_tried():
+    # The Jacobian depends on the velocity too, which the domain does not bound.
+    own = "follower.gain={method: robust-lqr, domain: {position: 0.5}}"
+    scenario = ech.load_scenario("van-der-pol", [own])
+    with pytest.raises(ech.EchelonError, match="unbounded"):
+        ech.build(scenario)
+    found = ech.design(scenario)
+    rows = {row.method: row for row in found.designs}
+    assert rows["robust-lqr"].gain is None and "unbounded" in rows["robust-lqr"].reason
+    assert rows["riccati"].stable and found.recommended is rows["riccati"]
+
+
+def test_a_gain_file_that_is_missing_ends_a_design():
+    scenario = ech.load_scenario("van-der-pol", ["follower.gain={file: nowhere.json}"])
+    with pytest.raises(ech.EchelonError, match=r"nowhere\.json"):
+        ech.design(scenario)
+
+
 def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon):
     code, out, err = echelon("design", "mine.yaml", "--json")
     told = json.loads(out, parse_constant=pytest.fail)

@@ -55,6 +55,7 @@ CASES = {
     "moves": (lambda x: jnp.flip(x).at[0].add(x[0]).reshape(2, 1).T.ravel(), ["13/21", "1/3"]),
     "a sum of nothing": (lambda x: jnp.sum(x[2:])[None], ["0"]),
     "whole numbers": (lambda x: x[jnp.argsort(jnp.array([3, 1]))], ["2/7", "1/3"]),
+    "a matrix of whole numbers": (lambda x: jnp.array([[1, 2], [0, -3]]) @ x, ["19/21", "-6/7"]),
     "a cumulative sum": (lambda x: jnp.cumsum(x), ["1/3", "13/21"]),
 }
 

@@ -1,5 +1,6 @@
 """Control laws: one agent's form is the paper's block form, and Theorem 1 does what it says."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,21 +10,25 @@ from hypothesis import strategies as st
 from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map
 from runs import simulate
 
+from echelon.certificates.domain import Domain
 from echelon.core import numerics
-from echelon.gains import FixedGain, Riccati
+from echelon.core.errors import EchelonError, LawError
+from echelon.gains import FixedGain, InnerLoop, Riccati
 from echelon.gains.gain import synthesize
-from echelon.laws import Agreement, Consensus, LocalView, Tracking, TrimInput
+from echelon.laws import Agreement, Consensus, Law, LocalView, Tracking, TrimInput
 from echelon.models import (
     DoubleIntegrator,
     Linear,
     PlanarQuadrotor,
     Quadrotor,
     SingleIntegrator,
+    Unicycle,
     UnicyclePoint,
 )
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Lemniscate, Line
+from echelon.results.lyapunov import lyapunov
 
 LINE = Graph.path(4)
 QUAD = Quadrotor()
@@ -279,3 +284,198 @@ def test_the_corollary_s_sign_is_wrong_the_error_that_vanishes_is_e_plus_d():
     assert np.abs(d).max() == 1.0
     assert e + d == pytest.approx(np.zeros((3, 2)), abs=1e-9)
     assert d - e == pytest.approx(2.0 * d, abs=1e-9)
+
+
+# ---- angles ----
+
+TURNED = [
+    (Unicycle(), FixedGain(), 2),
+    (UnicyclePoint(ahead=0.4), FixedGain(), 2),
+    (QUAD, InnerLoop(), 8),
+]
+
+
+@pytest.mark.parametrize(("model", "method", "angle"), TURNED, ids=lambda m: type(m).__name__)
+def test_an_agent_that_begins_a_whole_turn_off_moves_as_one_that_does_not(model, method, angle):
+    graph, n = Graph.path(2), len(model.state_names)
+    gain = synthesize(model, graph, method)
+    runs = []
+    for turns in (0.0, 1.0):
+        start = np.zeros((2, n))
+        start[1, :2], start[1, angle] = (0.2, -0.1), 0.3 + 2.0 * np.pi * turns
+        runs.append(
+            simulate(
+                model,
+                graph,
+                Formation(np.zeros((2, n))),
+                leader=TrimInput(),
+                follower=Consensus(gain),
+                initial=start,
+                horizon=1.0,
+                dt=0.01,
+            )
+        )
+    plain, turned = runs
+    away = turned.states - plain.states
+    away[:, 1, angle] -= 2.0 * np.pi
+    assert np.abs(away).max() < 1e-9
+    assert lyapunov(turned).value == pytest.approx(lyapunov(plain).value, abs=1e-9)
+
+
+def test_a_domain_of_half_a_turn_is_refused_where_differences_wind():
+    with pytest.raises(EchelonError) as caught:
+        Domain.about(QUAD, {"yaw": 1.6})
+    assert str(caught.value) == (
+        "the domain of `yaw` is 3.2 wide, and `Quadrotor` takes differences of it the shorter way "
+        "round; allowed is less than half a turn in all."
+    )
+    Domain.about(QUAD, {"yaw": 1.5, "attitude": 0.5})
+
+
+# ---- a law of one's own ----
+
+
+class Sound(Law):
+    """A law that every test below spoils in one way."""
+
+    def update(self, model, view, memory):
+        return -view.disagreement, memory
+
+
+def flown(**changes):
+    """A run of two single integrators under the spoiled law."""
+    law = type("Sound", (Sound,), {"__module__": __name__, "__doc__": "Spoiled.", **changes})()
+    model = SingleIntegrator(1)
+    return simulate(
+        model,
+        Graph.path(2),
+        Formation(np.zeros((2, 1))),
+        leader=TrimInput(),
+        follower=law,
+        horizon=0.2,
+        dt=0.1,
+    )
+
+
+def wanders(self, model, view, memory):
+    return -view.disagreement * np.random.default_rng().uniform(), memory
+
+
+WRITTEN = "; it must be written with `jax.numpy` and take what one agent knows."
+SPOILED = {
+    "an input alone": (
+        {"update": lambda self, model, view, memory: view.x},
+        "`update` of `Sound` returns one thing, and must return two, the input and the next "
+        "memory: `return u, memory`.",
+    ),
+    "a list for an input": (
+        {"update": lambda self, model, view, memory: ([0.0], memory)},
+        "the input of `Sound` has the type `list`, and must be one array, such as "
+        "`jnp.stack([...])` makes.",
+    ),
+    "an input of another size": (
+        {"update": lambda self, model, view, memory: (jnp.zeros(3), memory)},
+        "the input of `Sound` has shape (3,), and must have shape (1,).",
+    ),
+    "a complex input": (
+        {"update": lambda self, model, view, memory: (view.x * 1j, memory)},
+        "the input of `Sound` has the type complex128, and must have that of its argument, "
+        "float64; write `jnp.asarray(..., x.dtype)`.",
+    ),
+    "an input in single precision": (
+        {"update": lambda self, model, view, memory: (view.x.astype(jnp.float32), memory)},
+        "`update` of `Sound` casts float64 numbers to fewer digits, and must keep the type of "
+        "its argument, `x.dtype`.",
+    ),
+    "a drawn input": (
+        {"update": wanders},
+        "`update` of `Sound` differs from one call to the next, as a clock or a random number "
+        "makes it, and must be a function of its arguments alone.",
+    ),
+    "a lost memory": (
+        {
+            "init": lambda self: jnp.zeros(2),
+            "update": lambda self, model, view, memory: (view.x, None),
+        },
+        "the memory of `Sound` is float64 (2,) at first and nothing after a step, and must keep "
+        "its form.",
+    ),
+    "a memory that grows": (
+        {
+            "init": lambda self: jnp.zeros(2),
+            "update": lambda self, model, view, memory: (view.x, jnp.append(memory, 1.0)),
+        },
+        "the memory of `Sound` is float64 (2,) at first and float64 (3,) after a step, and must "
+        "keep its form.",
+    ),
+    "a memory of words": (
+        {"init": lambda self: "nothing yet"},
+        "`init` of `Sound` returns 'nothing yet', and must return arrays, numbers or nothing.",
+    ),
+    "a feed-forward by its name": (
+        {"feedforward": "relay"},
+        "`feedforward` of `Sound` is 'relay', and must be a member of `Feedforward`, such as "
+        "`Feedforward.RELAY`.",
+    ),
+    "a completion that is none": (
+        {"prepared": lambda self, model, graph: None},
+        "`prepared` of `Sound` returns a `NoneType`, and must return the completed law.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_a_law_of_ones_own_is_checked_as_a_model_is(name):
+    changes, sentence = SPOILED[name]
+    with pytest.raises(LawError) as caught:
+        flown(**changes)
+    assert str(caught.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("update", "kind"),
+    [
+        (
+            lambda self, model, view, memory: (view.x if view.x[0] > 0.0 else -view.x, memory),
+            "TracerBoolConversionError",
+        ),
+        (
+            lambda self, model, view, memory: (np.sin(view.x), memory),
+            "TracerArrayConversionError",
+        ),
+        (lambda self, model, view, memory: (view.velocity, memory), "AttributeError"),
+    ],
+)
+def test_errors_inside_a_law_are_told_with_their_kind(update, kind):
+    with pytest.raises(LawError) as caught:
+        flown(update=update)
+    assert str(caught.value).startswith(f"`update` of `Sound` fails with {kind}: ")
+    assert str(caught.value).endswith(WRITTEN)
+
+
+def test_a_sound_law_with_a_memory_of_whole_numbers_flies():
+    run = flown(
+        init=lambda self: (jnp.asarray(0), 0.0),
+        update=lambda self, model, view, memory: (
+            jnp.ones(1) * memory[0],
+            (memory[0] + 1, memory[1]),
+        ),
+    )
+    assert run.inputs[:, 1, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_a_law_that_is_called_by_hand_computes_in_double_or_not_at_all():
+    model = SingleIntegrator(1)
+    gain = synthesize(model, LINE, Riccati(coupling=0.3))
+    law = Consensus(gain)
+
+    def known():
+        zero = jnp.zeros(1)
+        return LocalView(jnp.zeros(()), zero, zero, jnp.asarray([0.1]), zero)
+
+    with pytest.raises(LawError, match="inside `with jax.enable_x64"):
+        known()
+    with jax.enable_x64(True):
+        u, _ = law.update(model, known(), law.init())
+    assert u.dtype == np.float64
+    assert float(u[0]) == pytest.approx(-0.3 * float(gain.P[0, 0]) * 0.1, rel=1e-15)

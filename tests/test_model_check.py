@@ -1,5 +1,7 @@
 """What is said of a malformed agent, once, when it enters `synthesize` or `simulate`."""
 
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from echelon.laws import TrimInput
 from echelon.models import ControlAffine, SingleIntegrator
 from echelon.models.check import check_model
 from echelon.models.linearization import at_trim
+from echelon.models.model import Limits
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 
@@ -188,8 +191,110 @@ FAILING = {
 def test_errors_inside_an_agent_s_own_code_are_told_with_their_kind(name):
     drift, kind = FAILING[name]
     sentence = told(spoiled(drift=drift))
-    assert sentence.startswith(f"`drift` of `Tank` fails at the trim with {kind}: ")
+    assert sentence.startswith(f"`drift` of `Tank` fails with {kind}: ")
     assert sentence.endswith("; it must be written with `jax.numpy` and take one agent's state.")
+
+
+def single(self, x):
+    return jnp.asarray(x, jnp.float32) * jnp.asarray(1.0, x.dtype)
+
+
+def drawn(self, x):
+    return x * np.random.default_rng().uniform()
+
+
+def watched(self, x):
+    return jax.lax.cond(x[0] > 0.0, lambda y: y * time.time(), lambda y: y, x)
+
+
+def limits(**changes):
+    bounds = {"matrix": ((1.0,),), "low": (-1.0,), "high": (float("inf"),)} | changes
+    return {"input_limits": Limits(**bounds)}
+
+
+FALSE = {
+    "a complex drift": (
+        {"drift": lambda self, x: x * 1j},
+        "`drift` of `Tank` has the type complex128, and must have that of its argument, float64; "
+        "write `jnp.asarray(..., x.dtype)`.",
+    ),
+    "a drift of truth values": (
+        {"drift": lambda self, x: x > 0.0},
+        "`drift` of `Tank` has the type bool, and must have that of its argument, float64; write "
+        "`jnp.asarray(..., x.dtype)`.",
+    ),
+    "a drift in single precision": (
+        {"drift": single},
+        "`drift` of `Tank` casts float64 numbers to fewer digits, and must keep the type of its "
+        "argument, `x.dtype`.",
+    ),
+    "a drawn drift": (
+        {"drift": drawn},
+        "`drift` of `Tank` differs from one call to the next, as a clock or a random number makes "
+        "it, and must be a function of its arguments alone.",
+    ),
+    "a drift by the clock": (
+        {"drift": watched},
+        "`drift` of `Tank` differs from one call to the next, as a clock or a random number makes "
+        "it, and must be a function of its arguments alone.",
+    ),
+    "numbers for names": (
+        {"state_names": (1, 2)},
+        "`state_names` of `Tank` is (1, 2), and must be a tuple of names.",
+    ),
+    "one number for names": (
+        {"input_names": 1},
+        "`input_names` of `Tank` is 1, and must be a tuple of names.",
+    ),
+    "limits that are no limits": (
+        {"input_limits": (0.0, 1.0)},
+        "`input_limits` of `Tank` is (0.0, 1.0), and must be a `Limits`.",
+    ),
+    "limits of two inputs": (
+        limits(matrix=((1.0, 0.0),)),
+        "`input_limits.matrix` of `Tank` has shape (1, 2), and must have shape (1, 1).",
+    ),
+    "limits of different lengths": (
+        limits(low=(-1.0, -1.0)),
+        "`input_limits.matrix` of `Tank` has shape (1, 1), and must have shape (2, 1).",
+    ),
+    "limits of no number": (
+        limits(low=(NAN,)),
+        "`input_limits.low` of `Tank` is (nan,), and must be numbers.",
+    ),
+    "limits that leave nothing": (
+        limits(low=(1.0,), high=(-1.0,)),
+        "`input_limits` of `Tank` must have each `low` below its `high`.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FALSE)
+def test_what_would_run_and_mean_something_else_is_refused(name):
+    changes, sentence = FALSE[name]
+    assert told(spoiled(**changes)) == sentence
+
+
+def test_constant_draws_and_open_limits_pass():
+    def noisy(self, x):
+        return x + jax.random.normal(jax.random.key(0), (2,))
+
+    with numerics.precision("float64"):
+        noise = np.asarray(jax.random.normal(jax.random.key(0), (2,)))
+    still = {"trim": ((0.0, -noise[1]), (-noise[0],))}
+    assert checked(spoiled(drift=noisy, **still)) == ()
+    assert checked(spoiled(**limits())) == ()
+
+
+def test_several_agents_for_one_are_refused():
+    assert told([Tank(), Tank()]) == (
+        "the model is a list of 2, and all agents share one model; agents that differ from it "
+        "together are a `plant`."
+    )
+
+
+def test_an_agent_is_checked_in_double_precision_wherever_it_is_asked():
+    assert check_model(Tank()) == ()
 
 
 REFUSED = {

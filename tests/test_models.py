@@ -32,6 +32,7 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
+from echelon.models.check import check_model
 from echelon.models.rigid_body import body_rates, euler_rates, free_spin
 from echelon.scenario import registry
 
@@ -519,6 +520,26 @@ def test_the_crazyflie_carries_the_identified_numbers():
     assert np.hypot(model.arm, model.arm) == pytest.approx(0.046, abs=5e-5)
     assert 4 * model.motor_thrust == pytest.approx(0.639, abs=1e-12)
     assert model.torque_per_thrust == 0.005964552
+
+
+@pytest.mark.parametrize(
+    ("name", "grams", "newtons", "metres"),
+    [
+        ("crazyflie-2.1+", 29.0, 0.12, 0.006993),
+        ("crazyflie-legacy", 29.0, 0.12, 0.00735),
+        ("crazyflie-thrust-kit", 32.5, 0.18, 0.00516),
+    ],
+)
+def test_the_crazyflies_of_today_carry_the_firmware_s_numbers(name, grams, newtons, metres):
+    model = Quadrotor.named(name)
+    assert (model.mass, model.motor_thrust) == (grams / 1000, newtons)
+    assert model.torque_per_thrust == metres
+    assert model.inertia == Quadrotor.crazyflie().inertia
+    with numerics.precision("float64"):
+        assert check_model(model) == ()  # hovering is within reach
+        # Full yaw: the collective gives way, so two motors give all and two give nothing.
+        most = np.asarray(model.limit(jnp.asarray([model.mass * 9.81, 0.0, 0.0, 1.0])))[3]
+    assert most == pytest.approx(2.0 * metres * newtons)
 
 
 def test_a_named_quadrotor_takes_changes():

@@ -69,10 +69,16 @@ def agree(name, method, feedforward, folder):
     try:
         built = ech.build(scenario)
     except ech.EchelonError as refused:
-        for act in (ech.run, ech.compare, ech.design):
+        for act in (ech.run, ech.compare):
             with pytest.raises(ech.EchelonError) as caught:
                 act(scenario)
             assert str(caught.value) == str(refused)
+        try:
+            (row,) = ech.design(scenario, method).designs
+        except ech.EchelonError as also:
+            assert str(also) == str(refused)
+        else:  # where the method alone is at fault, it is a row with the same reason
+            assert row.gain is None and str(refused).endswith(f"follower.gain: {row.reason}")
         return
     promise, gain = ech.promise(*built), built.parts.drive.gain
     told = tellers(scenario, built, method, folder)

@@ -134,6 +134,7 @@ def test_defaults():
                 "rate": None,
                 "exact": None,
                 "symmetry_weight": None,
+                "python": None,
                 "file": None,
             },
             "feedforward": "relay",
@@ -543,3 +544,19 @@ def test_the_schema_accepts_every_bundled_scenario(name):
     assert not conforms(data | {"simulation": {"horizon": 1}}, schema, schema)
     assert not conforms(data | {"graph": {"edges": [[0]]}}, schema, schema)
     assert not conforms(data | {"model": {"name": "quadroto"}}, schema, schema)
+
+
+def test_a_named_set_of_parameters_may_be_changed(load):
+    model = "model={name: quadrotor, parameters: {set: crazyflie-2.1+, mass: 0.03}}"
+    made = echelon.build(load(model)).parts.model
+    assert (made.mass, made.motor_thrust) == (0.03, 0.12)
+    for parameters, said in (
+        ("{set: crazyfly}", "parameters `crazyfly` are unknown"),
+        ("{set: [1]}", "parameters `[1]` are unknown"),
+        ("{set: crazyflie, weight: 1}", "got the parameter `weight` of `quadrotor`"),
+    ):
+        with pytest.raises(echelon.EchelonError) as caught:
+            echelon.build(load(f"model={{name: quadrotor, parameters: {parameters}}}"))
+        assert said in str(caught.value)
+    with pytest.raises(echelon.EchelonError, match="`pendulum` has no named parameter sets"):
+        echelon.build(load("model={name: pendulum, parameters: {set: small}}"))

@@ -1,11 +1,14 @@
 """A domain: the box of states and inputs on which a certificate is wanted."""
 
+import numbers
 from collections.abc import Mapping
 from typing import TypeAlias, final
 
+import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import GainError, did_you_mean, listing
+from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 
@@ -55,6 +58,7 @@ class Domain:
                 lower[name], upper[name] = low, high
         state = np.array([model.per_state(lower, -np.inf), model.per_state(upper, np.inf)])
         _check_chart(model, state)
+        _check_turns(model, state)
         return cls(*state, *inputs)
 
     def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Array, Array]:
@@ -104,7 +108,14 @@ class Domain:
 
 
 def _interval(name: str, bound: Bound) -> tuple[float, float]:
-    low, high = (-bound, bound) if isinstance(bound, (int, float)) else tuple(bound)
+    pair = (-bound, bound) if isinstance(bound, (int, float)) else bound
+    ends = np.asarray(pair, object)
+    if ends.shape != (2,) or not all(isinstance(end, numbers.Real) for end in ends):
+        raise GainError(
+            f"the domain of `{name}` is {bound}, and must be a half-width or a pair "
+            "`[lower, upper]`."
+        )
+    low, high = map(float, ends)
     if not (np.isfinite([low, high]).all() and low < high):
         raise GainError(
             f"the domain of `{name}` is [{low:g}, {high:g}], and must be finite with its lower end "
@@ -123,6 +134,20 @@ def _check_name(model: ControlAffine, name: str) -> None:
         raise GainError(
             f"the domain names `{name}`, and `{type(model).__name__}` has {listing(allowed)}"
             f"{did_you_mean(name, allowed)}."
+        )
+
+
+def _check_turns(model: ControlAffine, state: Array) -> None:
+    """Check that two agents in the domain differ by what laws take for their difference."""
+    ends = np.asarray(model.trim[0], float) + np.where(np.isfinite(state).all(0), state, 0.0)
+    with precision("float64"):
+        taken = np.asarray(model.difference(*map(jnp.asarray, ends[::-1])))
+    wide = ends[1] - ends[0]
+    for k in np.flatnonzero(np.abs(taken - wide) > 1e-9 * (1.0 + np.abs(wide))):
+        raise GainError(
+            f"the domain of `{model.state_names[k]}` is {wide[k]:.4g} wide, and "
+            f"`{type(model).__name__}` takes differences of it the shorter way round; allowed is "
+            "less than half a turn in all."
         )
 
 

@@ -93,13 +93,15 @@ def listing(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def check_kind(place: str, part: object, kind: type) -> None:
+def check_kind(
+    place: str, part: object, kind: type, fault: type[EchelonError] = SimulationError
+) -> None:
     """Check that a part is an instance of a class.
 
     Raises:
-        SimulationError: it is not.
+        EchelonError: it is not; of the class `fault`.
     """
     if isinstance(part, kind):
         return
     got = f"the class `{part.__name__}`" if isinstance(part, type) else f"a `{type(part).__name__}`"
-    raise SimulationError(f"`{place}` is {got}, and must be a `{kind.__name__}`.")
+    raise fault(f"`{place}` is {got}, and must be a `{kind.__name__}`.")

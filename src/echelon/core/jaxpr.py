@@ -116,6 +116,9 @@ def _apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[
         return _place(equation, operands, algebra.outside)
     if name in ADDED:
         return [_add(equation, operands, algebra.constant)]
+    # JAX lets it multiply whole numbers and others, where they are indices everywhere else.
+    if name == "dot_general":
+        operands = [algebra.lift(a.astype(float)) if a.dtype.kind in "biu" else a for a in operands]
     rule = algebra.rules.get(name, COMMON.get(name))
     if rule is None:
         return algebra.unknown(equation, operands)

@@ -153,6 +153,10 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
 Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Array
 
 
+_MOST = 1e75
+"""Of a weight: products of two are squared in norms, and 1e300 is a number yet."""
+
+
 def check_definite(name: str, matrix: np.ndarray) -> None:
     """Check that a matrix is finite, symmetric (to 1e-9 of its size) and positive definite.
 
@@ -163,6 +167,7 @@ def check_definite(name: str, matrix: np.ndarray) -> None:
         raise GainError(f"`{name}` has shape {matrix.shape}, and must be square.")
     if not np.isfinite(matrix).all():
         raise GainError(f"`{name}` holds a number that is not finite.")
+    _check_size(name, matrix)
     gap = np.abs(matrix - matrix.T)
     if gap.max() > 1e-9 * np.abs(matrix).max():
         i, j = np.unravel_index(np.argmax(gap), gap.shape)
@@ -197,4 +202,12 @@ def as_matrix(name: str, value: Weight, size: int) -> Array:
         raise GainError(
             f"`{name}` has shape {array.shape}, and must be {size} numbers or {size} x {size}."
         )
+    _check_size(name, array)
     return array
+
+
+def _check_size(name: str, matrix: Array) -> None:
+    """Check that the numbers of a weight can be computed with."""
+    largest = np.abs(matrix).max(initial=0.0)
+    if _MOST <= largest < np.inf:
+        raise GainError(f"`{name}` goes up to {largest:.3g}, and must stay below {_MOST:g}.")

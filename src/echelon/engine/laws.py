@@ -12,6 +12,7 @@ from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
 from echelon.engine.loop import Loop, Moment, advance, assemble, begin
 from echelon.engine.settings import Settings
 from echelon.engine.sums import on_host
+from echelon.laws.check import prepare_law
 from echelon.laws.law import Law, gain_of
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -69,7 +70,7 @@ class Laws(Drive):
         Raises:
             LawError: one does not fit the model or the graph.
         """
-        leader, follower = (law.prepared(model, graph) for law in (self.leader, self.follower))
+        leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
         same = leader is self.leader and follower is self.follower
         return self if same else Laws(leader, follower)
 

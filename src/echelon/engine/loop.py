@@ -135,15 +135,16 @@ def control(loop: Loop, now: Moment) -> Control:
     x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
     y = x - offsets
     # What was sent is what is: this network neither delays nor loses.
-    z = loop.exchange(y, y)
+    z = loop.exchange(y, y, jax.vmap(loop.model.difference))
     # From the step number, since a sum of many dt would gather rounding.
     t = now.step.astype(x.dtype) * loop.motion.dt
 
     def act(law: Law, who: Any, sent: jax.Array, memory: Memory) -> _Acted:
-        view = LocalView(t, x[who], offsets[who], z[who], sent)
         # One time for all; of everything else, an agent sees its own row and no other.
-        axes = LocalView(None, 0, 0, 0, 0)  # type: ignore[arg-type]
-        wanted, memory = jax.vmap(law.update, in_axes=(None, axes, 0))(loop.model, view, memory)
+        def one(x: Any, offset: Any, z: Any, sent: Any, memory: Memory) -> tuple[Any, Memory]:
+            return law.update(loop.model, LocalView(t, x, offset, z, sent), memory)
+
+        wanted, memory = jax.vmap(one)(x[who], offsets[who], z[who], sent, memory)
         return _Acted(wanted, loop.motion.deliver(wanted), memory)
 
     # Nobody is before a leader whose input it could be sent.

@@ -57,10 +57,13 @@ class Settings(NamedTuple):
         """
         for name in ("horizon", "dt"):
             value = getattr(self, name)
-            if not 0.0 < value < math.inf:
+            if not (isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf):
                 raise SimulationError(
                     f"`{name}` is {value}, and must be a positive finite number of seconds."
                 )
+        # Any text that is not empty would count as true.
+        if not isinstance(self.limits, bool):
+            raise SimulationError(f"`limits` is {self.limits!r}, and must be True or False.")
         if self.horizon < self.dt:
             raise SimulationError(
                 f"`horizon` is {self.horizon} s, and must be at least one step `dt` = {self.dt} s."

@@ -13,7 +13,7 @@ from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError, OutputError
 from echelon.core.types import Array, PathLike
 from echelon.core.words import Kind, Theorem
-from echelon.gains.gain import Gain
+from echelon.gains.gain import Gain, check_strength
 from echelon.models.linearization import linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -163,10 +163,12 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
     try:
         _check_model(path, stored["model"], model)
         _check_graph(path, stored["graph"], graph)
-        return _gain(stored)
+        gain = _gain(stored)
     # What a hand has changed in the file fails somewhere in here, in one of these ways.
     except (LookupError, TypeError, ValueError) as error:
         raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
+    check_strength(gain.coupling * graph.spectrum().high, linearize(model), gain.P, gain.R)
+    return gain
 
 
 def _read(path: PathLike) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.certificate import Certificate, RegionCertificate, certify
-from echelon.core.errors import GainError
+from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
@@ -73,7 +73,9 @@ class Gain(eqx.Module):
         if self.inner is None:
             return jnp.zeros(len(model.input_names), x.dtype)
         # About the trim, where the loop gives nothing: the trim input stays the law's to add.
-        return -jnp.asarray(self.inner, x.dtype) @ (x - jnp.asarray(model.trim[0], x.dtype))
+        return -jnp.asarray(self.inner, x.dtype) @ model.difference(
+            x, jnp.asarray(model.trim[0], x.dtype)
+        )
 
 
 class Feedback(NamedTuple):
@@ -139,7 +141,7 @@ class Method(eqx.Module):
             check_coupling(self.coupling)
         # Every method works on the same A and B, of normalized inputs: entries of like size.
         linear = linearize(model)
-        P, R, rho, region, inner = self.feedback(model, linear)
+        P, R, rho, region, inner = self._found(model, linear)
         # Before the certificate, which solves with R, and takes eigenvalues of what P makes.
         check_definite("P", P)
         check_definite("R", R)
@@ -147,11 +149,55 @@ class Method(eqx.Module):
         edge = None if rho is None else rho / (2.0 * spectrum.low)
         # A coupling of zero was refused above, and an edge of zero means that any coupling does.
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
+        check_strength(coupling * spectrum.high, linear, P, R)
         promised = None if region is None else region(coupling, spectrum)
         # The consensus law acts on what the inner loop leaves: c scales no part of that loop.
         closed = linear.with_inner(inner)
         certificate = certify(closed, spectrum, P, R, coupling, edge, promised)
         return Gain(P, R, coupling, self.name, certificate, inner)
+
+    def _found(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return what the method finds, after checking that it is what a method returns."""
+        found, name = self.feedback(model, linear), type(self).__name__
+        if not isinstance(found, Feedback):
+            raise GainError(
+                f"`feedback` of `{name}` returns a `{type(found).__name__}`, and must return a "
+                "`Feedback`."
+            )
+        n, m = linear.B.shape
+        for what, shape in (("P", (n, n)), ("R", (m, m)), ("inner", (m, n))):
+            matrix = getattr(found, what)
+            if what == "inner" and matrix is None:
+                continue
+            if (got := np.shape(matrix)) != shape:  # type: ignore[arg-type]
+                raise GainError(
+                    f"`{what}` that `feedback` of `{name}` returns has shape {got}, "
+                    f"and must have shape {shape}."
+                )
+        if found.rho is not None and not 0.0 <= found.rho < np.inf:
+            raise GainError(
+                f"`rho` that `feedback` of `{name}` returns is {found.rho}, and must be finite "
+                "and not negative."
+            )
+        return found
+
+
+def check_strength(strength: float, linear: Linearization, P: Array, R: Array) -> None:
+    """Check that what is fed back at a strength c lambda can be computed with.
+
+    Raises:
+        GainError: it cannot.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        fed_back = strength * (linear.B @ np.linalg.solve(R, linear.B.T @ P))
+        # Norms square P B R^-1 B'P.
+        known = np.isfinite((P @ fed_back) ** 2).all()
+    if not known:
+        raise GainError(
+            f"the feedback is too strong to compute with: the coupling times the graph's largest "
+            f"eigenvalue is {strength:.3g}, P goes up to {np.abs(P).max():.3g}; make `coupling`, "
+            "the edges' weights or P smaller."
+        )
 
 
 def check_coupling(coupling: float) -> None:
@@ -179,6 +225,7 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
     if not method.name:
         raise GainError(f"`{type(method).__name__}` has no `name`, and every gain method must.")
     # JAX would differentiate in float32, which no test of stabilizability at 1e-9 survives.
+    check_kind("graph", graph, Graph, GraphError)
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph.spectrum())

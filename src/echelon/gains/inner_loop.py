@@ -76,10 +76,16 @@ class InnerLoop(Method):
     def _weights(self, model: ControlAffine, count: int) -> Array:
         """Return the weights of the symmetric states, (count,)."""
         given = model.symmetry_weights if self.symmetry_weight is None else self.symmetry_weight
-        weights = np.broadcast_to(np.asarray(1.0 if given is None else given, float), (count,))
-        if not (weights > 0.0).all():
-            raise GainError(f"`symmetry_weight` is {weights.tolist()}, and must be positive.")
-        return weights
+        try:
+            weights = np.asarray(1.0 if given is None else given, float)
+        except (TypeError, ValueError):
+            weights = np.array(np.nan)
+        if weights.shape not in ((), (count,)) or not ((weights > 0.0) & (weights < np.inf)).all():
+            raise GainError(
+                f"`symmetry_weight` is {given}, and must be one positive number, or {count}, one "
+                "for each symmetric state."
+            )
+        return np.broadcast_to(weights, (count,))
 
 
 def symmetric_states(model: ControlAffine) -> list[int]:

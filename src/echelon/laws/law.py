@@ -1,12 +1,13 @@
 """The interface of a control law, and all that one agent may know when it runs one."""
 
 import abc
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from echelon.core.errors import LawError
@@ -19,7 +20,8 @@ from echelon.network.graph import Graph
 Memory: TypeAlias = Any
 
 
-class LocalView(NamedTuple):
+@final
+class LocalView(eqx.Module):
     """What one agent knows at one time.
 
     Attributes:
@@ -29,6 +31,9 @@ class LocalView(NamedTuple):
         disagreement: z = e + d (n,), from what the neighbours sent.
         feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
             unless the law's `broadcast` says otherwise.
+
+    Raises:
+        LawError: it is made of numbers where JAX computes in float32.
     """
 
     t: Scalar
@@ -36,6 +41,16 @@ class LocalView(NamedTuple):
     offset: State
     disagreement: State
     feedforward: Float[jax.Array, " k"]
+
+    def __check_init__(self) -> None:
+        """Refuse to lose digits without a word."""
+        # Verbs choose a precision, and trace. Who calls a law by hand has none that was chosen.
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(self))
+        if not traced and jnp.result_type(float) != np.float64:
+            raise LawError(
+                "a `LocalView` is made where JAX computes in float32, and a law would return 7 "
+                "digits; make it, and call the law, inside `with jax.enable_x64(True):`."
+            )
 
 
 class Law(eqx.Module):

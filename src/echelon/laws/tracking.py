@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import LawError, ReferenceError
+from echelon.core.errors import LawError, ReferenceError, check_kind
 from echelon.core.types import Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
@@ -17,7 +17,7 @@ from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.references.flatness import check_flat, follow, follow_at
-from echelon.references.reference import Reference
+from echelon.references.reference import Reference, check_reference
 
 
 class Tracking(Law):
@@ -36,6 +36,10 @@ class Tracking(Law):
     gain: Gain | None = None
     reaction: Gain | None = None
 
+    def __check_init__(self) -> None:
+        """Refuse what is no reference."""
+        check_kind("reference", self.reference, Reference, ReferenceError)
+
     @property
     def information(self) -> tuple[str, ...]:
         """The reference; neighbours' states when the leader reacts."""
@@ -44,6 +48,7 @@ class Tracking(Law):
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
         """Complete the gain where it is not, and check that the model can follow a reference."""
         check_flat(model)
+        check_reference(self.reference)
         if self.reaction is not None:
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
         gain = tracking_gain(self, model, graph, self.gain)

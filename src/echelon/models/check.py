@@ -8,8 +8,9 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.numerics import precision
+from echelon.core.trace import check_function, in_short
 from echelon.models.linearization import AtTrim, at_trim
-from echelon.models.model import ControlAffine
+from echelon.models.model import ControlAffine, Limits
 
 # Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
 _TRIM_TOLERANCE = 1e-9
@@ -31,11 +32,31 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     Raises:
         ModelError: the first fault found, as one sentence.
     """
+    with precision("float64"):
+        name = _check_kind(model)
+        _check_names(model, name)
+        x, u = _check_constants(model, name)
+        _check_functions(model, name, x, u)
+        _check_trim(model, name, u)
+        return (*_low_precision(model, name), *_weak_actuators(model, name))
+
+
+def _check_kind(model: ControlAffine) -> str:
+    """Return the name of the model's class, after checking that it is one."""
+    if isinstance(model, list | tuple | dict):
+        raise ModelError(
+            f"the model is a {type(model).__name__} of {len(model)}, and all agents share one "
+            "model; agents that differ from it together are a `plant`."
+        )
     if not isinstance(model, ControlAffine):
         raise ModelError(
             f"the model is {model!r}, and must be an instance of a `ControlAffine` class."
         )
-    name = type(model).__name__
+    return type(model).__name__
+
+
+def _check_words(model: ControlAffine, name: str) -> None:
+    """Check that states and inputs have names, which are text."""
     for what, names in (("state_names", model.state_names), ("input_names", model.input_names)):
         # A text is a sequence too, of letters: ("x") without its comma would name one state by
         # luck.
@@ -44,20 +65,18 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
                 f"`{what}` of `{name}` is the text `{names}`, and must be a tuple of names; "
                 f'one name is written ("{names}",).'
             )
+        if not isinstance(names, tuple | list) or not all(isinstance(n, str) for n in names):
+            raise ModelError(f"`{what}` of `{name}` is {names!r}, and must be a tuple of names.")
     n, m = len(model.state_names), len(model.input_names)
     if not (n and m):
         raise ModelError(
             f"`{name}` has {n} state names and {m} input names, and needs at least one of each."
         )
-    _check_names(model, name)
-    x, u = _trim(model, name, n, m)
-    _check_values(model, name, x, u)
-    _check_trim(model, name, u)
-    return (*_low_precision(model, name), *_weak_actuators(model, name))
 
 
 def _check_names(model: ControlAffine, name: str) -> None:
-    """Check that groups, position and units speak of states that exist."""
+    """Check the names, and that groups, position and units speak of states that exist."""
+    _check_words(model, name)
     known = model.state_names
     if len(set(known)) < len(known):
         raise ModelError(f"`state_names` of `{name}` repeats a name: {listing(known)}.")
@@ -80,15 +99,34 @@ def _check_names(model: ControlAffine, name: str) -> None:
             )
 
 
-def _trim(model: ControlAffine, name: str, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the trim as arrays, after checking all constant data."""
+    n, m = len(model.state_names), len(model.input_names)
     x, u = _pair(name, "trim", model.trim, n, m)
     _pair(name, "weights", model.weights, n, m)
     scale = _numbers(name, "input_scale", model.input_scale, (m, m))
     # Near a condition of 1/eps = 4.5e15 no digit of the inverse is right.
     if np.linalg.cond(scale) > 1e15:
         raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")
+    _check_limits(model, name, m)
     return x, u
+
+
+def _check_limits(model: ControlAffine, name: str, m: int) -> None:
+    """Check that the actuators' inequalities low <= G u <= high fit each other and the inputs."""
+    limits = model.input_limits
+    if limits is None:
+        return
+    if not isinstance(limits, Limits):
+        raise ModelError(f"`input_limits` of `{name}` is {limits!r}, and must be a `Limits`.")
+    k = len(limits.low)
+    _numbers(name, "input_limits.matrix", limits.matrix, (k, m))
+    low, high = (
+        _numbers(name, f"input_limits.{end}", getattr(limits, end), (k,), np.inf)
+        for end in ("low", "high")
+    )
+    if not (low < high).all():
+        raise ModelError(f"`input_limits` of `{name}` must have each `low` below its `high`.")
 
 
 def _pair(name: str, what: str, pair: Any, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
@@ -101,8 +139,10 @@ def _pair(name: str, what: str, pair: Any, n: int, m: int) -> tuple[np.ndarray, 
     )
 
 
-def _numbers(name: str, what: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return constant data as a finite array of the given shape."""
+def _numbers(
+    name: str, what: str, value: Any, shape: tuple[int, ...], most: float = np.finfo(float).max
+) -> np.ndarray:
+    """Return constant data as an array of the given shape, finite unless `most` is not."""
     try:
         array = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -111,18 +151,27 @@ def _numbers(name: str, what: str, value: Any, shape: tuple[int, ...]) -> np.nda
         # The trim of a single state may be a plain number.
         array = np.atleast_1d(array)
     _check_shape(name, what, array.shape, shape)
-    if not np.isfinite(array).all():
-        raise ModelError(f"`{what}` of `{name}` is {value}, and must be finite.")
+    if not (np.abs(array) <= most).all():
+        allowed = "finite" if np.isfinite(most) else "numbers"
+        raise ModelError(f"`{what}` of `{name}` is {value}, and must be {allowed}.")
     return array
 
 
-def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
-    """Check shape, finiteness and Jacobian of f, g and h at the trim."""
+_ADVICE = "it must be written with `jax.numpy` and take one agent's state"
+
+
+def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
+    """Check what f, g, h and the limits return, and that f, g and h are finite at the trim."""
     n, m, q = len(x), len(u), len(model.output_names)
     functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
-    for (what, function), shape in zip(functions.items(), ((n,), (n, m), (q,)), strict=True):
-        _check_shape(name, what, _shape(name, what, function, x), shape)
-    _check_shape(name, "limit", _shape(name, "limit", model.limit, u), (m,))
+    shapes = ((n,), (n, m), (q,), (m,))
+    for (what, function), shape in zip(
+        (functions | {"limit": model.limit}).items(), shapes, strict=True
+    ):
+        at = jnp.asarray(u if what == "limit" else x)
+        check_function(
+            ModelError, f"`{what}` of `{name}`", function, at, shape=shape, advice=_ADVICE
+        )
     there = _differentiate(model, name)
     slopes = (there.drift_slope, there.input_slope, there.output_slope)
     for what, value, slope in zip(functions, there[:3], slopes, strict=True):
@@ -137,10 +186,9 @@ def _differentiate(model: ControlAffine, name: str) -> AtTrim:
         there = at_trim(model)
     # The model is anyone's code, and JAX says in many ways that it cannot derive it.
     except Exception as error:
-        message = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
         raise ModelError(
-            f"`{name}` has no derivative at its trim, by {type(error).__name__}: {message}; write "
-            "it with `jax.numpy` alone."
+            f"`{name}` has no derivative at its trim, by {in_short(error)}; write it "
+            "with `jax.numpy` alone."
         ) from error
     gap = there.gap
     if gap is not None:
@@ -157,27 +205,6 @@ def _differentiate(model: ControlAffine, name: str) -> AtTrim:
             "derivatives of its own."
         )
     return there
-
-
-def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ...]:
-    """Return the shape of a model's function, with errors of the model's own code named as such."""
-    try:
-        # Abstract evaluation finds shapes and faults without compiling anything.
-        value = jax.eval_shape(function, jnp.asarray(at))
-    # The model is anyone's code: whatever it raises is its own fault, and stays attached as the
-    # cause.
-    except Exception as error:
-        message = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
-        raise ModelError(
-            f"`{what}` of `{name}` fails at the trim with {type(error).__name__}: {message}; "
-            "it must be written with `jax.numpy` and take one agent's state."
-        ) from error
-    if not hasattr(value, "shape"):
-        raise ModelError(
-            f"`{what}` of `{name}` returns a {type(value).__name__}, and must return one array, "
-            "such as `jnp.stack([...])` makes."
-        )
-    return value.shape
 
 
 def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, ...]) -> None:

@@ -236,6 +236,15 @@ def _rest(model: ControlAffine, u: _Inputs) -> _Inputs:
     return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
 
 
+def wound(difference: State, *angles: int) -> State:
+    """Return a difference of states with the angles (rad) at these places the shorter way round."""
+    # Agents that differ by a whole turn agree. Without a turn to take off nothing changes, to the
+    # bit.
+    places = np.array(angles)
+    turns = jnp.round(difference[places] / (2.0 * jnp.pi))
+    return difference.at[places].add(-2.0 * jnp.pi * turns)
+
+
 def check_positive(owner: object, **values: float) -> None:
     """Check that each named parameter is a finite positive number.
 

@@ -4,14 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, State
-from echelon.models.model import ControlAffine, check_positive, diagonal
-
-
-def _wrap_heading(x: State, y: State) -> State:
-    """Return x - y with the heading (third entry) brought to (-pi, pi]."""
-    # Followers that differ by a whole turn agree, and must not unwind.
-    turn = x[2] - y[2]
-    return (x - y).at[2].set(turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi)))
+from echelon.models.model import ControlAffine, check_positive, diagonal, wound
 
 
 def _drive(derivatives: jax.Array) -> tuple[State, Input]:
@@ -55,7 +48,7 @@ class Unicycle(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the heading wrapped."""
-        return _wrap_heading(x, y)
+        return wound(x - y, 2)
 
 
 class UnicyclePoint(ControlAffine):
@@ -108,4 +101,4 @@ class UnicyclePoint(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the heading wrapped."""
-        return _wrap_heading(x, y)
+        return wound(x - y, 2)

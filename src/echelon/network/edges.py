@@ -80,6 +80,8 @@ def check_edges(pairs: Array, weights: Array, agents: int) -> tuple[Array, Array
 
 def check_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
     """Return the leaders, sorted, after checking that each is an agent."""
+    if not isinstance(leaders, Iterable) or isinstance(leaders, str):
+        raise GraphError(f"`leaders` is {leaders!r}, and must be a list of agents, such as [0].")
     chosen = tuple(sorted(set(_whole(list(leaders), "a leader is").tolist())))
     if not chosen:
         raise GraphError("the graph has no leader; name at least one agent in `leaders`.")

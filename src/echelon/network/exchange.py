@@ -1,10 +1,16 @@
 """The seam of the network: what an agent learns from the values that its neighbours sent."""
 
+import operator
+from collections.abc import Callable
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Array, States
+
+Difference: TypeAlias = Callable[[States, States], States]
 
 
 class Exchange(eqx.Module):
@@ -18,10 +24,16 @@ class Exchange(eqx.Module):
     senders: Array
     weights: Array
 
-    def __call__(self, own: States, sent: States) -> States:
-        """Return z (N, n), z_i = sum_j A_ij (own_i - sent_j)."""
+    def __call__(self, own: States, sent: States, difference: Difference = operator.sub) -> States:
+        """Return z (N, n), z_i = sum_j A_ij (own_i - sent_j).
+
+        Args:
+            own: (N, n) states of the agents.
+            sent: (N, n) what was sent of each.
+            difference: of states (K, n) and (K, n), where it is another: of angles, which wind.
+        """
         weights = jnp.asarray(self.weights, own.dtype)[:, None]
         # Differences before sums: at consensus they vanish exactly, while sums of positions would
         # leave rounding.
-        differences = weights * (own[self.receivers] - sent[self.senders])
+        differences = weights * difference(own[self.receivers], sent[self.senders])
         return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))

@@ -60,6 +60,11 @@ class Formation:
             FormationError: an agent is unknown or an offset has a wrong length or a non-finite
                 number.
         """
+        if not isinstance(offsets, Mapping):
+            raise FormationError(
+                f"the offsets are a `{type(offsets).__name__}`, and must be a mapping from agents "
+                "to offsets, such as {1: (1.0, 0.0)}; a whole matrix is `Formation(offsets)`."
+            )
         full = np.zeros((graph.agents, len(model.state_names)))
         for agent, offset in offsets.items():
             if not isinstance(agent, (int, np.integer)) or not 0 <= agent < graph.agents:

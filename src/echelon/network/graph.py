@@ -195,6 +195,9 @@ class Graph:
         """Return the eigenvalues of the grounded Laplacian; computed once.
 
         All of them up to 400 followers, beyond that the smallest and the largest.
+
+        Raises:
+            GraphError: the weights are too far apart for the smallest to be known.
         """
         if self._spectrum is None:
             L, count = self.grounded_laplacian(), len(self.followers)

@@ -51,7 +51,7 @@ def figures(result: Result, lyapunov: Sequence[Array] | None = None) -> "dict[st
 
 
 def save_figures(
-    result: Result, folder: Path, lyapunov: Sequence[Array] | None = None
+    result: Result, folder: str | Path, lyapunov: Sequence[Array] | None = None
 ) -> list[Path]:
     """Write each figure of a run as PNG (150 dpi) and PDF under `folder`/figures; return the paths.
 
@@ -63,7 +63,7 @@ def save_figures(
     Raises:
         OSError: the folder or a file cannot be written.
     """
-    return draw.save(figures(result, lyapunov), folder / "figures")
+    return draw.save(figures(result, lyapunov), Path(folder) / "figures")
 
 
 # ---- in space ---------------------------------------------------------------------------------

@@ -9,9 +9,10 @@ import numpy as np
 
 from echelon.core.errors import LawError, PlanError, listing
 from echelon.core.numerics import precision
+from echelon.core.trace import check_array, traced
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.models.model import ControlAffine
-from echelon.references.reference import COORDINATES, Reference
+from echelon.references.reference import COORDINATES, Reference, check_reference
 
 
 def follow(model: ControlAffine, reference: Reference, t: Scalar) -> tuple[State, Input]:
@@ -103,6 +104,7 @@ def reference_targets(model: ControlAffine, reference: Reference | None, times: 
     if reference is None:
         x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
         return _targets(model, x, np.zeros((len(times), len(model.input_names))))
+    check_reference(reference)
     unknown = [name for name in model.flat_outputs if name not in COORDINATES]
     if not model.flat_outputs or unknown:
         raise PlanError(
@@ -161,3 +163,21 @@ def check_flat(model: ControlAffine) -> None:
             f"`flat_outputs` of `{type(model).__name__}` names {listing(unknown)}, "
             f"and a reference gives {listing(COORDINATES)}."
         )
+    _check_map(model)
+
+
+def _check_map(model: ControlAffine) -> None:
+    """Trace the flatness map, and check the state and the input that it returns."""
+    name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
+    with precision("float64"):
+        found = traced(
+            LawError,
+            f"`flat` of `{name}`",
+            model.flat,
+            jnp.zeros((model.flat_order + 1, len(model.flat_outputs))),
+            advice="it must be written with `jax.numpy` and take the outputs' derivatives",
+        ).result
+    if not isinstance(found, tuple | list) or len(found) != 2:
+        raise LawError(f"`flat` of `{name}` must return two things, a state and an input.")
+    for what, value, size in zip(("state", "input"), found, shapes, strict=True):
+        check_array(LawError, f"the {what} that `flat` of `{name}` makes", value, (size,))

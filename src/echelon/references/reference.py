@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import ReferenceError
-from echelon.core.numerics import derivatives
-from echelon.core.types import Scalar
+from echelon.core.errors import ReferenceError, check_kind
+from echelon.core.numerics import derivatives, precision
+from echelon.core.trace import check_function
+from echelon.core.types import Array, Scalar
 
 COORDINATES = ("x", "y", "z", "yaw")
 
@@ -41,17 +42,42 @@ def check_finite(owner: Reference, **values: object) -> None:
         ReferenceError: one is not.
     """
     for name, (value, length) in values.items():  # type: ignore[misc]
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            # What is no number fails the test below as NaN does, with the same sentence.
-            array = np.array([np.nan])
+        array = numbers_of(value)
         wanted = () if length is None else (length,)
         if array.shape != wanted or not np.isfinite(array).all():
             shape = "a finite number" if length is None else f"{length} finite numbers"
             raise ReferenceError(
                 f"`{name}` of `{type(owner).__name__}` is {value}, and must be {shape}."
             )
+
+
+def numbers_of(value: object) -> Array:
+    """Return a number or nested lists of numbers as float64; NaN alone for anything else."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return np.array([np.nan])
+    # Text that reads as a number is none, nor is a truth value, and what no int64 holds is an
+    # object.
+    return array.astype(np.float64) if array.dtype.kind in "iuf" else np.array([np.nan])
+
+
+def check_reference(reference: Reference) -> None:
+    """Check that a reference is one, and that it returns (x, y, z, yaw).
+
+    Raises:
+        ReferenceError: it is none, or returns something else.
+    """
+    check_kind("reference", reference, Reference, ReferenceError)
+    with precision("float64"):
+        check_function(
+            ReferenceError,
+            f"the point of `{type(reference).__name__}`",
+            reference,
+            jnp.zeros(()),
+            shape=(len(COORDINATES),),
+            advice="it must be written with `jax.numpy` and take one time",
+        )
 
 
 def in_space(point: jax.Array, yaw: float) -> jax.Array:

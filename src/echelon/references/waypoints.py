@@ -10,7 +10,7 @@ import numpy as np
 
 from echelon.core.errors import ReferenceError
 from echelon.core.types import Array, Scalar
-from echelon.references.reference import Reference, check_finite, in_space
+from echelon.references.reference import Reference, check_finite, in_space, numbers_of
 
 
 class Waypoints(Reference):
@@ -37,8 +37,7 @@ class Waypoints(Reference):
         self, times: Sequence[float], points: Sequence[Sequence[float]], yaw: float = 0.0
     ) -> None:
         """Fit the spline."""
-        t, p = np.asarray(times, dtype=np.float64), np.asarray(points, dtype=np.float64)
-        _check(t, p)
+        t, p = _read(times, points)
         self.yaw = yaw
         check_finite(self, yaw=(yaw, None))
         self.knots, self.coefficients = _fit(t, p)
@@ -58,21 +57,21 @@ class Waypoints(Reference):
         return in_space(value, self.yaw)
 
 
-def _check(times: np.ndarray, points: np.ndarray) -> None:
-    if (
-        times.ndim != 1
-        or len(times) < 2
-        or not np.isfinite(times).all()
-        or (np.diff(times) <= 0).any()
-    ):
+def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Array, Array]:
+    """Return times (K,) and points (K, 3), after checking both."""
+    t, p = numbers_of(times), numbers_of(points)
+    if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
+        shown = times.tolist() if isinstance(times, np.ndarray) else times
         raise ReferenceError(
-            f"`times` of `Waypoints` is {times.tolist()}, and must be at least 2 increasing times."
+            f"`times` of `Waypoints` is {shown}, and must be at least 2 increasing times."
         )
-    if points.shape != (len(times), 3) or not np.isfinite(points).all():
+    if p.shape != (len(t), 3) or not np.isfinite(p).all():
+        # Rows of different lengths, or words, have no shape to tell of.
+        got = f"is {points}" if p.shape == (1,) else f"has shape {p.shape}"
         raise ReferenceError(
-            f"`points` of `Waypoints` has shape {points.shape}, "
-            f"and must be {len(times)} finite points (x, y, z)."
+            f"`points` of `Waypoints` {got}, and must be {len(t)} finite points (x, y, z)."
         )
+    return t, p
 
 
 def _fit(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and why it falls or rises."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ from echelon.core.types import Array
 from echelon.engine.drive import Drive
 from echelon.engine.motion import Motion
 from echelon.engine.result import Result
+from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.world.disturbance import disturb
 
@@ -71,15 +73,16 @@ def lyapunov(result: Result) -> Lyapunov | None:
         fields = _fields(result.drive, _motion(result), x, u, steps)
         f, xdot, following, f_after = (np.asarray(part) for part in fields)
         y, later = result.states - offsets, following - offsets
-        z, delta = _deviations(graph, y)
-        z_later, delta_later = _deviations(graph, later)
+        difference = _difference(result.model)
+        z, delta = _deviations(graph, y, difference)
+        z_later, delta_later = _deviations(graph, later, difference)
         value = 0.5 * _form(delta, P, z)
         return Lyapunov(
             value=value,
-            rate=_form(delta, P, _disagreement(graph, xdot)),
-            drift=_drift(graph, P, y, f),
+            rate=_form(delta, P, _disagreement(graph, xdot, np.subtract)),
+            drift=_drift(graph, P, y, f, difference),
             after=0.5 * _form(delta_later, P, z_later),
-            drift_after=_drift(graph, P, later, f_after),
+            drift_after=_drift(graph, P, later, f_after, difference),
             rounding=_rounding(result, P, value),
         )
 
@@ -89,16 +92,30 @@ def _form(a: Array, P: Array, b: Array) -> Array:
     return np.einsum("tia,ab,tib->t", a, P, b)
 
 
-def _deviations(graph: Graph, y: Array) -> tuple[Array, Array]:
+_Difference: TypeAlias = Callable[[Array, Array], Array]
+
+
+def _difference(model: ControlAffine) -> _Difference:
+    """Return the difference of states (T, E, n) that the laws take: angles may wind."""
+    return lambda x, y: np.asarray(_differences(model, jnp.asarray(x), jnp.asarray(y)))
+
+
+@eqx.filter_jit
+def _differences(model: ControlAffine, x: jax.Array, y: jax.Array) -> jax.Array:
+    return jax.vmap(jax.vmap(model.difference))(x, y)
+
+
+def _deviations(graph: Graph, y: Array, difference: _Difference) -> tuple[Array, Array]:
     """Return z and delta, (T, N_f, n) each, of states less their offsets (T, N, n)."""
-    z = _disagreement(graph, y)
+    z = _disagreement(graph, y, difference)
     return z, _grounded_inverse(graph, z)
 
 
-def _drift(graph: Graph, P: Array, y: Array, f: Array) -> Array:
+def _drift(graph: Graph, P: Array, y: Array, f: Array, difference: _Difference) -> Array:
     """Return the drift's part of V' at states less their offsets y with drifts f, (T, N, n)."""
     i, j = graph.edges.T
-    return np.einsum("e,tea,ab,teb->t", graph.weights, y[:, i] - y[:, j], P, f[:, i] - f[:, j])
+    apart = difference(y[:, i], y[:, j])
+    return np.einsum("e,tea,ab,teb->t", graph.weights, apart, P, f[:, i] - f[:, j])
 
 
 def _rounding(result: Result, P: Array, value: Array) -> float:
@@ -135,7 +152,7 @@ def _fields(
     return drift(x), moving(x, u, jnp.arange(x.shape[1]), steps), later, drift(later)
 
 
-def _disagreement(graph: Graph, values: Array) -> Array:
+def _disagreement(graph: Graph, values: Array, difference: _Difference) -> Array:
     """Return the followers' z (T, N_f, n) of values (T, N, n)."""
     frames, agents, n = values.shape
     i, j = graph.edges.T
@@ -144,7 +161,7 @@ def _disagreement(graph: Graph, values: Array) -> Array:
     places = (np.concatenate([i, j]), np.concatenate([edge, edge]))
     gather = sp.csr_array(sp.coo_array((signs, places), shape=(agents, len(i))))
     # Differences first, as in the closed loop: at consensus they vanish exactly.
-    differences = np.moveaxis(values[:, i] - values[:, j], 1, 0).reshape(len(i), -1)
+    differences = np.moveaxis(difference(values[:, i], values[:, j]), 1, 0).reshape(len(i), -1)
     z = np.moveaxis((gather @ differences).reshape(agents, frames, n), 0, 1)
     return z[:, list(graph.followers)]
 

@@ -5,11 +5,9 @@ Names are looked up in the registry alone.
 
 import contextlib
 import importlib
-import importlib.util
 import inspect
-import sys
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 from echelon.core.errors import (
@@ -28,15 +26,18 @@ from echelon.engine.result import Result
 from echelon.engine.settings import Settings
 from echelon.engine.simulate import Progress, simulate
 from echelon.gains.file import load_gain
-from echelon.gains.gain import Gain, synthesize
+from echelon.gains.gain import Gain, Method, synthesize
+from echelon.laws.check import prepare_law
 from echelon.laws.law import Law
 from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
+from echelon.references.reference import Reference, check_reference
 from echelon.scenario import registry
+from echelon.scenario.own import own_class, own_code
 from echelon.scenario.scenario import Fault, Scenario, refuse
-from echelon.scenario.sections import GainSpec
+from echelon.scenario.sections import GainSpec, OwnClass
 from echelon.scenario.yaml import joined
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import check_plant, vary_parameters
@@ -79,6 +80,7 @@ def build(scenario: Scenario) -> Built:
     Raises:
         ScenarioError: one line for each part that cannot be made, with its place in the file.
     """
+    _check_scenario(scenario)
     faults = _Faults(scenario)
     with precision("float64"):
         model = graph = None
@@ -93,6 +95,13 @@ def build(scenario: Scenario) -> Built:
         faults.settle()
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
+        )
+
+
+def _check_scenario(scenario: object) -> None:
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError(
+            f"`scenario` is {scenario!r}, and must be a `Scenario`, as `load_scenario` returns it."
         )
 
 
@@ -124,11 +133,16 @@ def _with_laws(
         graph,
         cast(Formation, formation),
         Laws(cast(Law, leader), cast(Law, follower)),
-        initial=scenario.initial.states or scenario.initial.spread or {},
+        initial=_initial(scenario),
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
     return Built(parts, _settings(scenario))
+
+
+def _initial(scenario: Scenario) -> Any:
+    """Return spreads by state or group, and states by agent, in one mapping."""
+    return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
 
 
 def run(scenario: Scenario, progress: Progress | None = None, built: Built | None = None) -> Result:
@@ -137,6 +151,7 @@ def run(scenario: Scenario, progress: Progress | None = None, built: Built | Non
     Raises:
         ScenarioError: a part cannot be made.
     """
+    _check_scenario(scenario)
     result = simulate(*(build(scenario) if built is None else built), progress)
     told = {f"version_{name}": text for name, text in versions().items()}
     return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
@@ -164,6 +179,16 @@ def _offered(make: Callable[..., Any], offers: Mapping[str, Any]) -> dict[str, A
 def _checked(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the given parameters, after checking that `make` takes each and has all it needs."""
     allowed = inspect.signature(make).parameters
+    _known(make, what, given)
+    for name, parameter in allowed.items():
+        if parameter.default is inspect.Parameter.empty and name not in given:
+            raise ScenarioError(f"`{what}` needs the parameter `{name}`, which is missing.")
+    return dict(given)
+
+
+def _known(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the given parameters, after checking that `make` takes each."""
+    allowed = inspect.signature(make).parameters
     for name in given:
         if name not in allowed:
             verb = "is" if len(allowed) == 1 else "are"
@@ -171,76 +196,74 @@ def _checked(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> d
             raise ScenarioError(
                 f"got the parameter `{name}` of `{what}`, {taken}{did_you_mean(name, allowed)}."
             )
-    for name, parameter in allowed.items():
-        if parameter.default is inspect.Parameter.empty and name not in given:
-            raise ScenarioError(f"`{what}` needs the parameter `{name}`, which is missing.")
-    return dict(given)
+    return given
+
+
+class _Part(NamedTuple):
+    """A class that a scenario names, what messages call it, and its own keys there."""
+
+    cls: Callable[..., Any]
+    what: str
+    given: Mapping[str, Any]
+    own: bool
+
+    def made(self, offers: Mapping[str, Any] = MappingProxyType({})) -> Any:
+        """Return an instance made of the keys and of those offers that it takes.
+
+        Raises:
+            ScenarioError: a key is unknown or missing, or the class refuses a value.
+        """
+        given = _checked(self.cls, self.what, {**_offered(self.cls, offers), **self.given})
+        with own_code(f"`{self.what}` cannot be made with these parameters"):
+            return self.cls(**given)
+
+
+def _part(
+    scenario: Scenario,
+    kind: type,
+    table: Mapping[str, registry.Entry],
+    name: str | None,
+    python: str | None,
+    given: Mapping[str, Any] = MappingProxyType({}),
+) -> _Part:
+    """Return what a scenario names: a member of a table, or a class in a file of the user's."""
+    if python is not None:
+        return _Part(own_class(scenario.folder, python, kind), python, given, own=True)
+    return _Part(resolve(table[str(name)]), str(name), given, own=False)
+
+
+def _law_part(
+    scenario: Scenario, table: Mapping[str, registry.Entry], law: str | OwnClass
+) -> _Part:
+    if isinstance(law, OwnClass):
+        return _part(scenario, Law, table, None, law.python, law.parameters)
+    return _part(scenario, Law, table, law, None)
 
 
 def _model(scenario: Scenario) -> ControlAffine:
     spec = scenario.model
-    if spec.python:
-        cls, what = _user_class(scenario.folder, spec.python), spec.python
-    else:
-        cls, what = resolve(registry.MODELS[str(spec.name)]), str(spec.name)
+    part = _part(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
     extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
-    if extra and "allow_unphysical" not in _accepted(cls):
+    if extra and "allow_unphysical" not in _accepted(part.cls):
         raise ModelError(
-            f"`allow_unphysical` has no meaning for `{what}`, which has no such parameter."
+            f"`allow_unphysical` has no meaning for `{part.what}`, which has no such parameter."
         )
-    if isinstance(spec.parameters, str):
-        named = getattr(cls, "named", None)
-        if named is None:
-            raise ModelError(
-                f"`{what}` has no named parameter sets, and got `{spec.parameters}`; "
-                "give a mapping."
-            )
-        return named(spec.parameters, **extra)
-    try:
-        return cls(**_checked(cls, what, {**(spec.parameters or {}), **extra}))
-    except (TypeError, ValueError) as error:
-        raise ModelError(
-            f"`{what}` cannot be made with these parameters: {_first_line(error)}."
-        ) from error
+    given = spec.parameters or {}
+    given = {"set": given} if isinstance(given, str) else dict(given)
+    if "set" in given and "set" not in _accepted(part.cls):
+        return _named_set(part, given.pop("set"), {**given, **extra})
+    return part._replace(given={**given, **extra}).made()
 
 
-def _user_class(folder: Path, target: str) -> type[ControlAffine]:
-    """Return a model class from a user's file, `file.py:Class`."""
-    path, _, name = target.rpartition(":")
-    file = (folder / path).resolve()
-    if not file.is_file():
+def _named_set(part: _Part, name: object, changes: Mapping[str, Any]) -> ControlAffine:
+    """Return a model with a named set of parameters, some of them changed."""
+    named = getattr(part.cls, "named", None)
+    if named is None:
         raise ModelError(
-            f"the file `{file}` does not exist; a `python` path is relative to the scenario file."
+            f"`{part.what}` has no named parameter sets, and got `{name}`; give a mapping."
         )
-    spec = importlib.util.spec_from_file_location(f"echelon_user_{file.stem}", file)
-    if spec is None or spec.loader is None:
-        raise ModelError(f"the file `{file}` is no Python file.")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise ModelError(
-            f"the file `{file}` does not import: {type(error).__name__}: {_first_line(error)}."
-        ) from error
-    models = [key for key, value in vars(module).items() if _is_model(value)]
-    found = getattr(module, name, None)
-    if not _is_model(found):
-        has = f"it has {listing(models)}" if models else "it has none"
-        raise ModelError(
-            f"`{name}` in `{file}` is no `ControlAffine` class; {has}{did_you_mean(name, models)}."
-        )
-    return cast(type[ControlAffine], found)
-
-
-def _is_model(value: object) -> bool:
-    return (
-        isinstance(value, type) and issubclass(value, ControlAffine) and value is not ControlAffine
-    )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or ["no message"])[0].rstrip(".")
+    with own_code(f"`{part.what}` cannot be made with these parameters"):
+        return named(name, **_known(part.cls, part.what, changes))
 
 
 def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
@@ -276,8 +299,10 @@ def _reference(scenario: Scenario) -> Any:
     spec = scenario.reference
     if spec is None:
         return None
-    cls = resolve(registry.REFERENCES[spec.name])
-    return cls(**_checked(cls, spec.name, spec.parameters))
+    part = _part(scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters)
+    reference = part.made()
+    check_reference(reference)
+    return reference
 
 
 def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:
@@ -288,25 +313,34 @@ def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Format
     return make(model, graph, **_offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
 
 
-def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, folder: Path) -> Gain:
+def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:
     if spec.file is not None:
-        return load_gain(folder / spec.file, model, graph)
-    cls = resolve(registry.METHODS[spec.method])
-    return synthesize(model, graph, cls(**_checked(cls, spec.method, spec.arguments)))
+        return load_gain(scenario.folder / spec.file, model, graph)
+    part = _part(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
+    method = part.made()
+    with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
+        return synthesize(model, graph, method)
 
 
 def _follower(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
 ) -> Law | None:
     spec = scenario.follower
-    cls = resolve(registry.FOLLOWER_LAWS[spec.law])
+    part = _law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
     offers: dict[str, Any] = {"feedforward": spec.feedforward, "trim": spec.trim}
-    if "gain" in _accepted(cls):
+    if "gain" in _accepted(part.cls):
         with faults.at("follower", "gain"):
-            offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)
+            offers["gain"] = _gain(model, graph, spec.gain, scenario)
         if "gain" not in offers:
             return None
-    return cls(**_offered(cls, offers)).prepared(model, graph)
+    return _law(part, offers, model, graph)
+
+
+def _law(part: _Part, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
+    """Return the law of a scenario, completed and checked."""
+    law = part.made(offers)
+    with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
+        return prepare_law(law, model, graph)
 
 
 def _leader(
@@ -318,15 +352,15 @@ def _leader(
     reaction: Gain | None,
 ) -> Law | None:
     spec = scenario.leader
-    cls = resolve(registry.LEADER_LAWS[spec.law])
-    if spec.reacts and "reaction" not in _accepted(cls):
+    part = _law_part(scenario, registry.LEADER_LAWS, spec.law)
+    if spec.reacts and "reaction" not in _accepted(part.cls):
         raise ScenarioError(
-            f"`reacts` is true, and the law `{spec.law}` cannot be told to react; use `tracking`."
+            f"`reacts` is true, and the law `{part.what}` cannot be told to react; use `tracking`."
         )
     if spec.reacts and reaction is None:
-        raise ScenarioError(
-            f"`reacts` needs a follower law with a gain, and `{scenario.follower.law}` has none."
-        )
+        raise ScenarioError("`reacts` needs a follower law with a gain, and this one has none.")
+    if reference is not None and "reference" not in _accepted(part.cls):
+        raise ScenarioError(f"there is a `reference`, and the law `{part.what}` takes none.")
     offers: dict[str, Any] = {
         "reference": reference,
         "reaction": reaction,
@@ -336,10 +370,10 @@ def _leader(
     }
     if spec.gain is not None:
         with faults.at("leader", "gain"):
-            offers["gain"] = _gain(model, graph, spec.gain, scenario.folder)
+            offers["gain"] = _gain(model, graph, spec.gain, scenario)
         if "gain" not in offers:
             return None
-    return cls(**_offered(cls, offers)).prepared(model, graph)
+    return _law(part, offers, model, graph)
 
 
 def _settings(scenario: Scenario) -> Settings:

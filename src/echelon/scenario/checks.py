@@ -19,11 +19,11 @@ _TRACKS = ("tracking", "optimal-tracking")
 """The leader laws that follow a reference."""
 
 # Of these two keys a section has one at most; True where it must have one.
-_SOURCES: dict[str, tuple[str, str, bool]] = {
+SOURCES: dict[str, tuple[str, str, bool]] = {
     "model": ("name", "python", True),
     "graph": ("edges", "name", True),
     "formation": ("offsets", "name", False),
-    "initial": ("spread", "states", False),
+    "reference": ("name", "python", True),
 }
 
 # What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
@@ -74,7 +74,7 @@ def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
 
 
 def _sources(data: Part) -> Iterator[Finding]:
-    for name, (one, other, required) in _SOURCES.items():
+    for name, (one, other, required) in SOURCES.items():
         part = data.get(name)
         if not isinstance(part, dict):
             continue
@@ -116,10 +116,14 @@ def _choices(data: Part) -> Iterator[Finding]:
     yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
     for role in ("leader", "follower"):
         gain = section(data, role, "gain")
-        if gain.get("file") is not None and gain.get("method") is not None:
-            yield (role, "gain"), "got both `file` and `method`, allowed is one of them."
+        sources = [key for key in ("file", "method", "python") if gain.get(key) is not None]
+        if len(sources) > 1:
+            both = " and ".join(f"`{key}`" for key in sources)
+            yield (role, "gain"), f"got {both}, allowed is one of them."
+        if "python" in sources:  # whose keys its class alone knows
+            continue
         method = gain.get("method", registry.DEFAULT_METHOD)
-        made_by = "file" if gain.get("file") is not None else method
+        made_by = "file" if "file" in sources else method
         yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
         # The schema leaves open which further keys a method has.
         for key in (key for key in gain if isinstance(key, str) and key not in registry.GAIN_KEYS):

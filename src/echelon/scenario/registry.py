@@ -101,7 +101,7 @@ METHODS = {
 }
 DEFAULT_METHOD = "riccati"
 _ARGUMENTS = (key for entry in METHODS.values() for key in entry.needs + entry.takes)
-GAIN_KEYS = tuple(dict.fromkeys(("method", *_ARGUMENTS, "file")))
+GAIN_KEYS = tuple(dict.fromkeys(("method", *_ARGUMENTS, "python", "file")))
 """All keys of a gain, each once."""
 
 FOLLOWER_LAWS = {

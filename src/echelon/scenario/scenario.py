@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.scenario import sections
 from echelon.scenario.checks import cross_faults, number_of, section
+from echelon.scenario.override import settle_overrides
 from echelon.scenario.values import FolderName, Seed
 from echelon.scenario.yaml import (
     Document,
@@ -197,6 +198,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     Args:
         source: Path to a YAML file, or the name of a bundled scenario (which wins over a file).
         overrides: Texts such as `simulation.horizon=10`, laid over the file before it is checked.
+            A path among them is relative to the working folder, one in the file to the file.
 
     Raises:
         ScenarioError: There is no such scenario, or it has faults: one line for each of them, which
@@ -209,7 +211,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
         raise ScenarioError(f"{name}: this file cannot be read as UTF-8 text: {error}.") from error
     document = read_yaml(text, name)
     if overrides:
-        document = apply_overrides(document, overrides)
+        document = settle_overrides(apply_overrides(document, overrides))
         text = dump_yaml(document.data)
     return _scenario(document, text, file.parent)
 

@@ -22,6 +22,7 @@ from echelon.scenario.values import (
     Numbers,
     Numeric,
     OneOf,
+    OwnOr,
     Parameters,
     Positive,
     Seed,
@@ -45,7 +46,8 @@ class ModelSpec(BaseModel, **_either("name", "python")):
     python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
     parameters: Parameters = None
-    """Name of a set of parameters, or the parameters, in the model's units."""
+    """Name of a set of parameters, or the parameters, in the model's units; with the key `set` they
+    change those of a named set."""
     allow_unphysical: bool = False
     """Accept parameters that no body can have."""
 
@@ -97,20 +99,50 @@ class FormationSpec(BaseModel, **STRICT):
 
 
 @final
-class ReferenceSpec(BaseModel):
-    """What the leader tracks: a name of the registry, and that reference's own keys beside it."""
+class OwnClass(BaseModel):
+    """A class in a file of the user's, and what it is made with beside it."""
 
     model_config = STRICT | ConfigDict(extra="allow")
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
-    name: Annotated[str, OneOf(registry.REFERENCES)]
+    python: ClassInFile
+    """`file.py:Class`, the file relative to the scenario file."""
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """The class's own keys: numbers or nested tuples of numbers."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+@final
+class ReferenceSpec(BaseModel):
+    """What the leader tracks: a name of the registry or a class in a file of the user's.
+
+    That reference's own keys stand beside it.
+    """
+
+    model_config = _either("name", "python") | ConfigDict(extra="allow")
+    # narrower than the base's, as pydantic wants it to check the further keys
+    __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
+
+    name: Annotated[str, OneOf(registry.REFERENCES)] | None = None
     """Name of a reference."""
+    python: ClassInFile | None = None
+    """`file.py:Class`, the file relative to the scenario file."""
 
     @property
     def parameters(self) -> Mapping[str, Any]:
         """The reference's own keys: numbers or nested tuples of numbers, in m, s and rad."""
         return dict(self.__pydantic_extra__ or {})
+
+
+_GAIN_SCHEMA: Any = {
+    "anyOf": [
+        {"required": ["python"]},
+        {"propertyNames": {"enum": list(registry.GAIN_KEYS)}},
+    ]
+}
 
 
 @final
@@ -119,9 +151,7 @@ class GainSpec(BaseModel):
 
     # Arguments that deserve a description, or are no numbers, have their keys here; so that a new
     # method needs no more than its line in the registry, further ones may be numbers.
-    model_config = STRICT | ConfigDict(
-        extra="allow", json_schema_extra={"propertyNames": {"enum": list(registry.GAIN_KEYS)}}
-    )
+    model_config = STRICT | ConfigDict(extra="allow", json_schema_extra=_GAIN_SCHEMA)
     # narrower than the base's, as pydantic wants it to check the further keys
     __pydantic_extra__: dict[str, Numeric] = Field(init=False)  # pyright: ignore
 
@@ -143,21 +173,35 @@ class GainSpec(BaseModel):
     """Whether a rate is proved in exact arithmetic where it can be."""
     symmetry_weight: Numeric | None = None
     """Weight of the symmetric states in the P of `inner-loop`."""
+    python: ClassInFile | None = None
+    """A method of one's own, `file.py:Class`, the file relative to the scenario file; its own keys
+    stand beside it."""
     file: str | None = None
     """Gain file of `echelon design`, relative to the scenario file."""
 
     @property
     def arguments(self) -> dict[str, Any]:
         """What it gives the method."""
-        return self.model_dump(exclude={"method", "file"}, exclude_none=True)
+        return self.model_dump(exclude={"method", "python", "file"}, exclude_none=True)
+
+
+LeaderLaw = Annotated[
+    Annotated[str, OneOf(registry.LEADER_LAWS)] | OwnClass,
+    OwnOr(registry.LEADER_LAWS),
+]
+FollowerLaw = Annotated[
+    Annotated[str, OneOf(registry.FOLLOWER_LAWS)] | OwnClass,
+    OwnOr(registry.FOLLOWER_LAWS),
+]
 
 
 @final
 class LeaderSpec(BaseModel, **STRICT):
     """What the leader does."""
 
-    law: Annotated[str, OneOf(registry.LEADER_LAWS)] = Field(default_factory=lambda: "passive")
-    """Name of a law; default `tracking` with a reference, `passive` without."""
+    law: LeaderLaw = Field(default_factory=lambda: "passive")
+    """Name of a law, or one of one's own, `{python: file.py:Class}` with its own keys; default
+    `tracking` with a reference, `passive` without."""
     reacts: bool = False
     """Whether the leader answers to its neighbours."""
     start_error: dict[str, float] = {}
@@ -170,8 +214,8 @@ class LeaderSpec(BaseModel, **STRICT):
 class FollowerSpec(BaseModel, **STRICT):
     """What every follower does."""
 
-    law: Annotated[str, OneOf(registry.FOLLOWER_LAWS)] = "consensus"
-    """Name of a law."""
+    law: FollowerLaw = "consensus"
+    """Name of a law, or one of one's own, `{python: file.py:Class}` with its own keys."""
     gain: GainSpec = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
     feedforward: Annotated[str, OneOf(map(str, Feedforward))] = "relay"
@@ -184,12 +228,12 @@ class FollowerSpec(BaseModel, **STRICT):
 
 @final
 class InitialSpec(BaseModel, **STRICT):
-    """Where the followers start: a random spread about their goals, or given states."""
+    """Where the followers start: a random spread about their goals, save those of given states."""
 
     spread: dict[str, NotNegative] | None = None
     """Half-width of the spread, by state or group, in the states' units."""
     states: dict[int, Numbers] | None = None
-    """All states of an agent, in the states' units; the others start on goal."""
+    """All states of an agent, in the states' units; the others start by the spread."""
 
 
 @final

@@ -50,6 +50,12 @@ def OneOf(names: Iterable[str]) -> Allowed:
     return Allowed(are(listed), listed, core_schema.literal_schema(listed))
 
 
+def OwnOr(names: Iterable[str]) -> Allowed:
+    """Mark what is a name of a registry table or a class of the user's own."""
+    listed = list(names)
+    return Allowed(f"{are(listed)}, or `python: file.py:Class`", listed)
+
+
 def _weighted(edge: object) -> object:
     """Return an edge with its weight, 1 unless it is given."""
     if not isinstance(edge, list) or len(edge) not in (2, 3):
@@ -83,6 +89,9 @@ def _numeric(value: object) -> object:
         # the list may be long, so the message shows what is no number and not the whole list
         allowed = "is a number or a nested list of numbers"
         raise PydanticCustomError("allowed", allowed, {"got": value})
+    if isinstance(value, int) and abs(value) >= _WHOLE:
+        allowed = "is a whole number below 2^63, or one with an exponent, as `1e23`"
+        raise PydanticCustomError("allowed", allowed, {"got": value})
     return value
 
 
@@ -98,9 +107,11 @@ ClassInFile = Annotated[
 ]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
-Count = Annotated[int, Field(ge=1)]
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Agent = Annotated[int, Field(ge=0)]
+_WHOLE = 2**63
+"""The first whole number that NumPy and JAX do not know."""
+Count = Annotated[int, Field(ge=1, lt=_WHOLE)]
+Seed = Annotated[int, Field(ge=0, lt=_WHOLE)]
+Agent = Annotated[int, Field(ge=0, lt=_WHOLE)]
 Agents = Annotated[tuple[Agent, ...], Field(strict=False)]
 Edge = Annotated[
     tuple[Agent, Agent, Positive],

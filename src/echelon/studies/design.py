@@ -1,24 +1,34 @@
 """All gain methods on one scenario, side by side, and one of them recommended."""
 
 import time
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from echelon.certificates import margins
-from echelon.core.errors import EchelonError, GainError, did_you_mean, listing
+from echelon.certificates.domain import Domain
+from echelon.core.errors import (
+    EchelonError,
+    GainError,
+    ScenarioError,
+    did_you_mean,
+    listing,
+)
 from echelon.core.numerics import precision
 from echelon.core.words import Theorem
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain, Method, synthesize
 from echelon.laws.consensus import Consensus
+from echelon.models.model import ControlAffine
 from echelon.promises.promise import Promise, promise
 from echelon.promises.statement import Hypothesis
 from echelon.scenario import registry
 from echelon.scenario.build import Built, build, resolve
 from echelon.scenario.scenario import Scenario
 from echelon.scenario.sections import GainSpec
+from echelon.scenario.yaml import Fault
 from echelon.studies.speedup import speedup
 
 _ADVISED = 100
@@ -108,7 +118,7 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
             f"{did_you_mean(method, registry.METHODS)}."
         )
     spec = scenario.follower.gain if isinstance(scenario, Scenario) else None
-    built = build(scenario) if isinstance(scenario, Scenario) else Built(*scenario)
+    built = _built(scenario) if isinstance(scenario, Scenario) else Built(*scenario)
     names = registry.METHODS if method is None else [method]
     methods = [resolve(registry.METHODS[name]) for name in names]
     tried = tuple(
@@ -119,6 +129,36 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     best, dt = recommended(tried, built.settings.dt), built.settings.dt
     why = "No method gives a stable loop here." if best is None else because(best, tried, dt)
     return Designs(tried, best, why, built.settings)
+
+
+_ALWAYS = GainSpec(method="given", P="identity")
+"""A gain that there is for every model."""
+
+
+def _built(scenario: Scenario) -> Built:
+    """Build a scenario; where its own gain alone cannot be made, with one that always can."""
+    try:
+        return build(scenario)
+    except ScenarioError as error:
+        faults: tuple[Fault, ...] = getattr(error, "faults", ())
+        own = scenario.follower.gain
+        # A file that is not there was meant to be, while a method that fails has its row.
+        if own.file or own.python or {fault.field for fault in faults} != {"follower.gain"}:
+            raise
+        follower = scenario.follower.model_copy(update={"gain": _ALWAYS})
+        built = build(scenario.model_copy(update={"follower": follower}))
+        # A domain that is none is a mistake, and not what a method fails at.
+        if own.domain is not None and not _is_domain(built.parts.model, own.domain):
+            raise
+        return built
+
+
+def _is_domain(model: ControlAffine, bounds: Mapping[str, Any]) -> bool:
+    try:
+        Domain.about(model, bounds)
+    except GainError:
+        return False
+    return True
 
 
 def _chooses(method: type[Method]) -> bool:
@@ -173,9 +213,9 @@ def _why(best: Design, others: list[Design], rivals: list[Design], dt: float) ->
 def _tried(method: type[Method], arguments: dict[str, Any], built: Built) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
     name, (parts, settings) = method.name, built
-    missing = [f"`follower.gain.{key}`" for key in method.needs if key not in arguments]
+    missing = [key for key in method.needs if key not in arguments]
     if missing:
-        return Design(name, None, reason=f"give {' and '.join(missing)} to try it")
+        return Design(name, None, reason=_wish(name, missing, parts))
     began = time.perf_counter()
     try:
         gain = synthesize(parts.model, parts.graph, method(**arguments))
@@ -186,6 +226,15 @@ def _tried(method: type[Method], arguments: dict[str, Any], built: Built) -> Des
     found = promise(parts, settings)
     with precision("float64"):
         return _known(gain, parts, settings, found)._replace(seconds=seconds)
+
+
+def _wish(method: str, missing: list[str], parts: Parts) -> str:
+    """Return how a scenario gives a method the keys that it misses."""
+    model = parts.model
+    state = [*model.state_groups, *model.state_names][0]
+    shown = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
+    keys = ", ".join(shown.get(key, f"{key}: ...") for key in missing)
+    return f"give `follower.gain={{method: {method}, {keys}}}` to try it"
 
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
@@ -225,7 +274,8 @@ def _advice(gain: Gain, parts: Parts) -> str:
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
     """Return what the scenario says of this method, and its domain for those that need one."""
-    if spec is not None and spec.method == method.name and spec.file is None:
+    made = spec is not None and spec.file is None and spec.python is None
+    if spec is not None and made and spec.method == method.name:
         return {**method.usual, **spec.arguments}
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region

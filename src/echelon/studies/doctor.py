@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core import numerics
+from echelon.core.errors import ModelError
 from echelon.core.provenance import versions
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
@@ -21,6 +22,7 @@ from echelon.laws.consensus import Consensus
 from echelon.laws.tracking import Tracking
 from echelon.models import ControlAffine, Pendulum, Quadrotor
 from echelon.models.check import check_model
+from echelon.models.linearization import linearize
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Lemniscate
@@ -49,7 +51,7 @@ def checks() -> Iterator[Check]:
     """Run the self-checks one after the other."""
     tests: tuple[Callable[[], Check], ...] = (
         _double_precision,
-        _flags_untouched,
+        _precision_kept,
         _models,
         _spectra,
         _order,
@@ -71,26 +73,36 @@ def _double_precision() -> Check:
     )
 
 
-def _flags_untouched() -> Check:
-    before = jax.config.read("jax_enable_x64")
+def _precision_kept() -> Check:
+    """Linearize in a float32 program."""
+    # Nobody else asks for this damping, so that no answer from before is handed out.
+    damping = 0.1234567890123
     with numerics.precision("float32"):
-        single = jnp.asarray(1.0).dtype == jnp.float32
+        found = linearize(Pendulum(damping=damping)).A
+        after = jnp.asarray(1.0).dtype
+    off = abs(float(found[1, 1]) + damping)
     return Check(
-        "float32 is there by choice", bool(single), f"jax_enable_x64 is {before} inside a verb"
+        "a float32 program gets float64 answers, and stays what it is",
+        off < 1e-15 and after == jnp.float32,
+        f"A is off by {off:.1g}, and JAX is in {after} after it",
     )
 
 
 def _models() -> Check:
-    count = 0
-    for entry in registry.MODELS.values():
-        if entry.target.endswith(":Linear"):
-            continue
-        module, _, name = entry.target.partition(":")
-        make: Callable[[], ControlAffine] = getattr(importlib.import_module(module), name)
-        check_model(make())
-        count += 1
+    """Check every model of the list, by its own defaults where it has some."""
+    given = {"linear": {"A": ((0.0, 1.0), (0.0, 0.0)), "B": ((0.0,), (1.0,))}}
+    faults = []
+    for name, entry in registry.MODELS.items():
+        module, _, cls = entry.target.partition(":")
+        make: Callable[..., ControlAffine] = getattr(importlib.import_module(module), cls)
+        try:
+            check_model(make(**given.get(name, {})))
+        except ModelError as error:
+            faults.append(str(error))
     return Check(
-        "every bundled model is finite, with its trim an equilibrium", True, f"{count} models"
+        "every bundled model is finite, with its trim an equilibrium",
+        not faults,
+        " ".join(faults) or f"{len(registry.MODELS)} models",
     )
 
 

@@ -107,7 +107,8 @@ class Disturbance:
             # The two halves of the seed, since a precision could cut it to its lower one.
             key=np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32),
             # Whole steps: a wind that changed within one would cost the integrator its order.
-            window=np.asarray(max(1, round(self.hold / dt)), np.int32),
+            # A draw that outlasts any run need not be counted further.
+            window=np.asarray(max(1, round(min(self.hold / dt, 2**31 - 1))), np.int32),
             common=self.common,
         )
 

@@ -1,0 +1,497 @@
+"""Feed the command line nonsense: no crash, no hang, no silence; `python3 dev.py fuzz [SECONDS]`.
+
+Scenario files, `--set`, gain files, folders of runs and whole command lines are drawn by a seeded
+grammar: sound ones with a few things spoiled. Each is a process of its own, so that a hang, a crash
+or a hunger for memory ends it alone. What must hold of each: it ends within its time, with an exit
+code that the help lists, without a traceback or a library's warning, and if it refuses, then in
+whole sentences.
+"""
+
+import argparse
+import contextlib
+import copy
+import json
+import os
+import random
+import resource
+import select
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ALLOWED = {0, 1, 2, 3, 4}
+"""Exit codes: done, not promised, bad input, diverged, an optional part is missing."""
+CPU = 20
+"""Seconds of computing after which a case hangs; compiling takes some 5 of them."""
+MEMORY = 4 << 30
+"""Bytes of resident memory that no case of these needs."""
+
+BASES: list[dict[str, Any]] = [
+    {
+        "name": "carts",
+        "model": {"name": "double-integrator", "parameters": {"dimension": 2, "drag": 0.1}},
+        "graph": {"edges": [[0, 1], [1, 2, 0.5]], "leaders": [0]},
+        "formation": {"offsets": {1: [1.0, 0.0], 2: [2.0, 0.0]}},
+        "reference": {"name": "circle", "radius": 1.0, "rate": 0.5, "center": [0, 0, 1]},
+        "leader": {"law": "tracking", "reacts": False, "start_error": {"x": 0.1}},
+        "follower": {
+            "law": "consensus",
+            "gain": {"method": "riccati", "Q": [1, 1, 1, 1], "coupling": 1.5},
+            "feedforward": "relay",
+        },
+        "initial": {"spread": {"position": 0.5}},
+        "disturbance": {"rms": {"velocity": 0.1}, "hold": 0.1},
+        "simulation": {"horizon": 0.2, "dt": 0.02, "store_every": 2},
+        "report": {"steady_window": 0.05},
+        "seed": 3,
+    },
+    {
+        "name": "ring",
+        "model": {"name": "van-der-pol", "parameters": {"damping": 1.0}},
+        "plant": {"scale": {"damping": 1.1}},
+        "graph": {"name": "ring", "agents": 4, "leaders": [0]},
+        "follower": {"gain": {"method": "given", "P": [2, 1], "coupling": 2.0}},
+        "initial": {"states": {1: [0.5, 0.0], 2: [0.0, 0.5]}},
+        "simulation": {"horizon": 0.1, "dt": 0.02, "integrator": "euler"},
+    },
+    {
+        "name": "points",
+        "model": {"name": "single-integrator", "parameters": {"dimension": 2}},
+        "graph": {"name": "grid", "rows": 2, "columns": 2},
+        "formation": {"name": "grid", "spacing": 0.5, "columns": 2},
+        "leader": {"law": "agreement"},
+        "follower": {"law": "agreement"},
+        "simulation": {"horizon": 0.1, "dt": 0.05, "limits": False, "precision": "float32"},
+    },
+]
+
+ODD: list[Any] = [
+    None,
+    True,
+    -1,
+    0,
+    1,
+    2,
+    0.5,
+    -0.0,
+    1e-300,
+    1e300,
+    1e23,
+    10**23,
+    2**63,
+    float("nan"),
+    float("inf"),
+    "",
+    "x",
+    "1",
+    "nan",
+    "Ü\U0001f680",
+    "a\nb",
+    "riccati",
+    "../..",
+    [],
+    [1],
+    [[1, 2], [3]],
+    [None],
+    {},
+    {"x": 1},
+    {1: [0, 0]},
+]
+FACTORS = [-1, 0, 2, 3, 0.5, 1e-9, 1e9, 1e200]
+NUMBERS = [0, 1, 2, 3, 0.1, 1e-8, 1e-300, 1e16, 1e155, 1.7e308]
+MARKS = [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
+WORDS = ["dt", "horizon", "gain", "name", "python", "file", "set", "0", "x", "position", "é", "*"]
+
+
+class Case(NamedTuple):
+    """A command line, and the files that lie where it runs."""
+
+    arguments: list[str]
+    files: dict[str, bytes]
+
+
+class Ending(NamedTuple):
+    """How a case ended: exit code, negative for a signal; what it printed; what is wrong."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+    faults: tuple[str, ...]
+
+
+# ---- the grammar ---------------------------------------------------------------------------------
+
+
+def places(data: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the paths of all values in plain data."""
+    found = [path] if path else []
+    if not isinstance(data, dict | list):
+        return found
+    for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+        found += places(value, (*path, key))
+    return found
+
+
+def spoil(rng: random.Random, data: Any) -> Any:
+    """Return plain data with one thing changed: replaced, left out, added, doubled or renamed."""
+    data = copy.deepcopy(data)
+    *above, key = rng.choice(places(data))
+    part = data
+    for step in above:
+        part = part[step]
+    how = rng.choice(["replace", "replace", "drop", "add", "wrap"])
+    # A number is mostly made another one, so that more than types is tried.
+    if isinstance(part[key], int | float) and rng.random() < 0.7:
+        how = "scale"
+    if how == "drop":
+        del part[key]
+    elif how == "add" and isinstance(part, dict):
+        part[rng.choice(WORDS)] = rng.choice(ODD)
+    elif how == "scale":
+        part[key] = rng.choice([part[key] * by for by in FACTORS] + NUMBERS)
+    elif how == "wrap":
+        part[key] = rng.choice([[part[key]], {"x": part[key]}, str(part[key])])
+    else:
+        part[key] = rng.choice(ODD)
+    return data
+
+
+def torn(rng: random.Random, text: bytes) -> bytes:
+    """Return bytes of which a few are lost, doubled or others."""
+    found = bytearray(text)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(found) + 1)
+        how = rng.randrange(4)
+        if how == 0:
+            del found[at : at + rng.randint(1, 20)]
+        elif how == 1:
+            found[at:at] = rng.choice(
+                [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
+            )
+        elif how == 2:
+            found[at:at] = found[at : at + 30]
+        else:
+            found[at : at + 1] = bytes([rng.randrange(256)])
+    return bytes(found)
+
+
+def harmless(data: Any) -> bool:
+    """Tell whether a scenario, if it runs, runs for a moment: long or large ones are no fault."""
+    if not isinstance(data, dict):
+        return True
+    simulation, graph = (data.get(name) for name in ("simulation", "graph"))
+    if isinstance(graph, dict):
+        sizes = [graph.get(key) for key in ("agents", "rows", "columns")]
+        edges = [end for edge in _rows(graph.get("edges")) for end in _rows(edge)[:2]]
+        if any(isinstance(size, int) and size > 100 for size in sizes + edges):
+            return False
+    if not isinstance(simulation, dict):
+        return True
+    horizon, dt = simulation.get("horizon"), simulation.get("dt")
+    if not all(isinstance(value, int | float) for value in (horizon, dt)) or not dt:
+        return True
+    return not 2000 < horizon / dt
+
+
+def _rows(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def scenario(rng: random.Random) -> Any:
+    """Return a scenario with up to three things spoiled, as plain data."""
+    while True:
+        data = rng.choice(BASES)
+        for _ in range(rng.choice([0, 1, 1, 1, 2, 3])):
+            data = spoil(rng, data) if places(data) else data
+        if harmless(data):
+            return data
+
+
+def as_yaml(data: Any) -> bytes:
+    """Return plain data as YAML."""
+    from echelon.scenario.yaml import dump_yaml
+
+    return dump_yaml(data).encode("utf-8", "surrogatepass")
+
+
+def large(value: Any) -> bool:
+    """Tell whether a number is too large for a quick run."""
+    return isinstance(value, int | float) and value > 100
+
+
+def setting(rng: random.Random, data: Any) -> str:
+    """Return a `--set` of something that is there, or is not."""
+    path = [*rng.choice(places(data))]
+    if rng.random() < 0.3:
+        path[rng.randrange(len(path))] = rng.choice(WORDS)
+    value = rng.choice(ODD if rng.random() < 0.5 else NUMBERS)
+    # Long runs and large graphs are no fault.
+    if path[-1] in ("horizon", "agents", "rows", "columns") and large(value):
+        value = -1
+    if path[-1] == "dt" and not large(value) and isinstance(value, int | float):
+        value = max(value, 1e-3) if value > 0 else value
+    from echelon.scenario.yaml import inline_yaml
+
+    text = rng.choice([inline_yaml(value), "{", "[1, 2", "*a", "", "3 # three"])
+    return f"{'.'.join(map(str, path))}{rng.choice(['=', '=', '=', '=', ''])}{text}"
+
+
+def options(rng: random.Random, verb: str) -> list[str]:
+    """Return options that a verb has, and now and then one that it has not."""
+    some = {
+        "run": [["--no-figures"], ["--json"], ["--out", "out"], ["--out", "s.yaml"], ["--force"]],
+        "check": [["--json"]],
+        "design": [["--json"], ["--method", "riccati"], ["--method", "x"], ["--out", "no/g.json"]],
+        "verify": [["--json"]],
+    }.get(verb, [])
+    found = [option for option in some if rng.random() < 0.4]
+    if rng.random() < 0.1:
+        found.append([rng.choice(["--nothing", "--json=3", "--set", "-", "--out"])])
+    return [word for option in found for word in option]
+
+
+def flown(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw a scenario file under a verb."""
+    data = scenario(rng)
+    text = as_yaml(data)
+    if rng.random() < 0.2:
+        text = torn(rng, text)
+    verb = rng.choice(["check", "check", "check", "run", "design"])
+    quick = ["--no-figures", "--out", "out"] if verb == "run" else []
+    quick += ["--method", "riccati"] if verb == "design" else []
+    return Case([verb, "s.yaml", *quick, *options(rng, verb)], {"s.yaml": text})
+
+
+def overridden(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw a sound scenario under `--set`."""
+    data = rng.choice(BASES)
+    sets = [["--set", setting(rng, data)] for _ in range(rng.randint(1, 3))]
+    words = [word for pair in sets for word in pair]
+    return Case(["check", "s.yaml", *words], {"s.yaml": as_yaml(data)})
+
+
+def gained(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw a gain file under `verify`, or under `check`."""
+    if rng.random() < 0.3:
+        spoiled = torn(rng, gain)
+    else:
+        data = json.loads(gain)
+        for _ in range(rng.choice([1, 1, 2, 3])):
+            data = spoil(rng, data) if places(data) else data
+        spoiled = json.dumps(data, default=str).encode("utf-8", "surrogatepass")
+    files = {"g.json": spoiled, "s.yaml": as_yaml(BASES[0])}
+    if rng.random() < 0.5:
+        return Case(["verify", "g.json", *options(rng, "verify")], files)
+    return Case(["check", "s.yaml", "--set", "follower.gain.file=g.json"], files)
+
+
+def reopened(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw the folder of a run of which a file is torn or missing."""
+    files = {f"out/{name}": text for name, text in run.items()}
+    for name in rng.sample(sorted(files), rng.randint(1, min(2, len(files)))):
+        files[name] = torn(rng, files[name]) if rng.random() < 0.7 else b""
+        if rng.random() < 0.2:
+            del files[name]
+    words = rng.choice([["run", "out", "--no-figures", "--out", "again"], ["check", "out"]])
+    if rng.random() < 0.4:
+        words = ["run", "--resume", "out"]
+    return Case(words, files)
+
+
+def typed(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw a command line of words."""
+    verbs = ["run", "check", "design", "compare", "verify", "list", "schema", "fly", "", "--help"]
+    verb = rng.choice(verbs)
+    names = ["s.yaml", "nowhere.yaml", ".", "", "g.json", "pape", "é", "\udcff", "-", "--", "/"]
+    words = [rng.choice(names) for _ in range(rng.randint(0, 2))]
+    if verb in ("run", "compare"):
+        # Sound ones of these take a while, and are drawn elsewhere.
+        words = [word for word in words if word != "s.yaml"] or ["nowhere.yaml"]
+    files = {"s.yaml": as_yaml(BASES[0]), "g.json": gain}
+    return Case([word for word in (verb, *words, *options(rng, verb))], files)
+
+
+KINDS: dict[str, Callable[..., Case]] = {
+    "scenario files": flown,
+    "--set": overridden,
+    "gain files": gained,
+    "folders of runs": reopened,
+    "command lines": typed,
+}
+
+
+# ---- one case ------------------------------------------------------------------------------------
+
+
+def call(arguments: list[str]) -> int:
+    """Run the command line in this process, and return its exit code."""
+    from echelon.cli.app import main
+
+    sys.argv = ["echelon", *arguments]
+    try:
+        main()
+    except SystemExit as left:
+        return left.code if isinstance(left.code, int) else int(left.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 99
+    return 0
+
+
+def attempt(case: Case) -> Ending:
+    """Run a case in a process of its own, and judge how it ended."""
+    folder = Path(tempfile.mkdtemp(prefix="echelon-fuzz-"))
+    for name, text in case.files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(text)
+    began = time.monotonic()
+    pipes = [os.pipe(), os.pipe()]
+    child = os.fork()
+    if not child:
+        os.chdir(folder)
+        for (_, end), stream in zip(pipes, (1, 2), strict=True):
+            os.dup2(end, stream)
+        resource.setrlimit(resource.RLIMIT_CPU, (CPU, CPU + 5))
+        os.environ["TMPDIR"] = str(folder)
+        code = call(case.arguments)
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code % 256)
+    for _, end in pipes:
+        os.close(end)
+    (out, err), hungry = _listen(child, [end for end, _ in pipes])
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    shutil.rmtree(folder, ignore_errors=True)
+    seconds = time.monotonic() - began
+    faults = ("it takes more than 4 GiB of memory",) if hungry else judged(code, out, err)
+    return Ending(code, out, err, seconds, tuple(faults))
+
+
+def _listen(child: int, ends: list[int]) -> tuple[list[str], bool]:
+    """Return what a process prints, and whether it was ended for its memory or its time."""
+    texts: dict[int, bytes] = dict.fromkeys(ends, b"")
+    still, hungry, began = set(ends), False, time.monotonic()
+    while still:
+        for end in select.select(still, [], [], 0.1)[0]:
+            piece = os.read(end, 1 << 16)
+            texts[end] += piece
+            if not piece:
+                still.remove(end)
+        with contextlib.suppress(OSError, ValueError):
+            resident = int(Path(f"/proc/{child}/statm").read_text().split()[1]) * 4096
+            if resident > MEMORY and not hungry:
+                hungry = True
+                os.kill(child, signal.SIGKILL)
+        if time.monotonic() - began > 6 * CPU:  # it waits, and does not compute
+            os.kill(child, signal.SIGKILL)
+    for end in ends:
+        os.close(end)
+    return [texts[end].decode("utf-8", "replace") for end in ends], hungry
+
+
+def judged(code: int, out: str, err: str) -> Iterator[str]:
+    """Yield what is wrong with how a case ended."""
+    if code in (-signal.SIGXCPU, -signal.SIGKILL):
+        yield f"it does not end within {CPU} s"
+    elif code not in ALLOWED:
+        yield f"its exit code is {code}"
+    if "Traceback (most recent call last)" in out + err:
+        yield "it shows a traceback"
+    if "Warning: " in err:
+        yield "it shows a library's warning"
+    said = [line for line in err.splitlines() if line.strip()]
+    if code in (2, 4) and not said:
+        yield "it refuses without a word"
+    # What the reader of words refuses, it does in a form of its own.
+    if code == 2 and said and not any(line.startswith(("Usage:", "Error: ")) for line in said):
+        if not said[0].startswith("echelon: "):
+            yield "its sentence does not begin with `echelon: `"
+        yield from (f"no full stop: {line}" for line in said if not line.endswith("."))
+
+
+# ---- many ----------------------------------------------------------------------------------------
+
+
+def sound() -> tuple[bytes, dict[str, bytes]]:
+    """Return a gain file, and the files of a run, made in processes of their own."""
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        (folder / "s.yaml").write_bytes(as_yaml(BASES[0]))
+        for words in (
+            ["design", "s.yaml", "--method", "riccati", "--out", "g.json"],
+            ["run", "s.yaml", "--no-figures", "--out", "out"],
+        ):
+            child = os.fork()
+            if not child:
+                os.chdir(folder)
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+                os._exit(call(words))
+            if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]):
+                raise SystemExit(f"a sound command fails: echelon {' '.join(words)}")
+        files = {path.name: path.read_bytes() for path in (folder / "out").iterdir()}
+        return (folder / "g.json").read_bytes(), files
+
+
+def drawn(seed: int, made: tuple[bytes, dict[str, bytes]]) -> tuple[str, Case]:
+    """Return the kind and the case that a seed draws."""
+    rng = random.Random(seed)
+    kind = [*KINDS][seed % len(KINDS)]
+    return kind, KINDS[kind](rng, *made)
+
+
+def preload() -> None:
+    """Import what the commands import, once for all processes, and compute nothing."""
+    import jax
+
+    import echelon.certificates.lmi
+    import echelon.cli.app
+    import echelon.results.dataset
+    import echelon.studies.design
+    import echelon.verifier.verify  # noqa: F401
+
+    del jax
+
+
+def main() -> int:
+    """Draw cases until the time or their number is over, and tell the faulty ones."""
+    parser = argparse.ArgumentParser(prog="fuzz", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("seconds", nargs="?", type=float, default=600.0)
+    parser.add_argument("--seed", type=int, default=0, help="of the first case")
+    parser.add_argument("--cases", type=int, default=sys.maxsize, help="at most so many")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["ECHELON_CACHE"] = cache
+        preload()
+        made, ends, faulty = sound(), Counter[str](), 0
+        deadline, seed = time.monotonic() + given.seconds, given.seed
+        while time.monotonic() < deadline and seed - given.seed < given.cases:
+            kind, case = drawn(seed, made)
+            ending = attempt(case)
+            ends[f"{kind}: exit code {ending.code}"] += 1
+            if ending.faults:
+                faulty += 1
+                print(f"\nseed {seed}: echelon {' '.join(map(ascii, case.arguments))}")
+                print("\n".join(f"  {fault}" for fault in ending.faults))
+                for name, text in case.files.items() if kind != "folders of runs" else ():
+                    print(f"  {name}: {text[:1500]!r}")
+                print(
+                    *(f"  | {line}" for line in ending.err.splitlines()[-6:]), sep="\n", flush=True
+                )
+            seed += 1
+    for what, count in sorted(ends.items()):
+        print(f"{count:6d}  {what}")
+    print(f"{sum(ends.values())} cases from seed {given.seed} on, {faulty} of them faulty")
+    return int(faulty > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,169 @@
+"""What a trace of somebody's function shows before it runs: shapes, types, casts, frozen values."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from echelon.core.errors import EchelonError
+from echelon.core.types import Array
+
+
+class Trace(NamedTuple):
+    """A function as JAX sees it.
+
+    Attributes:
+        result: what it returns, each array as its shape and type.
+        rounds: whether it casts a float64 to fewer digits on its way.
+        frozen: whether a second trace differs, as a clock or a random number makes it.
+    """
+
+    result: Any
+    rounds: bool
+    frozen: bool
+
+
+def trace(function: Callable[..., Any], *arguments: Any) -> Trace:
+    """Trace a function twice at arguments of these shapes; nothing is compiled or computed.
+
+    Raises:
+        Exception: whatever the function raises.
+    """
+
+    def once() -> tuple[Any, Any]:
+        # Under a name of its own, since JAX would hand out the first trace of one function again.
+        return jax.make_jaxpr(lambda *a: function(*a), return_shape=True)(*arguments)
+
+    first, result = once()
+    steps = list(_steps(first))
+    return Trace(
+        result,
+        any(rounds for _, _, rounds in steps),
+        [step[:2] for step in steps] != [step[:2] for step in _steps(once()[0])],
+    )
+
+
+def _steps(jaxpr: Any) -> Iterator[tuple[str, list[bytes], bool]]:
+    """Yield all equations, inner ones too: name, the numbers in it, and whether it rounds."""
+    yield "constants", [_bits(value) for value in getattr(jaxpr, "consts", ())], False
+    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        name = equation.primitive.name
+        numbers = [_bits(v.val) for v in equation.invars if hasattr(v, "val")]
+        yield name, numbers, name == "convert_element_type" and _shortens(equation)
+        for inner in _inner(equation.params.values()):
+            yield from _steps(inner)
+
+
+def _inner(values: Any) -> Iterator[Any]:
+    """Yield the jaxprs among parameters of an equation, those in tuples too."""
+    for value in values:
+        if hasattr(value, "eqns") or hasattr(value, "jaxpr"):
+            yield value
+        elif isinstance(value, tuple | list):
+            yield from _inner(value)
+
+
+def _shortens(equation: Any) -> bool:
+    [before], [after] = equation.invars, equation.outvars
+    kinds = [np.dtype(v.aval.dtype) for v in (before, after)]
+    return (
+        kinds[0] == np.float64
+        and jax.numpy.issubdtype(kinds[1], jax.numpy.floating)
+        and (kinds[1].itemsize < kinds[0].itemsize)
+    )
+
+
+def _bits(value: Any) -> bytes:
+    # Keys of random numbers are no numbers of NumPy's.
+    if jax.numpy.issubdtype(getattr(value, "dtype", np.dtype(float)), jax.dtypes.extended):
+        value = jax.random.key_data(value)
+    array: Array = np.asarray(value)
+    return array.tobytes()
+
+
+def check_function(
+    fault: Callable[[str], Exception],
+    what: str,
+    function: Callable[..., Any],
+    *arguments: Any,
+    shape: tuple[int, ...],
+    advice: str,
+) -> None:
+    """Check that a function returns one float64 array of a shape, and the same each time.
+
+    Args:
+        fault: makes an error of a sentence.
+        what: the function, as the sentence begins.
+        function: somebody's own code.
+        arguments: what it is traced at.
+        shape: of what it must return.
+        advice: what it must be, for a function that raises.
+
+    Raises:
+        Exception: the one that `fault` makes, for the first fault found.
+    """
+    found = traced(fault, what, function, *arguments, advice=advice)
+    check_array(fault, what, found.result, shape)
+
+
+def check_array(
+    fault: Callable[[str], Exception], what: str, value: Any, shape: tuple[int, ...]
+) -> None:
+    """Check that what a trace returns is one array of a shape, of float64 or whole numbers.
+
+    Raises:
+        Exception: the one that `fault` makes.
+    """
+    if not hasattr(value, "shape"):
+        raise fault(
+            f"{what} has the type `{type(value).__name__}`, and must be one array, such as "
+            "`jnp.stack([...])` makes."
+        )
+    if value.shape != shape:
+        raise fault(f"{what} has shape {value.shape}, and must have shape {shape}.")
+    # Whole numbers are exact, and JAX multiplies them with any other.
+    if value.dtype != np.float64 and not np.issubdtype(value.dtype, np.integer):
+        raise fault(
+            f"{what} has the type {value.dtype}, and must have that of its argument, float64; "
+            "write `jnp.asarray(..., x.dtype)`."
+        )
+
+
+def traced(
+    fault: Callable[[str], Exception],
+    what: str,
+    function: Callable[..., Any],
+    *arguments: Any,
+    advice: str,
+) -> Trace:
+    """Return the trace of somebody's function, which must neither fail nor round nor change.
+
+    Raises:
+        Exception: the one that `fault` makes, for the first fault found.
+    """
+    try:
+        found = trace(function, *arguments)
+    # A sentence of our own, which says more than its place would.
+    except EchelonError:
+        raise
+    # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
+    except Exception as error:
+        raise fault(f"{what} fails with {in_short(error)}; {advice}.") from error
+    if found.rounds:
+        raise fault(
+            f"{what} casts float64 numbers to fewer digits, and must keep the type of its "
+            "argument, `x.dtype`."
+        )
+    if found.frozen:
+        raise fault(
+            f"{what} differs from one call to the next, as a clock or a random number makes it, "
+            "and must be a function of its arguments alone."
+        )
+    return found
+
+
+def in_short(error: BaseException) -> str:
+    """Return the class and the first line of somebody else's error, without a full stop."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0].rstrip('.:') if lines else 'no message'}"
