@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from fractions import Fraction
 from typing import TypeAlias
 
+import numpy as np
+
 from echelon.core.types import Array
 
 Rows: TypeAlias = list[list[Fraction]]
@@ -72,6 +74,17 @@ def inverse(matrix: Rows) -> Rows:
             if i != k and work[i][k]:
                 work[i] = [x - work[i][k] * y for x, y in zip(work[i], work[k], strict=True)]
     return [row[size:] for row in work]
+
+
+def rounded(matrix: Rows) -> Array:
+    """Return a matrix of fractions as the nearest floats."""
+    return np.array([[float(x) for x in row] for row in matrix])
+
+
+def weighted(B: Array, R: Array) -> Array:
+    """Return B R^-1 B', rounded once."""
+    pull = rows_of(B)
+    return rounded(product(product(pull, inverse(rows_of(R))), transposed(pull)))
 
 
 def first_unproved(
