@@ -1,7 +1,8 @@
 """Linear algebra of the checker of saved gains: spectra, ranks and growth, and their rounding."""
 
+from collections.abc import Callable
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg
@@ -67,16 +68,15 @@ def _least(apart: Array, led: Array, guess: Array) -> tuple[float, float]:
     steps = _eliminate(apart, led)
     if steps is None:
         return 0.0, 0.0
-    x = guess + 1e-16
+    x, y = guess, guess + 1e-16
     for _ in range(_ITERATIONS):
-        x = x / np.linalg.norm(x)
+        # What is far from the slowest mode dies out, and must not become zero.
+        x = np.maximum(y / np.linalg.norm(y), 1e-150)
         y = _solve(*steps, x)
-        ratios = y / x
-        if ratios.max() <= (1.0 + 1e-14 * len(x)) * ratios.min():
+        if (y / x).max() * (x @ x) <= (1.0 + 1e-14 * len(x)) * (x @ y):
             break
-        x = y
     # Each of the additions rounds once.
-    return float(x @ x / (x @ y)), float((1.0 - 8.0 * _EPS * len(x)) / ratios.max())
+    return float(x @ x / (x @ y)), float((1.0 - 8.0 * _EPS * len(x)) / (y / x).max())
 
 
 def _eliminate(apart: Array, led: Array) -> tuple[Array, Array] | None:
@@ -109,29 +109,22 @@ def size(matrix: Array) -> float:
     return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0]))
 
 
-def doubt_of_solving(R: Array) -> float:
-    """Return the relative error of R^-1 b in floating point: its condition, units apart."""
-    units = np.sqrt(np.diag(R))
-    return 4.0 * _EPS * len(R) * float(np.linalg.cond(R / np.outer(units, units)))
+Doubt: TypeAlias = Callable[[Array, Array], float]
+"""From vectors y, x of length n to a bound on |y* D x|, D what is not known of a matrix."""
 
 
-def rightmost(matrix: Array, doubt: Array | float = 0.0) -> tuple[float, float]:
-    """Return the largest real part of an eigenvalue, and what may be wrong with it.
-
-    That is by rounding, and by entries that are known to +- doubt only.
-    """
+def rightmost(matrix: Array, doubt: Doubt = lambda y, x: 0.0) -> tuple[float, float]:
+    """Return the largest real part of an eigenvalue, and what rounding and a doubt make of it."""
     # Without the units of the states, which would inflate the bound of the rounding.
     balanced, (units, _) = scipy.linalg.matrix_balance(matrix, permute=False, separate=True)
     found: Any = scipy.linalg.eig(balanced, left=True, right=True)
     values, left, right = found
     at = int(np.argmax(values.real))
+    y, x = left[:, at], right[:, at]
     # A simple eigenvalue moves by the perturbation over the cosine of its two vectors (Wilkinson).
-    y, x = np.abs(left[:, at]), np.abs(right[:, at])
-    cosine = max(abs(np.vdot(left[:, at], right[:, at])), 1e-300)
-    rounding = 50.0 * _EPS * float(np.linalg.norm(balanced))
-    moved = float(y @ (np.broadcast_to(doubt, matrix.shape) * units / units[:, None]) @ x)
+    cosine = max(abs(np.vdot(y, x)), 1e-300)
+    lost = 50.0 * _EPS * float(np.linalg.norm(balanced)) + doubt(y / units, units * x)
     # Near a Jordan block that says too much: one of four moves by about the fourth root.
-    lost = rounding + moved
     return float(values[at].real), min(lost / cosine, 1e-2 * lost**0.25)
 
 

@@ -76,15 +76,15 @@ def inverse(matrix: Rows) -> Rows:
     return [row[size:] for row in work]
 
 
-def rounded(matrix: Rows) -> Array:
-    """Return a matrix of fractions as the nearest floats."""
+def weighted(B: Array, R: Array, P: Array) -> tuple[Array, Array, Array]:
+    """Return R^-1 B' (m, n), B R^-1 B' (n, n) and B R^-1 B'P (n, n), each rounded once."""
+    pull = product(inverse(rows_of(R)), transposed(rows_of(B)))
+    both = product(rows_of(B), pull)
+    return _rounded(pull), _rounded(both), _rounded(product(both, rows_of(P)))
+
+
+def _rounded(matrix: Rows) -> Array:
     return np.array([[float(x) for x in row] for row in matrix])
-
-
-def weighted(B: Array, R: Array) -> Array:
-    """Return B R^-1 B', rounded once."""
-    pull = rows_of(B)
-    return rounded(product(product(pull, inverse(rows_of(R))), transposed(pull)))
 
 
 def first_unproved(

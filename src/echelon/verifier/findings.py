@@ -2,8 +2,6 @@
 
 from typing import NamedTuple
 
-import numpy as np
-
 from echelon.core.types import Array
 from echelon.verifier import algebra, exact
 from echelon.verifier.file import SavedGain
@@ -55,7 +53,9 @@ class Facts(NamedTuple):
         saved: the file.
         eigenvalues: all of the grounded Laplacian, or those that a file without edges holds.
         bound: lambda_min is no less.
-        weighted: B R^-1 B' (n, n), rounded once, and `doubt`, what a solver may make of it.
+        pull: R^-1 B' (m, n), rounded once.
+        weighted: B R^-1 B' (n, n), the same.
+        feedback: B R^-1 B'P (n, n), the same.
         closed: A of the drift, its inner loop closed (n, n).
         speed: the size of its entries in units that make it small, 1/s.
     """
@@ -63,8 +63,9 @@ class Facts(NamedTuple):
     saved: SavedGain
     eigenvalues: Array
     bound: float
+    pull: Array
     weighted: Array
-    doubt: Array
+    feedback: Array
     closed: Array
     speed: float
 
@@ -79,14 +80,12 @@ def facts(saved: SavedGain) -> Facts:
     graph, B = saved.graph, saved.model.B
     stored = algebra.Spectrum(graph.spectrum, float(graph.spectrum[0]))
     values, bound = stored if graph.edges is None else algebra.spectrum(graph, graph.edges)
-    inverse = exact.rounded(exact.inverse(exact.rows_of(saved.R)))
     closed = saved.model.A if saved.inner is None else saved.model.A - B @ saved.inner
     return Facts(
         saved,
         values,
         bound,
-        exact.weighted(B, saved.R),
-        algebra.doubt_of_solving(saved.R) * np.abs(B) @ np.abs(inverse) @ np.abs(B.T),
+        *exact.weighted(B, saved.R, saved.P),
         closed,
         algebra.size(closed),
     )

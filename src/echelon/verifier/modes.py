@@ -39,25 +39,39 @@ def _between(facts: Facts) -> Iterator[Finding]:
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
     if followers <= algebra.ALL_MODES or facts.saved.abscissa >= 0.0:
         return
-    values = values[1:-1] if len(values) > 2 else np.geomspace(*values, _BETWEEN)[1:-1]
-    found, slack = _slowest(facts, values)
+    values = (
+        values[1:-1] if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)[1:-1]
+    )
+    found, slack = _slowest(facts, values[1:-1])
     yield said("all modes between decay", found + slack < 0.0, "", found)
 
 
 def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
     """Return the slowest mode, 1/s, and what rounding may make of it."""
-    c, P = facts.saved.coupling, facts.saved.P
-    K, doubt = c * facts.weighted @ P, c * facts.doubt @ np.abs(P)
-    lost = 50.0 * np.finfo(float).eps * float(values[-1])
+    K = facts.saved.coupling * facts.feedback
     modes = np.linalg.eigvals(facts.closed - values[:, None, None] * K).real.max(axis=1)
     found = [
-        # The smallest eigenvalue is known to all its digits, the others as parts of the largest.
-        algebra.rightmost(facts.closed - x * K, x * doubt + np.abs(K) * lost * (x > facts.low))
+        algebra.rightmost(facts.closed - x * K, _doubt(facts, K, float(x)))
         for x in values[np.argsort(modes)[-_LOOKED_AT:]]
     ]
     slowest = max(value for value, _ in found)
     # Of modes that are equally slow, but for rounding, the worst conditioned sets the slack.
     return slowest, max(slack for value, slack in found if value >= slowest - slack)
+
+
+def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
+    """Return what solving with R in floating point, and an eigenvalue's rounding, leave open."""
+    saved, eps = facts.saved, float(np.finfo(float).eps)
+    # The smallest eigenvalue is known to all its digits, the others as parts of the largest.
+    lost = 50.0 * eps * float(facts.eigenvalues[-1]) if value > facts.low else 0.0
+
+    def bound(y: Array, x: Array) -> float:
+        # A solver's R^-1 b is that of R + D with |D| <= 8 m eps |R|, D another for each b.
+        left, right = np.abs(facts.pull @ y.conj()), np.abs(facts.pull @ saved.P) @ np.abs(x)
+        solved = 8.0 * len(saved.R) * eps * left @ np.abs(saved.R) @ right
+        return float(saved.coupling * value * solved + abs(np.vdot(y, K @ x)) * lost)
+
+    return bound
 
 
 def _edge(facts: Facts) -> Iterator[Finding]:

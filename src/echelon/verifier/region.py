@@ -24,6 +24,10 @@ def regional(facts: Facts) -> Iterator[Finding]:
         yield said("strength", region.strength == 0.0, region.strength, 0.0, "the drift alone")
     else:
         yield same("strength", region.strength, 2.0 * saved.coupling * facts.low)
+    fine = region.rate >= 0.0 if region.theorem == "A5" else region.rate > 0.0
+    text = "V may rise" if region.theorem == "A5" else "errors need not shrink"
+    # No set is certified either where V may grow.
+    yield said("the rate is one of decay", fine, region.rate, text="" if fine else text)
     if saved.inner is not None:
         yield said("promise on a domain", False, text="none is known of a gain with an inner loop")
         return
