@@ -31,6 +31,7 @@ HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
   lint    check style, layout and who imports whom: ruff, import-linter
   types   check types: pyright
   docs    build the documentation into site/, with warnings as errors: zensical
+  mutate  change the code in small ways and see which of them no test notices
   wheel   build the wheel into build/, install it alone and without extras, and try it"""
 NO_PIP = (
     "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
@@ -120,6 +121,7 @@ VERBS = {
     ],
     "types": lambda rest: [tool("pyright", *rest)],
     "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
+    "mutate": lambda rest: [[str(program("python")), "benchmarks/mutate.py", *rest]],
     "wheel": wheel,
 }
 

@@ -492,16 +492,22 @@ def test_a_proof_at_a_corner_holds_for_every_matrix_within_its_error(seed):
         turned = P @ A + (P @ A).T - 0.4 * P @ B @ B.T @ P
         return -0.5 * scipy.linalg.eigh(turned, P, eigvals_only=True)[-1]
 
-    rate = float(random.uniform(-1.0, 1.0))
-    parts = (P, B, R, A[None])
-    failed = exact.first_unproved(*parts, error, Fraction(2, 5), rate)
+    # The largest rate that Gershgorin's rows leave, by the formula of the docstring in floats.
+    spread = np.abs(P) @ error
+    lost = np.diag(spread.sum(axis=0) + spread.sum(axis=1))
+    held = 0.4 * P @ B @ B.T @ P
+    edge = -0.5 * scipy.linalg.eigh(P @ A + A.T @ P - held + lost, P, eigvals_only=True)[-1]
+    parts, strength = (P, B, R, A[None]), Fraction(2, 5)
+    for moved in (error, -error):
+        assert exact.first_unproved(*parts, moved, strength, edge - 1e-9) is None
+        assert exact.first_unproved(*parts, moved, strength, edge + 1e-9) == 0
     signs = [np.reshape(s, (2, 2)) for s in combinations((-1.0, 1.0), repeat=4)]
-    if failed is None:
-        assert all(slowest(A + s * error) > rate for s in signs)
+    assert all(slowest(A + s * error) >= edge - 1e-9 for s in signs)
     # Without an error it is the rate itself that decides.
-    exactly = slowest(A)
-    assert exact.first_unproved(*parts, 0.0 * error, Fraction(2, 5), exactly - 1e-9) is None
-    assert exact.first_unproved(*parts, 0.0 * error, Fraction(2, 5), exactly + 1e-9) == 0
+    assert exact.first_unproved(*parts, 0.0 * error, strength, slowest(A) - 1e-9) is None
+    assert exact.first_unproved(*parts, 0.0 * error, strength, slowest(A) + 1e-9) == 0
+    two = (P, B, R, np.stack([A - np.eye(2), A]))
+    assert exact.first_unproved(*two, 0.0 * error, strength, slowest(A) + 1e-9) == 1
 
 
 def test_definiteness_is_of_symmetric_matrices_to_the_last_bit():
