@@ -202,6 +202,25 @@ def test_a_file_whose_model_cannot_be_made_is_incomplete_whatever_its_hull(
         assert json.loads(out)["holds"] is False
 
 
+def test_the_model_of_a_scenario_completes_the_check(tmp_path, echelon):
+    (tmp_path / "own.py").write_text(
+        "import jax.numpy as jnp\nimport echelon as ech\n"
+        "class Own(ech.ControlAffine):\n"
+        "    state_names, input_names = ('x',), ('u',)\n"
+        "    def drift(self, x): return -x\n"
+        "    def input_map(self, x): return jnp.ones((1, 1), x.dtype)\n"
+    )
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nmodel: {python: 'own.py:Own'}\ngraph: {name: path, agents: 4}\n"
+        "follower: {gain: {method: riccati}}\nsimulation: {horizon: 1.0, dt: 0.1}\n"
+    )
+    told = tmp_path / "gain.json"
+    code, _, err = echelon("design", tmp_path / "own.yaml", "--method", "riccati", "--out", told)
+    assert (code, err) == (0, "")
+    assert echelon("verify", told)[0] == 5
+    assert echelon("verify", told, "--scenario", tmp_path / "own.yaml")[0] == 0
+
+
 def test_a_small_graph_has_edges(files, said):
     told = edited(files["riccati"], "graph.edges", None)
     for key in ("lambda_min", "lambda_max"):

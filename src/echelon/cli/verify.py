@@ -2,18 +2,25 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.cli import tables
 from echelon.cli.console import JsonOption
 
+if TYPE_CHECKING:
+    from echelon.models.model import ControlAffine
+
 _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 
 
 def verify(
     gain: Annotated[Path, typer.Argument(help="A gain file, as `design --out` writes it.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="A scenario whose model the agents are, where it is one of your own."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Recompute what a saved gain promises, from its file alone.
@@ -22,7 +29,7 @@ def verify(
     """
     from echelon.verifier.verify import verify as recompute
 
-    found = recompute(gain)
+    found = recompute(gain, None if scenario is None else _model(scenario))
     if as_json:
         lines = [each._asdict() for each in found.findings]
         told = {
@@ -39,3 +46,10 @@ def verify(
         console.print(tables.plain_table(titles, found.findings), soft_wrap=whole)
         console.print(found.sentence, highlight=False, markup=False, soft_wrap=whole)
     raise typer.Exit(_EXIT_CODES[found.verdict])
+
+
+def _model(scenario: str) -> "ControlAffine":
+    from echelon.scenario.build import build
+    from echelon.scenario.scenario import load_scenario
+
+    return build(load_scenario(scenario, [])).parts.model

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
@@ -60,14 +59,8 @@ def model_of(saved: SavedModel) -> ControlAffine | NoModel:
         if not (isinstance(cls, type) and issubclass(cls, ControlAffine)):
             return NoModel(f"`{saved.path}` is no model", True)
         return cls(**{key: _frozen(value) for key, value in saved.parameters.items()})
-    except (
-        ImportError,
-        AttributeError,
-        ArithmeticError,
-        TypeError,
-        ValueError,
-        EchelonError,
-    ) as error:
+    # Parameters of a false file can break a class in any way.
+    except Exception as error:
         return NoModel(f"`{saved.path}` cannot be made: {error}", True)
 
 
