@@ -28,12 +28,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-# Which tests concern a room; what they do not call they do not run for.
+# Which tests concern a room, or a file that has tests of its own.
 TESTS = {
     "core": ["jaxpr", "linearization", "lyapunov", "bad_input"],
     "enclosure": ["hull", "jaxpr", "exact", "regional"],
     "network": ["graph", "formation", "recommend"],
     "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
+    "certificates/exact.py": ["exact"],
+    "enclosure/curves.py": ["hull"],
+    "enclosure/interval.py": ["hull"],
     "verifier": ["verify", "false_claims"],
     "gains": ["gains", "inner_loop", "regional", "paper"],
     "laws": ["laws", "feedforward", "paper", "attack"],
@@ -260,7 +263,8 @@ def study(tree: Path, room: str, only: str, count: int, seed: int) -> tuple[int,
     files = sorted((tree / "src" / "echelon" / room).glob(only or "*.py"))
     every = [change for file in files for change in changes(file)]
     drawn = random.Random(seed).sample(every, min(count, len(every)))
-    tests = [f"tests/test_{name}.py" for name in TESTS[room]]
+    listed = TESTS.get(f"{room}/{only}", TESTS[room])
+    tests = [f"tests/test_{name}.py" for name in listed]
     watch, recorded, begun = Watch(str(tree / "src" / "echelon")), tree / "calls", time.monotonic()
     if forked(tests, 3600.0, watch, recorded):
         raise SystemExit(f"the tests of `{room}` fail without any change: {' '.join(tests)}")
@@ -292,7 +296,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=50, help="changes of each room (50)")
     parser.add_argument("--seed", type=int, default=0, help="which ones are drawn (0)")
     asked = parser.parse_args()
-    rooms = [each.partition("/") for each in asked.room or TESTS]
+    rooms = [each.partition("/") for each in asked.room or TESTS if asked.room or "/" not in each]
     unknown = [room for room, _, _ in rooms if room not in TESTS]
     if unknown:
         parser.error(f"`{unknown[0]}` has no tests listed; there are {', '.join(TESTS)}")

@@ -377,21 +377,44 @@ def test_a_drift_that_its_derivatives_do_not_tell_of_leaves_the_hull(files, said
         assert "pairs come together as promised" in said(told, model)
 
 
-@pytest.mark.parametrize("name", ["a sign", "a stopped gradient", "a small one", "another slope"])
+AT_THE_TRIM = {
+    **{name: FALSE_SLOPES[name] for name in ("a sign", "a stopped gradient", "a small one")},
+    "another slope": slippery,
+    "a bend to the right": jax.nn.relu,
+    "a bend to the left": lambda x: jax.nn.relu(-x),
+}
+
+
+@pytest.mark.parametrize("name", AT_THE_TRIM)
 def test_a_slope_at_the_trim_that_is_none_is_refused(files, said, name):
-    model = agent(lambda x: -x + FALSE_SLOPES[name](x))
+    model = agent(lambda x: -x + AT_THE_TRIM[name](x))
     assert said(files["plain riccati"], model) == ["A at the trim, by differences"]
 
 
-def test_a_curved_drift_has_its_slope_at_the_trim(said, tmp_path):
-    for drift in (
-        lambda x: -x + 40.0 * x**2,
-        lambda x: x**2 * jnp.sign(x),
-        lambda x: jnp.sin(9 * x),
-    ):
-        model = agent(drift)
-        told = saved(model, LINE, ech.gains.Riccati(), tmp_path)
-        assert said(told, model) == []
+@pytest.mark.parametrize(("slower", "fine"), [(0.015, True), (0.025, False)])
+def test_samples_promise_a_rate_to_two_parts_in_a_hundred(files, said, slower, fine):
+    told = edited(files["plain"], "certificate.region.kind", "samples")
+    told = edited(told, "certificate.region.error", [[0.0]])
+    told = edited(told, "certificate.region.rate", rate_at_the_trim(told))
+    height = slower * rate_at_the_trim(told)
+    # Its slope is -1 at the trim and at the corners, and -1 + height between them.
+    turn = 2.0 * np.pi
+    model = agent(lambda x: -x + height * (x / 2 - jnp.sin(turn * x) / (2 * turn)))
+    wanted = [] if fine else ["pairs come together as promised", "rate at 258 states, 1/s"]
+    assert said(told, model) == wanted
+
+
+@pytest.mark.parametrize(
+    ("drift", "input_map"),
+    [
+        (lambda x: -x + 40.0 * x**2, jnp.ones_like),
+        (lambda x: x**2 * jnp.sign(x), jnp.ones_like),
+        (lambda x: jnp.sin(9.0 * x), lambda x: 2.0 + jnp.sin(x)),
+    ],
+)
+def test_a_curved_agent_has_its_slope_at_the_trim(said, tmp_path, drift, input_map):
+    model = agent(drift, input_map)
+    assert said(saved(model, LINE, ech.gains.Riccati(), tmp_path), model) == []
 
 
 BEYOND = {
@@ -402,6 +425,11 @@ BEYOND = {
     ),
     "no number on a part": (
         lambda x: -x + 0.0 * jnp.sqrt(0.9 - x),
+        jnp.ones_like,
+        "Jacobians lie in the hull",
+    ),
+    "a steep place at the trim": (
+        lambda x: -x + 1e-4 * jnp.tanh(x / 1e-4),
         jnp.ones_like,
         "Jacobians lie in the hull",
     ),
@@ -455,6 +483,15 @@ def test_a_gain_about_another_equilibrium_or_in_other_units_is_not_that_of_the_m
         trim = ((np.pi, 0.0), (0.0,))
 
     assert "trim and units of the inputs" in said(files["riccati"], Upturned())
+
+
+@pytest.mark.parametrize(
+    ("chart", "refused"), [((-0.5, 2.0), True), ((-2.0, 1.0), True), ((-1.1, 1.1), False)]
+)
+def test_a_domain_stays_where_the_equations_hold(files, said, chart, refused):
+    model = agent(lambda x: -x)
+    type(model).chart = {"x0": chart}
+    assert said(files["plain"], model) == ["the domain stays inside the chart"] * refused
 
 
 # ---- the algebra of it ----

@@ -109,6 +109,7 @@ def _quotients_off(saved: SavedModel, at: Evaluated, steps: Array) -> float:
 def _on_the_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> Iterator[Finding]:
     """Try to contradict the promise at states of the domain."""
     saved = facts.saved
+    yield said("the domain stays inside the chart", _charted(saved.model, region, model))
     some = points(saved, region)
     found = evaluate(model, saved.model, saved.model.state + some.states, some.inputs)
     count = f"{len(found.jacobians)} states"
@@ -134,6 +135,16 @@ def _on_the_domain(facts: Facts, region: SavedRegion, model: ControlAffine) -> I
     least = region.rate * (1.0 - TIGHT) - slack - slower
     fine = decided and rate >= least
     yield said(f"rate at {count}, 1/s", fine, region.rate, rate, "with their own g")
+
+
+def _charted(saved: SavedModel, region: SavedRegion, model: ControlAffine) -> bool:
+    """Tell whether bounded states stay where the equations hold."""
+    for name, (low, high) in model.chart.items():
+        k = saved.state_names.index(name)
+        least, most = saved.state[k] + region.lower[k], saved.state[k] + region.upper[k]
+        if np.isfinite(most - least) and not low < least <= most < high:
+            return False
+    return True
 
 
 def _secants(facts: Facts, region: SavedRegion, model: ControlAffine, some: Points) -> Finding:

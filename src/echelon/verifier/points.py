@@ -59,6 +59,8 @@ def points(saved: SavedGain, region: SavedRegion) -> Points:
     for fractions in (_lattice(box, random), random.uniform(size=(_EACH, len(box.used)))):
         parts.append(ends[0] + fractions * (ends[1] - ends[0]))
     found, n = box.filled(np.concatenate(parts), random), len(saved.P)
+    # The trim, where many a slope is extreme.
+    found[-1] = 0.0
     few = 2 ** len(box.used)
     return Points(found[:, :n], found[:, n:], few if few <= _EACH else 0)
 
