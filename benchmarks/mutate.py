@@ -31,12 +31,12 @@ ROOT = Path(__file__).resolve().parents[1]
 # Which tests concern a room, or a file that has tests of its own.
 TESTS = {
     "core": ["jaxpr", "linearization", "lyapunov", "bad_input"],
-    "enclosure": ["hull", "jaxpr", "exact", "regional"],
+    "enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
     "network": ["graph", "formation", "recommend"],
     "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
     "certificates/exact.py": ["exact"],
-    "enclosure/curves.py": ["hull"],
-    "enclosure/interval.py": ["hull"],
+    "enclosure/curves.py": ["interval", "hull"],
+    "enclosure/interval.py": ["interval", "hull"],
     "verifier": ["verify", "false_claims"],
     "gains": ["gains", "inner_loop", "regional", "paper"],
     "laws": ["laws", "feedforward", "paper", "attack"],

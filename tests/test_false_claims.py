@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import echelon as ech
 from echelon.verifier import algebra, exact
-from echelon.verifier.enclosed import farthest_outside, steepest, support
+from echelon.verifier.enclosed import farthest_from_all, farthest_outside, steepest, support
 from echelon.verifier.file import SavedGraph
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -506,6 +506,8 @@ def test_means_of_corners_have_secants_in_bounds_that_some_corner_reaches(seed):
     every = np.einsum("kn,hnm,km->kh", normals, hull, steps)
     assert bounds.high == pytest.approx(every.max(axis=1), rel=1e-12)
     assert bounds.low == pytest.approx(every.min(axis=1), rel=1e-12)
+    sizes = np.abs(normals)[:, None] @ np.abs(hull).max(axis=0) @ np.abs(steps)[:, :, None]
+    assert bounds.size == pytest.approx(sizes[:, 0, 0], rel=1e-12)
     wider = support(hull, error, normals, steps)
     for signs in combinations((-1.0, 1.0), repeat=2):
         moved = np.einsum("kn,nm,km->k", normals, error * np.outer([1, *signs], [1, 1, 1]), steps)
@@ -523,9 +525,22 @@ def test_a_jump_is_found_by_halving_however_low_it_is():
 
     assert steepest(velocity, x, y, x, bounds) > 1.0
     assert steepest(lambda z: (0.5 * z, np.zeros_like(z)), x, y, x, bounds) < 0.0
+    # In other units it is the same.
+    small = support(np.array([[[-1e-6]], [[1e-6]]]), np.zeros((1, 1)), x, x - y)
+    found = steepest(lambda z: (1e-6 * velocity(z)[0], np.zeros_like(z)), x, y, x, small)
+    assert found == pytest.approx(steepest(velocity, x, y, x, bounds), rel=1e-9)
     # What rounding may be is taken off.
     assert steepest(lambda z: (velocity(z)[0], np.full_like(z, height)), x, y, x, bounds) < 0.0
     assert steepest(lambda z: (z * np.nan, 0.0 * z), x, y, x, bounds) == np.inf
+
+
+def test_samples_are_measured_by_the_nearest_matrix_as_a_part_of_the_largest():
+    known = np.array([[[4.0, 1.0]], [[2.0, 0.0]]])
+    near = [[2.0, 0.004]]
+    assert farthest_from_all(known, np.array([near])) == pytest.approx(1e-3)
+    assert farthest_from_all(known, np.array([near, [[4.4, 1.0]]])) == pytest.approx(0.1)
+    assert farthest_from_all(known, np.array([[[np.nan, 1.0]], near])) == np.inf
+    assert farthest_from_all(0.0 * known, 0.0 * known) == 0.0
 
 
 def test_no_matrix_that_is_no_number_lies_in_a_hull():
