@@ -96,7 +96,7 @@ def variants(node: ast.AST) -> Iterator[ast.AST]:
         other = copy.copy(node)
         other.test = ast.UnaryOp(ast.Not(), node.test)
         yield other
-    if isinstance(node, ast.Return) and node.value is not None:
+    if isinstance(node, ast.Return) and getattr(node.value, "value", node.value) is not None:
         yield ast.Return(ast.Constant(None))
     if is_droppable(node):
         yield ast.Pass()

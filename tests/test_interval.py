@@ -108,6 +108,8 @@ def test_a_place_on_the_circle_is_the_same_after_whole_turns(turns):
             assert float(part.lo) == pytest.approx(plain, abs=1e-15)
             # Wide enough for its remainder, and no wider.
             assert Fraction(1, 2**100) < part.hi - part.lo < Fraction(1, 2**98)
+    for place in (Fraction(1, 10**40), pi().lo, pi().lo / 2, -pi().lo / 2):
+        assert all(-1 <= part.lo < part.hi <= 1 for part in circle(place))
     far = circle(Fraction(7) * 2**300)
     assert all((part.lo, part.hi) == (-1, 1) for part in far)
 
