@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,9 +78,8 @@ def variants(node: ast.AST) -> Iterator[ast.AST]:
     if isinstance(node, ast.Compare):
         for k, op in enumerate(node.ops):
             for other in COMPARED[type(op)]:
-                yield ast.Compare(
-                    node.left, node.ops[:k] + [other()] + node.ops[k + 1 :], node.comparators
-                )
+                ops = node.ops[:k] + [other()] + node.ops[k + 1 :]
+                yield ast.Compare(node.left, ops, node.comparators)
     elif isinstance(node, ast.BinOp | ast.AugAssign) and type(node.op) in COMPUTED:
         other = copy.copy(node)
         other.op = COMPUTED[type(node.op)]()
@@ -135,21 +135,23 @@ def is_droppable(node: ast.AST) -> bool:
     return isinstance(node, ast.AugAssign | ast.Raise | ast.Continue | ast.Break)
 
 
-def places(node: ast.AST, function: str = "") -> Iterator[tuple[ast.AST, str, object, str]]:
-    """Yield parent, field, index and function of every node that runs and is no message."""
+Put = Callable[[ast.AST], None]
+"""What puts another node in a node's place."""
+
+
+def places(node: ast.AST, function: str = "") -> Iterator[tuple[ast.AST, Put, str]]:
+    """Yield every node that runs and is no message, what replaces it, and its function."""
     for field, value in ast.iter_fields(node):
-        if field in ("annotation", "returns", "decorator_list", "bases", "type_params"):
+        if field in ("annotation", "returns", "decorator_list", "bases"):
             continue
-        for index, child in enumerate(value if isinstance(value, list) else [value]):
-            if isinstance(child, ast.JoinedStr | ast.Import | ast.ImportFrom):
+        puts = partial(setattr, node, field)
+        each = enumerate(value) if isinstance(value, list) else [(None, value)]
+        for index, child in each:
+            if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr):
                 continue
-            if not isinstance(child, ast.AST):
-                continue
-            inner = function
-            if isinstance(child, ast.FunctionDef | ast.ClassDef | ast.Lambda):
-                name = getattr(child, "name", "<lambda>")
-                inner = f"{function}.{name}" if function else name
-            yield node, field, index if isinstance(value, list) else None, function
+            yield child, puts if index is None else partial(value.__setitem__, index), function
+            name = child.name if isinstance(child, ast.FunctionDef | ast.ClassDef) else ""
+            inner = ".".join(filter(None, (function, name)))
             # What an error says is compared where it matters; `strict` only finds our own faults.
             if not isinstance(child, ast.Raise) and getattr(child, "arg", "") != "strict":
                 yield from places(child, inner)
@@ -158,28 +160,13 @@ def places(node: ast.AST, function: str = "") -> Iterator[tuple[ast.AST, str, ob
 def changes(file: Path) -> Iterator[Change]:
     """Yield every change of a file."""
     tree = ast.parse(file.read_text("utf-8"))
-    for parent, field, index, function in list(places(tree)):
-        held = getattr(parent, field)
-        node = held if index is None else held[index]
+    for node, put, function in list(places(tree)):
         for other in variants(node):
-            put(parent, field, index, ast.copy_location(other, node))
+            put(ast.copy_location(other, node))
             source = ast.unparse(ast.fix_missing_locations(tree))
-            put(parent, field, index, node)
-            old, new = (first_line(each) for each in (node, other))
+            put(node)
+            old, new = (ast.unparse(each).splitlines()[0][:70] for each in (node, other))
             yield Change(file, getattr(node, "lineno", 0), function, old, new, source)
-
-
-def put(parent: ast.AST, field: str, index: object, node: ast.AST) -> None:
-    """Set a child of a node."""
-    if index is None:
-        setattr(parent, field, node)
-    else:
-        getattr(parent, field)[index] = node
-
-
-def first_line(node: ast.AST) -> str:
-    """Return the beginning of a node's text."""
-    return ast.unparse(node).splitlines()[0][:70]
 
 
 # ---- trying one ----
