@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echelon.enclosure.curves import wave_points
-from echelon.enclosure.interval import Interval, circle, outward, pi, point, wave
+from echelon.enclosure.interval import ELEMENTARY, Interval, circle, outward, pi, point, wave
 
 FRACTIONS = st.fractions(-50, 50, max_denominator=1000)
 TURN = 2.0 * math.pi
@@ -130,3 +130,71 @@ def test_the_waves_of_any_arc_lie_in_its_polygon(degrees, orders):
         assert (reach <= limit + 1e-12).all()
         # Nor is it far larger: a polygon about an arc stays near the unit circle.
         assert np.abs(corners).max() < 4.0
+
+
+# Each with an interval on which it is defined, ends included where they are.
+FUNCTIONS = {
+    "reciprocal": (np.reciprocal, (0.1, 50.0)),
+    "exp": (np.exp, (-30.0, 30.0)),
+    "expm1": (np.expm1, (-30.0, 30.0)),
+    "log": (np.log, (1e-9, 1e9)),
+    "log1p": (np.log1p, (-0.999, 1e9)),
+    "sqrt": (np.sqrt, (0.0, 1e9)),
+    "rsqrt": (lambda x: 1.0 / np.sqrt(x), (1e-9, 1e9)),
+    "tan": (np.tan, (-1.57, 1.57)),
+    "asin": (np.arcsin, (-1.0, 1.0)),
+    "acos": (np.arccos, (-1.0, 1.0)),
+    "atan": (np.arctan, (-1e3, 1e3)),
+    "sinh": (np.sinh, (-30.0, 30.0)),
+    "cosh": (np.cosh, (-30.0, 30.0)),
+    "tanh": (np.tanh, (-30.0, 30.0)),
+    "logistic": (lambda x: 1.0 / (1.0 + np.exp(-x)), (-30.0, 30.0)),
+    "abs": (np.abs, (-30.0, 30.0)),
+    "sign": (np.sign, (-30.0, 30.0)),
+    "sin": (np.sin, (-9.0, 9.0)),
+    "cos": (np.cos, (-9.0, 9.0)),
+}
+
+
+@pytest.mark.parametrize("name", ELEMENTARY)
+def test_the_range_on_an_interval_is_that_of_its_points(name):
+    plain, (least, most) = FUNCTIONS[name]
+    random, span = np.random.default_rng(0), most - least
+    drawn = [sorted(random.uniform(least, most, 2)) for _ in range(12)]
+    # About 0, where some of them turn, and up to the ends of where they are defined.
+    near = [(max(least, -a), min(most, b)) for a, b in ((0.5, 0.25), (0.25, 0.5), (3.0, 2.0))]
+    near += [(max(least, a), min(most, b)) for a, b in ((1.0, 2.0), (0.5, 4.0), (-4.0, -1.0))]
+    whole = [(least, most), (least, least + 0.1 * span), (most - 0.1 * span, most)]
+    for low, high in [*drawn, *(pair for pair in near if pair[0] < pair[1]), *whole]:
+        x = Interval(Fraction(low), Fraction(high))
+        assert ELEMENTARY[name].defined(x)
+        found = ELEMENTARY[name].range(x)
+        points = np.append(np.linspace(low, high, 2001), [0.0] if low <= 0.0 <= high else [])
+        values = plain(points)
+        size = np.abs(values).max()
+        assert found.lo <= values.min() + 1e-14 * size
+        assert found.hi >= values.max() - 1e-14 * size
+        assert float(found.lo) == pytest.approx(values.min(), rel=1e-13, abs=1e-4 * size)
+        assert float(found.hi) == pytest.approx(values.max(), rel=1e-13, abs=1e-4 * size)
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("reciprocal", 0, 1),
+        ("reciprocal", -1, 1),
+        ("exp", 0, 2049),
+        ("log", 0, 1),
+        ("log1p", -1, 1),
+        ("sqrt", Fraction(-1, 10**9), 1),
+        ("rsqrt", 0, 1),
+        ("tan", 1, 2),
+        ("asin", Fraction(-1000001, 10**6), 0),
+        ("asin", 0, Fraction(1000001, 10**6)),
+        ("acos", 0, Fraction(1000001, 10**6)),
+        ("sinh", -2049, 0),
+        ("cosh", 0, 2049),
+    ],
+)
+def test_a_function_is_defined_where_it_is(name, low, high):
+    assert not ELEMENTARY[name].defined(Interval(Fraction(low), Fraction(high)))
