@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from echelon.enclosure.curves import wave_points
+from echelon.enclosure.curves import power_points, wave_points
 from echelon.enclosure.interval import ELEMENTARY, Interval, circle, outward, pi, point, wave
 
 FRACTIONS = st.fractions(-50, 50, max_denominator=1000)
@@ -198,3 +198,15 @@ def test_the_range_on_an_interval_is_that_of_its_points(name):
 )
 def test_a_function_is_defined_where_it_is(name, low, high):
     assert not ELEMENTARY[name].defined(Interval(Fraction(low), Fraction(high)))
+
+
+def test_a_single_power_has_its_range_and_several_their_control_points():
+    x = Interval(Fraction(-1), Fraction(2))
+    assert power_points(x, [2]) == [{2: 0}, {2: 4}]
+    assert power_points(x, [3]) == [{3: -1}, {3: 8}]
+    # Of x^2 on [-1, 2]: the ends' squares, and their product between.
+    assert power_points(x, [1, 2]) == [
+        {1: -1, 2: 1},
+        {1: Fraction(1, 2), 2: -2},
+        {1: 2, 2: 4},
+    ]
