@@ -114,6 +114,16 @@ def test_a_place_on_the_circle_is_the_same_after_whole_turns(turns):
     assert all((part.lo, part.hi) == (-1, 1) for part in far)
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_an_arc_too_far_off_to_be_placed_is_the_whole_circle(sign):
+    start = Fraction(sign) * 2**201
+    points = wave_points(Interval(start, start + Fraction(1, 10)), [1])
+    corners = np.array([[float(corner[1, 0]), float(corner[1, 1])] for corner in points])
+    t = np.linspace(0.0, TURN, 100)
+    around = np.stack([np.cos(t), np.sin(t)])
+    assert ((corners @ around).max(axis=0) >= 1.0).all()
+
+
 @pytest.mark.parametrize("degrees", [1, 90, 170, 179, 180, 181, 200, 270, 350, 359.9, 360, 500])
 @pytest.mark.parametrize("orders", [[1], [1, 2], [2]])
 def test_the_waves_of_any_arc_lie_in_its_polygon(degrees, orders):
