@@ -32,6 +32,7 @@ HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
   types   check types: pyright
   docs    build the documentation into site/, with warnings as errors: zensical
   fuzz    feed the command line nonsense for [SECONDS], and tell what it does not bear
+  mutate  change the code in small ways and see which of them no test notices
   wheel   build the wheel into build/, install it alone and without extras, and try it"""
 NO_PIP = (
     "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
@@ -122,6 +123,7 @@ VERBS = {
     "types": lambda rest: [tool("pyright", *rest)],
     "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
     "fuzz": lambda rest: [[str(program("python")), "benchmarks/fuzz.py", *rest]],
+    "mutate": lambda rest: [[str(program("python")), "benchmarks/mutate.py", *rest]],
     "wheel": wheel,
 }
 

@@ -262,3 +262,27 @@ def test_the_quadrotor_is_refused_what_is_not_so(quadrotor):
     ).holds
     wider = value_hull(euler_rate_quadrotor, quadrotor_box(tilt=0.9, yaw=0.7), NO_INPUTS)
     assert not prove_contraction(wider.vertices, wider.error, B, P, rho, ALPHA).holds
+
+
+# --- what is taken ----------------------------------------------------------------------------
+
+
+def test_one_entry_that_no_power_of_two_divides_is_refused_among_others_that_one_does():
+    P = np.array([[Fraction(3, 4), Fraction(1, 3)], [Fraction(1, 3), Fraction(1)]])
+    none = np.zeros((2, 2))
+    with pytest.raises(GainError, match="`P` holds an entry that is no whole number over a power"):
+        prove_contraction(-np.eye(2)[None], none, none[:, :1], P, 0.0, 0.0)
+
+
+def test_a_metric_may_be_asymmetric_by_rounding_only_and_its_symmetric_part_counts():
+    none = np.zeros((2, 2))
+
+    def proved(off):
+        P = np.array([[4.0, 1.0 + off], [1.0, 2.0]])
+        return prove_contraction(-np.eye(2)[None], none, none[:, :1], P, 0.0, 0.5)
+
+    with pytest.raises(GainError, match="`P` is not symmetric"):
+        proved(4e-9 * (1.0 + 1e-6))
+    found = proved(4e-9 * (1.0 - 1e-6))
+    # The pivots of P and of P itself less 2 rate P / 2: those of [[4, 1 + off / 2], [., 2]].
+    assert found.holds and found.smallest_pivot == pytest.approx(1.75 - 1e-9, rel=1e-12)

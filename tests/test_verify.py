@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.scenario import registry
 from echelon.scenario.build import resolve
-from echelon.verifier.algebra import grounded_rows, observable, rightmost, spectrum
-from echelon.verifier.equations import farthest_outside
+from echelon.verifier.algebra import ends_of_many, grounded_rows, observable, rightmost, spectrum
+from echelon.verifier.enclosed import farthest_outside
 from echelon.verifier.exact import first_unproved, inverse, is_positive_definite, product, rows_of
 from echelon.verifier.file import SavedGraph
 
@@ -98,16 +98,18 @@ def test_every_bundled_model_is_made_again_from_its_file(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("graph", "open_"), [(ech.Graph.path(501), 0), (ech.Graph.complete(80), 1)]
+    ("graph", "verdict"),
+    [(ech.Graph.path(501), "verified"), (ech.Graph.complete(80), "incomplete")],
 )
-def test_large_graphs_are_checked_as_far_as_their_edges_are_there(graph, open_, tmp_path):
+def test_large_graphs_are_checked_as_far_as_their_edges_are_there(graph, verdict, tmp_path):
     model = ech.models.DoubleIntegrator(1)
     ech.save_gain(
         ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, tmp_path / "gain.json"
     )
     found = ech.verify(tmp_path / "gain.json")
-    assert found.holds
-    assert sum(each.verdict == "not checked" for each in found.findings) == open_
+    open_ = [each.claim for each in found.findings if each.verdict == "not checked"]
+    assert found.verdict == verdict and found.holds is (verdict == "verified")
+    assert open_ == ([] if found.holds else ["graph spectrum"])
 
 
 def test_a_model_of_ones_own_must_be_given_and_is_never_imported(tmp_path):
@@ -115,14 +117,17 @@ def test_a_model_of_ones_own_must_be_given_and_is_never_imported(tmp_path):
     ech.save_gain(ech.synthesize(model, LINE, ech.gains.Riccati()), model, LINE, file)
     found = ech.verify(file)
     verdicts = {each.claim: each.verdict for each in found.findings}
-    assert found.holds and verdicts["equations of the model"] == "not checked"
-    assert found.sentence.endswith("1 could not be checked.")
+    assert not found.holds and verdicts["equations of the model"] == "not checked"
+    assert (
+        found.sentence
+        == "Incomplete: 14 claims hold as stored, and could not be checked: equations of the model."
+    )
     assert ech.verify(file, model).sentence.startswith("Verified:")
     assert not ech.verify(file, ech.models.Pendulum()).holds
     told = json.loads(file.read_text())
     told["model"]["class"] = "antigravity:Thing"
     file.write_text(json.dumps(told))
-    assert ech.verify(file).holds and "antigravity" not in sys.modules
+    assert ech.verify(file).verdict == "incomplete" and "antigravity" not in sys.modules
 
 
 def test_a_proof_that_holds_is_found_again_at_its_rate_and_not_far_above(files):
@@ -209,9 +214,11 @@ def test_whatever_stands_in_a_file_it_is_refused_in_words(files, data, tmp_path_
     except ech.EchelonError as error:
         assert str(error).count("\n") == 0
     else:
-        refused = any(each.verdict == "refused" for each in found.findings)
-        assert found.holds is not refused
-        assert found.sentence.startswith("Refused" if refused else "Verified")
+        verdicts = {each.verdict for each in found.findings}
+        wanted = "incomplete" if "not checked" in verdicts else "verified"
+        assert found.verdict == ("refused" if "refused" in verdicts else wanted)
+        assert found.sentence.startswith(found.verdict.capitalize())
+        assert found.holds is (found.verdict == "verified")
 
 
 def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_path):
@@ -219,7 +226,8 @@ def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_
     file.write_text(json.dumps(told))
     code, out, err = echelon("verify", file)
     assert (code, err) == (0, "") and "recomputed" in out
-    assert out.splitlines()[-1].startswith("Verified: 2")
+    count = len(ech.verify(file).findings)
+    assert out.splitlines()[-1] == f"Verified: {count} claims hold as stored."
     file.write_text(json.dumps(changed(told, radius=2.0)))
     code, out, _ = echelon("verify", file, "--json")
     told = json.loads(out)
@@ -265,12 +273,14 @@ def test_the_sign_of_a_minor_is_not_a_matter_of_rounding():
 @pytest.mark.parametrize("followers", [3, 30, 450])
 def test_the_spectrum_of_a_chain_is_its_closed_form(followers):
     edges = np.array([(k, k + 1, 1.0) for k in range(followers)])
-    found = spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
+    found, bound = spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
     k = np.arange(1, followers + 1)
     wanted = 4.0 * np.sin((2 * k - 1) * np.pi / (4 * followers + 2)) ** 2
-    wanted = wanted if followers <= 400 else wanted[[0, -1]]
     assert found == pytest.approx(wanted, rel=1e-11)
     assert found[0] == pytest.approx(wanted[0], rel=1e-13)
+    assert wanted[0] * (1.0 - 1e-11) <= bound <= wanted[0]
+    many = wanted if followers <= 400 else wanted[[0, -1]]
+    assert ends_of_many(found) == pytest.approx(many, rel=1e-11)
 
 
 def test_the_exact_laplacian_loses_no_weight():

@@ -22,7 +22,8 @@ from echelon.core.errors import EchelonError
 
 _EPILOG = (
     "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, "
-    "4 an optional part is not installed, 130 interrupted. "
+    "4 an optional part is not installed, 5 verified as far as it could be checked, "
+    "130 interrupted. "
     "ECHELON_CACHE names the folder where compiled code is kept between runs; `off` keeps none."
 )
 _INTERRUPTED: Final = 130

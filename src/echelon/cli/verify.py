@@ -2,25 +2,42 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.cli import tables
 from echelon.cli.console import JsonOption
 
+if TYPE_CHECKING:
+    from echelon.models.model import ControlAffine
+
+_EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
+
 
 def verify(
     gain: Annotated[Path, typer.Argument(help="A gain file, as `design --out` writes it.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="A scenario whose model the agents are, where it is one of your own."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Recompute what a saved gain promises, from its file alone; exit code 0 if all of it holds."""
+    """Recompute what a saved gain promises, from its file alone.
+
+    Exit code 0 if all of it holds, 1 if a claim does not, 5 if one could not be checked.
+    """
     from echelon.verifier.verify import verify as recompute
 
-    found = recompute(gain)
+    found = recompute(gain, None if scenario is None else _model(scenario))
     if as_json:
         lines = [each._asdict() for each in found.findings]
-        told = {"holds": found.holds, "sentence": found.sentence, "findings": lines}
+        told = {
+            "verdict": found.verdict,
+            "holds": found.holds,
+            "sentence": found.sentence,
+            "findings": lines,
+        }
         print(json.dumps(told, indent=2))
     else:
         console = tables.console()
@@ -28,4 +45,11 @@ def verify(
         whole = not console.is_terminal
         console.print(tables.plain_table(titles, found.findings), soft_wrap=whole)
         console.print(found.sentence, highlight=False, markup=False, soft_wrap=whole)
-    raise typer.Exit(0 if found.holds else 1)
+    raise typer.Exit(_EXIT_CODES[found.verdict])
+
+
+def _model(scenario: str) -> "ControlAffine":
+    from echelon.scenario.build import build
+    from echelon.scenario.scenario import load_scenario
+
+    return build(load_scenario(scenario, [])).parts.model

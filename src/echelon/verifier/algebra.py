@@ -1,7 +1,8 @@
 """Linear algebra of the checker of saved gains: spectra, ranks and growth, and their rounding."""
 
+from collections.abc import Callable
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg
@@ -11,6 +12,8 @@ from echelon.verifier.file import SavedGraph
 
 ALL_MODES = 400
 """On larger graphs two eigenvalues stand for all."""
+_ITERATIONS = 100
+"""Of a power iteration that starts where floating point ended."""
 _EPS = float(np.finfo(float).eps)
 
 
@@ -32,35 +35,97 @@ def grounded_rows(graph: SavedGraph, edges: Array) -> list[list[Fraction]]:
     return [[rows[i][j] for j in kept] for i in kept]
 
 
-def spectrum(graph: SavedGraph, edges: Array) -> Array:
-    """Return the eigenvalues of the grounded Laplacian, or the extreme two of many.
+class Spectrum(NamedTuple):
+    """Eigenvalues of the grounded Laplacian, ascending, and what the smallest is no less than."""
 
-    The smallest is the Rayleigh quotient of its vector, summed over edges: all terms are positive,
-    so that it keeps its digits where it is small.
-    """
+    values: Array
+    bound: float
+
+
+def spectrum(graph: SavedGraph, edges: Array) -> Spectrum:
+    """Return all eigenvalues of the grounded Laplacian; 0 first where an agent is not reached."""
     (i, j), weights, kept = edges[:, :2].astype(int).T, edges[:, 2], followers(graph)
-    L = np.zeros((graph.agents, graph.agents))
-    for rows, columns, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
-        np.add.at(L, (rows, columns), sign * weights)
-    values, vectors = scipy.linalg.eigh(L[np.ix_(kept, kept)])
-    mode = np.zeros(graph.agents)
-    mode[kept] = vectors[:, 0]
-    values[0] = weights @ (mode[i] - mode[j]) ** 2 / (mode @ mode)
+    W = np.zeros((graph.agents, graph.agents))
+    np.add.at(W, (np.append(i, j), np.append(j, i)), np.append(weights, weights))
+    apart, led = W[np.ix_(kept, kept)], W[np.ix_(kept, graph.leaders)].sum(axis=1)
+    values, vectors = scipy.linalg.eigh(np.diag(apart.sum(axis=1) + led) - apart)
+    values[0], bound = _least(apart, led, np.abs(vectors[:, 0]))
+    return Spectrum(values, bound)
+
+
+def ends_of_many(values: Array) -> Array:
+    """Return eigenvalues, or the extreme two of many."""
     return values if len(values) <= ALL_MODES else values[[0, -1]]
 
 
-def rightmost(matrix: Array) -> tuple[float, float]:
-    """Return the largest real part of an eigenvalue, and what rounding may make of it."""
+def _least(apart: Array, led: Array, guess: Array) -> tuple[float, float]:
+    """Return the smallest eigenvalue of L = diag(apart 1 + led) - apart, and a lower bound of it.
+
+    L^-1 has no negative entry. It is applied by an elimination that only adds, so that no digit is
+    lost whatever the range of the weights (Grassmann, Taksar, Heyman), and for every x > 0 no
+    eigenvalue of it exceeds the largest entry of L^-1 x / x (Collatz, Wielandt).
+    """
+    steps = _eliminate(apart, led)
+    if steps is None:
+        return 0.0, 0.0
+    x, y = guess, guess + 1e-16
+    for _ in range(_ITERATIONS):
+        # What is far from the slowest mode dies out, and must not become zero.
+        x = np.maximum(y / np.linalg.norm(y), 1e-150)
+        y = _solve(*steps, x)
+        if (y / x).max() * (x @ x) <= (1.0 + 1e-14 * len(x)) * (x @ y):
+            break
+    # Each of the additions rounds once.
+    return float(x @ x / (x @ y)), float((1.0 - 8.0 * _EPS * len(x)) / (y / x).max())
+
+
+def _eliminate(apart: Array, led: Array) -> tuple[Array, Array] | None:
+    """Return weights (N, N) and pivots (N,) of an elimination; None where one agent is cut off."""
+    W, led, pivots = apart.copy(), led.copy(), np.zeros(len(led))
+    for k in range(len(W)):
+        pivots[k] = led[k] + W[k, k + 1 :].sum()
+        if not pivots[k] > 0.0:
+            return None
+        part = W[k + 1 :, k] / pivots[k]
+        W[k + 1 :, k + 1 :] += np.outer(part, W[k, k + 1 :])
+        led[k + 1 :] += part * led[k]
+        # What an agent hears of itself by way of another moves it nowhere.
+        np.fill_diagonal(W[k + 1 :, k + 1 :], 0.0)
+    return W, pivots
+
+
+def _solve(W: Array, pivots: Array, b: Array) -> Array:
+    """Return L^-1 b, b not negative, by the steps of an elimination."""
+    x = b.copy()
+    for k in range(len(x)):
+        x[k + 1 :] += W[k + 1 :, k] * (x[k] / pivots[k])
+    for k in reversed(range(len(x))):
+        x[k] = (x[k] + W[k, k + 1 :] @ x[k + 1 :]) / pivots[k]
+    return x
+
+
+def size(matrix: Array) -> float:
+    """Return the norm of a matrix in those units of its states that make it small."""
+    return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0]))
+
+
+Doubt: TypeAlias = Callable[[Array, Array], float]
+"""From vectors y, x of length n to a bound on |y* D x|, D what is not known of a matrix."""
+
+
+def rightmost(matrix: Array, doubt: Doubt = lambda y, x: 0.0) -> tuple[float, float]:
+    """Return the largest real part of an eigenvalue, and what rounding and a doubt make of it."""
     # Without the units of the states, which would inflate the bound of the rounding.
-    balanced = scipy.linalg.matrix_balance(matrix, permute=False)[0]
+    balanced, (units, _) = scipy.linalg.matrix_balance(matrix, permute=False, separate=True)
     found: Any = scipy.linalg.eig(balanced, left=True, right=True)
     values, left, right = found
     at = int(np.argmax(values.real))
+    y, x = left[:, at], right[:, at]
     # A simple eigenvalue moves by the perturbation over the cosine of its two vectors (Wilkinson).
-    cosine = abs(np.vdot(left[:, at], right[:, at]))
-    rounding = 50.0 * _EPS * float(np.linalg.norm(balanced))
+    cosine = max(abs(np.vdot(y, x)), 1e-300)
+    lost = 50.0 * _EPS * float(np.linalg.norm(balanced)) + doubt(y / units, units * x)
     # Near a Jordan block that says too much: one of four moves by about the fourth root.
-    return float(values[at].real), min(rounding / max(cosine, 1e-300), 1e-2 * rounding**0.25)
+    return float(values[at].real), min(lost / cosine, 1e-2 * lost**0.25)
 
 
 def observable(A: Array, C: Array) -> int:

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from fractions import Fraction
 from typing import TypeAlias
 
+import numpy as np
+
 from echelon.core.types import Array
 
 Rows: TypeAlias = list[list[Fraction]]
@@ -72,6 +74,17 @@ def inverse(matrix: Rows) -> Rows:
             if i != k and work[i][k]:
                 work[i] = [x - work[i][k] * y for x, y in zip(work[i], work[k], strict=True)]
     return [row[size:] for row in work]
+
+
+def weighted(B: Array, R: Array, P: Array) -> tuple[Array, Array, Array]:
+    """Return R^-1 B' (m, n), B R^-1 B' (n, n) and B R^-1 B'P (n, n), each rounded once."""
+    pull = product(inverse(rows_of(R)), transposed(rows_of(B)))
+    both = product(rows_of(B), pull)
+    return _rounded(pull), _rounded(both), _rounded(product(both, rows_of(P)))
+
+
+def _rounded(matrix: Rows) -> Array:
+    return np.array([[float(x) for x in row] for row in matrix])
 
 
 def first_unproved(

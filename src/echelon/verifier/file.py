@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -218,11 +219,20 @@ def read(file: PathLike) -> SavedGain:
 
 def _json(file: PathLike) -> object:
     try:
-        return json.loads(Path(file).read_text("utf-8"))
+        return json.loads(Path(file).read_text("utf-8"), object_pairs_hook=partial(_mapping, file))
     except OSError as error:
         raise GainError(f"the gain file `{file}` cannot be read: {error.strerror}.") from error
     except (ValueError, RecursionError) as error:
         raise GainError(f"the gain file `{file}` is no JSON: {error}.") from error
+
+
+def _mapping(file: PathLike, pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """Return a mapping; of two equal keys one reader would take the first, another the last."""
+    told = dict(pairs)
+    if len(told) < len(pairs):
+        twice = next(key for k, (key, _) in enumerate(pairs) if key in dict(pairs[:k]))
+        raise GainError(f"`{file}` is no gain that can be verified: `{twice}` stands there twice.")
+    return told
 
 
 def _model(told: _Part) -> SavedModel:
@@ -252,6 +262,8 @@ def _graph(told: _Part) -> SavedGraph:
     edges = told.array("edges", -1, 3) if told.optional("edges") else None
     if edges is not None and len(edges) > _MOST_EDGES:
         raise told.fault("graph.edges", f"must be null for more than {_MOST_EDGES} edges")
+    if edges is None and agents * (agents - 1) // 2 <= _MOST_EDGES:
+        raise told.fault("graph.edges", f"must be given: {agents} agents cannot have so many")
     numbers = leaders if edges is None else np.append(leaders, edges[:, :2])
     if not len(leaders) or not all(x == int(x) and 0 <= x < agents for x in numbers):
         raise told.fault("graph", f"must name agents from 0 to {agents - 1}, one leader at least")

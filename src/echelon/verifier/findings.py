@@ -1,0 +1,91 @@
+"""What a check finds of a claim, and what was recomputed that claims rest on."""
+
+from typing import NamedTuple
+
+from echelon.core.types import Array
+from echelon.verifier import algebra, exact
+from echelon.verifier.file import SavedGain
+
+TIGHT = 1e-9
+"""A number that was recomputed may differ by this part of itself, and by rounding."""
+ROUNDING = 1e-12
+"""Rounding of eigenvalues, as a part of the largest of them."""
+DECIDED = 1e-6
+"""Rounding beyond this part of a rate leaves the rate undecided, and is no credit."""
+
+
+class Finding(NamedTuple):
+    """A claim of the file, what was found, and `holds`, `refused` or `not checked`."""
+
+    claim: str
+    stored: str
+    found: str
+    verdict: str
+    text: str
+
+
+def said(
+    claim: str, fine: bool, stored: object = "", found: object = "", text: str = ""
+) -> Finding:
+    """Return a finding that holds or is refused."""
+    return Finding(claim, _shown(stored), _shown(found), "holds" if fine else "refused", text)
+
+
+def unchecked(claim: str, stored: object, text: str) -> Finding:
+    """Return a finding of what could not be checked."""
+    return Finding(claim, _shown(stored), "", "not checked", text)
+
+
+def _shown(value: object) -> str:
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def same(claim: str, stored: float, found: float, slack: float = 0.0, text: str = "") -> Finding:
+    """Compare two numbers, to a billionth of themselves and the slack of their rounding."""
+    fine = abs(stored - found) <= TIGHT * max(abs(stored), abs(found)) + slack
+    return said(claim, fine, stored, found, text)
+
+
+class Facts(NamedTuple):
+    """What was recomputed and later claims rest on.
+
+    Attributes:
+        saved: the file.
+        eigenvalues: all of the grounded Laplacian, or those that a file without edges holds.
+        bound: lambda_min is no less.
+        pull: R^-1 B' (m, n), rounded once.
+        weighted: B R^-1 B' (n, n), the same.
+        feedback: B R^-1 B'P (n, n), the same.
+        closed: A of the drift, its inner loop closed (n, n).
+        speed: the size of its entries in units that make it small, 1/s.
+    """
+
+    saved: SavedGain
+    eigenvalues: Array
+    bound: float
+    pull: Array
+    weighted: Array
+    feedback: Array
+    closed: Array
+    speed: float
+
+    @property
+    def low(self) -> float:
+        """Return lambda_min."""
+        return float(self.eigenvalues[0])
+
+
+def facts(saved: SavedGain) -> Facts:
+    """Recompute what claims rest on."""
+    graph, B = saved.graph, saved.model.B
+    stored = algebra.Spectrum(graph.spectrum, float(graph.spectrum[0]))
+    values, bound = stored if graph.edges is None else algebra.spectrum(graph, graph.edges)
+    closed = saved.model.A if saved.inner is None else saved.model.A - B @ saved.inner
+    return Facts(
+        saved,
+        values,
+        bound,
+        *exact.weighted(B, saved.R, saved.P),
+        closed,
+        algebra.size(closed),
+    )

@@ -1,0 +1,47 @@
+"""Claims of the graph: its spectrum, and that every follower is reached."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.verifier import algebra
+from echelon.verifier.file import SavedGain
+from echelon.verifier.findings import ROUNDING, TIGHT, Facts, Finding, said, same, unchecked
+
+
+def drawn(saved: SavedGain) -> Iterator[Finding]:
+    """Check that there is a graph, before its spectrum is computed."""
+    graph = saved.graph
+    followers = graph.agents - len(graph.leaders)
+    count = followers if followers <= algebra.ALL_MODES else 2
+    fine = saved.modes == count == len(graph.spectrum)
+    yield said("modes looked at", fine, saved.modes, count)
+    # Fewer edges than followers cannot reach all; said before a matrix of that size is made.
+    if graph.edges is not None and (not _is_graph(graph.edges) or followers > len(graph.edges)):
+        text = "an edge links no two agents, is given twice or has no positive weight, or some are"
+        yield said("graph", False, text=text + " missing")
+
+
+def spanned(facts: Facts) -> Iterator[Finding]:
+    """Check the spectrum that the file states."""
+    saved, stored = facts.saved, facts.saved.graph.spectrum
+    found, claim = algebra.ends_of_many(facts.eigenvalues), "graph spectrum"
+    high = float(found[-1])
+    if saved.graph.edges is None:
+        text = "the file holds no edges of so large a graph"
+        yield unchecked(claim, float(stored[0]), text)
+    else:
+        gap = float(np.abs(found - stored).max())
+        yield said(claim, gap <= TIGHT * high, "", f"{gap:.3g} apart", "grounded Laplacian")
+    text = "every follower has a path to a leader"
+    yield said("lambda_min is positive", facts.low > 0.0, found=facts.low, text=text)
+    yield same("lambda_min", saved.lambda_min, facts.low)
+    yield same("lambda_min of the spectrum", float(stored[0]), facts.low)
+    yield same("lambda_max", saved.lambda_max, high, ROUNDING * high)
+
+
+def _is_graph(edges: Array) -> bool:
+    pairs = np.sort(edges[:, :2], axis=1)
+    apart = bool((pairs[:, 0] < pairs[:, 1]).all())
+    return apart and len(np.unique(pairs, axis=0)) == len(pairs) and bool((edges[:, 2] > 0.0).all())
