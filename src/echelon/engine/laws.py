@@ -102,12 +102,21 @@ class Laws(Drive):
         return _LawStepper(assemble(problem, self.leader, self.follower), problem.states)
 
 
+_AGENT_STEPS = 20_000
+"""Steps of one agent each in a chunk: a quadrotor's take 2 to 8 us, and a model may take longer."""
+
+
 @final
 class _LawStepper(Stepper):
     """The closed loop of laws, traced by JAX: many steps a call."""
 
     def __init__(self, loop: Loop, states: Array) -> None:
         self.loop, self.states = loop, states
+
+    @property
+    def longest(self) -> int:
+        """Steps that take a tenth of a second, and one where that takes longer."""
+        return max(1, _AGENT_STEPS // len(self.states))
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
