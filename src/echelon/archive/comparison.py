@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from echelon.archive.folder import unwritable
+from echelon.core.files import write_whole
 from echelon.results.dataset import save_dataset
 from echelon.studies.compare import Comparison
 
@@ -24,8 +25,8 @@ def write_comparison(
             if row.flight is not None:
                 save_dataset(row.flight.result, folder / "runs" / f"{row.label}.nc")
         content = json.dumps(summary, indent=2, allow_nan=False)
-        (folder / "comparison.json").write_text(content + "\n", "utf-8")
-        (folder / "comparison.txt").write_text(text + "\n", "utf-8")
+        write_whole(folder / "comparison.json", content + "\n")
+        write_whole(folder / "comparison.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load, and numbers alone need none of it.
             from echelon.plots.comparison import save_comparison_figures

@@ -81,7 +81,7 @@ def numbers(now: Moment) -> tuple[Array, ...]:
 def _leaf(stored: Array, like: Any) -> Any:
     """Return one of the numbers as the leaf that it was."""
     if _is_key(like):
-        return jax.random.wrap_key_data(stored, impl=jax.random.key_impl(like))
+        return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
     return jnp.asarray(stored, like.dtype)
 
 

@@ -185,4 +185,4 @@ def join(stretches: Sequence[Stretch]) -> Stretch | None:
 
 def _finite(states: Array, inputs: Array) -> Array:
     """Return which agents are finite in which frames, (T, N)."""
-    return np.isfinite(states).all(axis=2) & np.isfinite(inputs).all(axis=2)
+    return np.logical_and(np.isfinite(states).all(axis=2), np.isfinite(inputs).all(axis=2))

@@ -8,7 +8,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -22,11 +22,13 @@ from echelon.core.errors import (
 )
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
+from echelon.engine.initial import initial_states
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
+from echelon.engine.record import Stretch
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
-from echelon.engine.simulate import Progress, simulate
+from echelon.engine.simulate import Keep, Progress, simulate
 from echelon.gains.file import load_gain
 from echelon.gains.gain import Gain, synthesize
 from echelon.laws.law import Law
@@ -128,16 +130,32 @@ def _with_laws(
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
+    with faults.at("initial"):
+        initial_states(parts, scenario.seed)
+    faults.settle()
     return Built(parts, _settings(scenario))
 
 
-def run(scenario: Scenario, progress: Progress | None = None, built: Built | None = None) -> Result:
+def run(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    built: Built | None = None,
+    keep: Keep | None = None,
+    before: Sequence[Stretch] = (),
+) -> Result:
     """Simulate a scenario, built unless its parts are given, and note where the result comes from.
+
+    `progress`, `keep` and `before` are those of `simulate`.
 
     Raises:
         ScenarioError: a part cannot be made.
     """
-    result = simulate(*(build(scenario) if built is None else built), progress)
+    parts = build(scenario) if built is None else built
+    return note_origin(simulate(*parts, progress, keep, before), scenario)
+
+
+def note_origin(result: Result, scenario: Scenario) -> Result:
+    """Return a result with its scenario and the versions of what computed it."""
     told = {f"version_{name}": text for name, text in versions().items()}
     return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
 

@@ -29,6 +29,8 @@ from echelon.scenario.yaml import (
 )
 
 _BUNDLED = Path(__file__).parent / "bundled"
+KEPT = "scenario.yaml"
+"""The name of the scenario in the folder of a run."""
 
 
 @final
@@ -59,6 +61,11 @@ class Scenario(BaseModel, **sections.STRICT):
     def text(self) -> str:
         """The effective YAML, overrides included."""
         return self._text
+
+    @property
+    def data(self) -> dict[Any, Any]:
+        """The same as plain data; not to be changed."""
+        return self._document.data
 
     @property
     def folder(self) -> Path:
@@ -184,9 +191,12 @@ def _found(source: str | Path) -> tuple[Path, str]:
     names = list(bundled_scenarios())
     if str(source) in names:
         return _BUNDLED / f"{source}.yaml", f"{source}.yaml"
-    if Path(source).is_file():
-        return Path(source), str(source)
-    said = f"no such file exists, allowed is a file or a bundled scenario: {listing(names)}"
+    # The folder of a run holds the scenario that was run.
+    file = Path(source) / KEPT if Path(source).is_dir() else Path(source)
+    if file.is_file():
+        return file, str(file)
+    what = f"it is a folder without `{KEPT}`" if file != Path(source) else "no such file exists"
+    said = f"{what}, allowed is a file, the folder of a run or a bundled scenario: {listing(names)}"
     close = did_you_mean(Path(source).stem, names)
     raise ScenarioError(f"got the scenario `{source}`, {said}{close}.")
 
@@ -195,7 +205,8 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     """Read and check a scenario.
 
     Args:
-        source: Path to a YAML file, or the name of a bundled scenario (which wins over a file).
+        source: Path to a YAML file, the folder of a run, or the name of a bundled scenario (which
+            wins over a file).
         overrides: Texts such as `simulation.horizon=10`, laid over the file before it is checked.
 
     Raises:
