@@ -1,4 +1,4 @@
-"""Nothing computed is lost, nothing of the user's is overwritten, and a run goes on where it was."""
+"""Nothing computed is lost, nothing of the user's is overwritten, and runs go on."""
 
 import contextlib
 import json
@@ -19,6 +19,7 @@ import xarray as xr
 
 import echelon as ech
 from echelon.archive.chunks import Chunks
+from echelon.core import files
 from echelon.core.files import write_whole
 from echelon.engine import simulate as engine
 from echelon.engine.grid import Grid
@@ -49,11 +50,16 @@ disturbance: {rms: {rate: 0.1}, hold: 0.05}
 simulation: {horizon: 1.0, dt: 0.01}
 """
 LONG = ["--set", "simulation.horizon=4000", "--set", "simulation.store_every=1000"]
-# A file for each chunk, and not one every two seconds.
-EAGER = (
-    "import sys; sys.argv[0] = 'echelon'; import echelon.engine.simulate as engine; "
-    "engine._SECONDS = 0.0; from echelon.cli.app import main; main()"
-)
+# Whoever started the tests may have switched Ctrl-C off, as a script does for what it starts in the
+# background, and a child inherits that. And a file for each chunk, not one every two seconds.
+EAGER = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import echelon.engine.simulate as engine
+engine._SECONDS = 0.0
+from echelon.cli.app import main
+main()
+"""
 
 
 @pytest.fixture
@@ -67,17 +73,12 @@ def here(tmp_path, monkeypatch):
 
 @contextlib.contextmanager
 def started(*arguments, code=EAGER):
-    """Start the command line in a process of its own, with the signals that a terminal gives it.
-
-    Whoever started the tests may have switched Ctrl-C off, as a script does for what it starts in
-    the background, and a child would inherit that.
-    """
+    """Start the command line in a process of its own, with the signals that a terminal gives it."""
     process = subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         yield process
@@ -121,19 +122,19 @@ class Wandering(Law):
     def update(self, model, view, memory):
         total, count, key = memory
         key, now = jax.random.split(key)
-        push = 0.1 * jax.random.normal(now, view.e.shape, view.x.dtype)
-        return -(view.e + view.d) + push - 0.01 * total, (total + view.e.sum(), count + 1, key)
+        z, push = view.disagreement, jax.random.normal(now, view.x.shape, view.x.dtype)
+        return 0.1 * push - z - 0.01 * total, (total + z.sum(), count + 1, key)
 
 
 def wandering(**settings):
-    agent, graph = ech.models.SingleIntegrator(1), ech.Graph.path(3)
+    agent, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
     parts = ech.Parts(
         agent,
         graph,
         ech.Formation.from_offsets(agent, graph, {}),
-        ech.Laws(ech.laws.Tracking(ech.references.Line([0.0], [1.0])), Wandering()),
-        initial={"x": 1.0},
-        world=ech.World(disturbance=ech.Disturbance(rms={"x": 0.2}, hold=0.3)),
+        ech.Laws(ech.laws.Tracking(ech.references.Circle((0.0, 0.0, 0.0))), Wandering()),
+        initial={"position": 1.0},
+        world=ech.World(disturbance=ech.Disturbance(rms={"position": 0.2}, hold=0.3)),
     )
     return parts, ech.Settings(**{"horizon": 50.0, "dt": 0.01} | settings)
 
@@ -258,13 +259,12 @@ def test_a_signal_before_anything_is_computed_leaves_no_trace(here):
 # ---- a disk that takes no more ----
 
 
-@contextlib.contextmanager
-def small_files(most):
-    """Let no file of this process grow beyond some bytes, as a disk with no more room would."""
+def under(most, call, *arguments):
+    """Call what may not let a file grow beyond some bytes, as on a disk that has no more room."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
     try:
-        yield
+        return call(*arguments)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
@@ -273,7 +273,9 @@ FRAMES = ["--set", "simulation.horizon=10", "--no-figures"]
 
 
 def test_a_full_disk_shows_the_report_and_keeps_what_was_written(here, echelon, monkeypatch):
-    with small_files(30_000):
+    write = files._write
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "_write", lambda *file: under(30_000, write, *file))
         code, out, err = echelon("run", "mine.yaml", *FRAMES, "--out", "o")
     assert code == 2 and "follower 3" in out
     assert err.endswith(
@@ -294,8 +296,7 @@ def test_a_disk_that_fills_while_a_run_lasts_ends_it_and_it_goes_on_later(
 
     def fill(self, stretch):
         written.append(stretch)
-        with small_files(100 if len(written) > 5 else resource.RLIM_INFINITY):
-            write(self, stretch)
+        under(100 if len(written) > 5 else resource.RLIM_INFINITY, write, self, stretch)
 
     monkeypatch.setattr(Chunks, "write", fill)
     code, out, err = echelon("run", "mine.yaml", *FRAMES, "--out", "o")
@@ -309,8 +310,8 @@ def test_a_disk_that_fills_while_a_run_lasts_ends_it_and_it_goes_on_later(
 
 def test_a_file_that_cannot_be_written_is_what_it_was(here):
     (here / "gain.json").write_text("precious")
-    with small_files(1000), pytest.raises(OSError):
-        write_whole(here / "gain.json", "x" * 2000)
+    with pytest.raises(OSError):
+        under(1000, write_whole, here / "gain.json", "x" * 2000)
     assert (here / "gain.json").read_text() == "precious"
     assert not list(here.glob("*.part")) and not list(here.glob(".*"))
     write_whole(here / "gain.json", "x" * 2000)

@@ -55,21 +55,29 @@ def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[P
     return [claim_folder(name, out / name, force, RUNS) for name in names]
 
 
-def claim_file(path: Path | None, force: bool, never: Sequence[Path] = ()) -> None:
-    """Check that a file can be written without the loss of another.
+def claim_design(out: Path | None, figures: Path | None, force: bool, read: Sequence[Path]) -> None:
+    """Check that a design can write its gain and its figures without the loss of a file.
 
     Raises:
-        OutputError: it is there and `force` was not given, or is one of those that must `never` be
-            replaced.
+        OutputError: the gain would replace a file that is `read` here, or another without `force`;
+            or the folder of the figures holds something, without `force`.
     """
-    if path is None or not path.exists() or not (path.is_file() or path.is_dir()):
+    if figures is not None and figures.exists() and not figures.is_dir():
+        raise OutputError(f"`{figures}` is a file, and the figures need a folder.")
+    if figures is not None and figures.is_dir() and any(figures.iterdir()) and not force:
+        raise OutputError(
+            f"the folder `{figures}` is not empty; choose another, or `--force` to replace "
+            "earlier figures."
+        )
+    if out is None or not out.exists():
         return
-    if path.is_dir():
-        raise OutputError(f"`{path}` is a folder, and the output must be a file.")
-    if any(other.exists() and path.samefile(other) for other in never):
-        raise OutputError(f"`{path}` is what is read here, and would be lost; choose another file.")
-    if not force:
-        raise OutputError(f"the file `{path}` exists; choose another, or `--force` to replace it.")
+    if out.is_dir():
+        raise OutputError(f"`{out}` is a folder, and the output must be a file.")
+    if any(file.exists() and out.samefile(file) for file in read):
+        raise OutputError(f"`{out}` is what is read here, and would be lost; choose another file.")
+    # A pipe or a device holds nothing that could be lost.
+    if out.is_file() and not force:
+        raise OutputError(f"the file `{out}` exists; choose another, or `--force` to replace it.")
 
 
 @contextlib.contextmanager

@@ -64,6 +64,9 @@ def run(
         result = _fly(job, as_json)
         _show(result, as_json)
         _write(job.chunks, result, figures, as_json)
+    if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
+        # Then the disk ended it, and its message says so.
+        raise OutputError(f"{result.message[:-1]}, and {_again(job.chunks.folder)}.")
     raise typer.Exit(STOP.exit_code or result.outcome.exit_code)
 
 
@@ -126,6 +129,10 @@ def _fly(job: _Job, quiet: bool) -> "Result":
         return build.run(job.scenario, progress, job.built, keep, job.before)
 
 
+def _again(folder: Path) -> str:
+    return f"`echelon run --resume {folder}` goes on"
+
+
 @contextmanager
 def _undone(chunks: "Chunks") -> Iterator[None]:
     """Leave no folder behind where a run is refused before anything is computed."""
@@ -156,10 +163,8 @@ def _write(chunks: "Chunks", result: "Result", figures: bool, quiet: bool) -> No
     try:
         write_findings(result, chunks.folder, figures)
     except OutputError as error:
-        again = f"`echelon run --resume {chunks.folder}`"
-        raise OutputError(
-            f"{str(error)[:-1]}; what was computed is kept, {again} goes on."
-        ) from error
+        again = f"what was computed is kept, and {_again(chunks.folder)}"
+        raise OutputError(f"{str(error)[:-1]}; {again}.") from error
     if result.outcome in (Outcome.COMPLETED, Outcome.DIVERGED):
         chunks.remove()
     if not quiet:

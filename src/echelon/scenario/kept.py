@@ -25,6 +25,11 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
     return (dump_yaml(data) if files else scenario.text), files
 
 
+def files_of(scenario: Scenario) -> list[Path]:
+    """Return the file of a scenario and all that it names."""
+    return [scenario.file, *self_contained(scenario, "")[1].values()]
+
+
 def _named(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, tuple[str, str]]]:
     """Yield the place of every file in plain data, its name, and what stands after that."""
     if isinstance(value, dict | list):

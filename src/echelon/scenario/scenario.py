@@ -55,7 +55,7 @@ class Scenario(BaseModel, **sections.STRICT):
 
     _document: Document = PrivateAttr(Document({}, {(): "scenario"}))
     _text: str = PrivateAttr("")
-    _folder: Path = PrivateAttr(Path())
+    _file: Path = PrivateAttr(Path())
 
     @property
     def text(self) -> str:
@@ -70,7 +70,12 @@ class Scenario(BaseModel, **sections.STRICT):
     @property
     def folder(self) -> Path:
         """The folder to which the paths in the file are relative."""
-        return self._folder
+        return self._file.parent
+
+    @property
+    def file(self) -> Path:
+        """The file that it was read from; one that is not there for a mapping."""
+        return self._file
 
     def place(self, *path: str | int) -> str:
         """Return where a key stands, as in `paper.yaml:4`; else its parent's place."""
@@ -161,7 +166,7 @@ def refuse(faults: Iterable[Fault]) -> NoReturn:
     raise error
 
 
-def _scenario(document: Document, text: str, folder: Path) -> Scenario:
+def _scenario(document: Document, text: str, file: Path) -> Scenario:
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
         said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
@@ -175,7 +180,7 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
     faults = [Fault(document.place(path), joined(path), said) for path, said in found.items()]
     if scenario is None or faults or document.faults:
         refuse([*document.faults, *faults])
-    scenario._document, scenario._text, scenario._folder = document, text, folder
+    scenario._document, scenario._text, scenario._file = document, text, file
     return scenario
 
 
@@ -222,7 +227,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     if overrides:
         document = apply_overrides(document, overrides)
         text = dump_yaml(document.data)
-    return _scenario(document, text, file.parent)
+    return _scenario(document, text, file)
 
 
 def _plain(value: object) -> object:
@@ -245,7 +250,7 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
         ScenarioError: The scenario has faults, as in `load_scenario`.
     """
     plain = _plain(data)
-    return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder))
+    return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder) / "mapping")
 
 
 def json_schema() -> dict[str, Any]:
