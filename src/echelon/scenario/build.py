@@ -25,6 +25,7 @@ from echelon.core.provenance import versions
 from echelon.engine.initial import initial_states
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
+from echelon.engine.prepare import check_memory
 from echelon.engine.record import Stretch
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
@@ -84,6 +85,8 @@ def build(scenario: Scenario) -> Built:
     faults = _Faults(scenario)
     with precision("float64"):
         model = graph = None
+        with faults.at("simulation"):
+            _settings(scenario).check()
         with faults.at("model"):
             model = _model(scenario)
             check_model(model)
@@ -130,6 +133,8 @@ def _with_laws(
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
+    with faults.at("simulation"):
+        check_memory(parts, _settings(scenario))
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()
