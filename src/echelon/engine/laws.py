@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, final
 import jax
 import jax.numpy as jnp
 
-from echelon.core.errors import ModelError, check_kind
+from echelon.core.errors import check_kind
 from echelon.core.types import Array, State
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
@@ -123,22 +123,6 @@ class _LawStepper(Stepper):
         return begin(self.loop, jnp.asarray(self.states))
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
-        """Store frames and take steps; what happens on the way is seen afterwards.
-
-        Raises:
-            ModelError: a NumPy constant stands in the model or a law that JAX has seen in another
-                precision.
-        """
-        try:
-            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
-        except ValueError as error:
-            # JAX caches traces by shape and type: a NumPy constant met in float64 stays so in a
-            # float32 run, and all that JAX says of it is this.
-            if "Cannot lower jaxpr" not in str(error):
-                raise
-            raise ModelError(
-                f"`{type(self.loop.model).__name__}` or a law uses a NumPy constant that JAX has "
-                "already seen in another precision; write it as Python numbers or as "
-                "`jnp.asarray(constant, x.dtype)`."
-            ) from error
+        """Store frames and take steps; what happens on the way is seen afterwards."""
+        now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
         return Chunk(now, *on_host((states, inputs, sums)))

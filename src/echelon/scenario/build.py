@@ -242,7 +242,8 @@ def _user_class(folder: Path, target: str) -> type[ControlAffine]:
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    # `sys.exit()` in it would end the program, with the exit code of a run that went well.
+    except (Exception, SystemExit) as error:
         raise ModelError(
             f"the file `{file}` does not import: {type(error).__name__}: {_first_line(error)}."
         ) from error
