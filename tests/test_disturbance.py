@@ -140,6 +140,7 @@ def test_the_wind_has_its_rms_and_neither_time_nor_agents_repeat_it():
 GUSTS = Disturbance(rms={"velocity": 1.0}, input_rms={"ax": 0.3}, hold=0.1)
 
 
+@pytest.mark.slow
 def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
     run = drift(disturbance=GUSTS)
     assert np.array_equal(run.states, drift(disturbance=GUSTS).states)

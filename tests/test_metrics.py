@@ -149,6 +149,7 @@ def test_a_run_without_a_frame_has_no_numbers():
     assert "interrupted" in ech.report(nothing)
 
 
+@pytest.mark.slow
 def test_the_relay_is_a_fixed_point_of_the_formation():
     """Started on their goals, followers told the leader's input stay there to rounding."""
     model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)

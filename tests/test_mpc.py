@@ -144,6 +144,7 @@ def test_each_plans_after_those_before_it_with_the_plans_they_have_just_made(mon
         assert np.array_equal(last[place][1].inputs, last[before][2].inputs)
 
 
+@pytest.mark.slow
 def test_in_single_precision_it_flies_the_same():
     double, single = (swarm(precision=name) for name in ("float64", "float32"))
     assert single.states == pytest.approx(double.states, abs=1e-3)

@@ -94,6 +94,7 @@ def test_the_leader_as_printed_deviates_by_what_was_found_for_it(changes, pinned
     assert deviation(found.states) == pytest.approx(baseline.tracking_rmse(found.states))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terminal", ["origin", "none"])
 def test_a_solver_of_another_kind_finds_the_same_flight(terminal):
     _, found = leader(terminal=terminal)
@@ -136,6 +137,7 @@ def distances(plans, pairs=((1, 0), (2, 1), (3, 1))):
     return np.array([np.linalg.norm(gap, axis=1) for gap in gaps])
 
 
+@pytest.mark.slow
 def test_the_linear_distance_term_makes_the_followers_fly_apart():
     plans = PlanarBaseline.literal().plans(TREE, OFFSETS)
     assert all(plan.solved for plan in plans)

@@ -119,7 +119,7 @@ def by_hand(start, wanted, inputs, steps, step, limited, weight):
     return np.array(found.value(X)).T, np.array(found.value(V)).T
 
 
-@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("limited", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_leader_s_plan_is_that_of_a_problem_written_by_hand(limited):
     states = starts()
     made = planned(states, limits=limited, dt=0.01, input_weight=1e-3)

@@ -44,6 +44,11 @@ RUNS = {
 }
 
 
+# A run in space, one without positions, one on a line; the others are drawn by the slow tests.
+QUICK = {"quadrotor", "van-der-pol", "one-axis"}
+FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in RUNS]
+
+
 def close(model, graph, method, reference, spread):
     """A short run with one offset where the model has a position, and of synchronization else."""
     gain = synthesize(model, graph, method)
@@ -300,7 +305,7 @@ def test_all_agents_of_a_swarm_are_drawn(runs):
 # ---- odd runs ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", FEW)
 def test_a_run_that_grew_out_of_all_bounds_is_drawn_within_its_start(runs, name, tmp_path):
     result = exploded(runs(name))
     paths = save_figures(result, tmp_path, (np.full(51, 1e300), np.full(51, np.inf)))
@@ -325,7 +330,7 @@ def test_what_is_within_reach_is_drawn_and_nothing_else_changes(runs):
     assert not all_figures(result)["trajectories"].get_suptitle()
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", FEW)
 def test_a_run_of_one_frame_is_drawn_as_dots(runs, name, tmp_path):
     whole = runs(name)
     result = cut(whole, whole.states[:1], None if whole.reference is None else whole.reference[:1])
@@ -369,6 +374,7 @@ def test_each_figure_is_written_as_png_and_pdf(runs, tmp_path):
         assert pdf.read_bytes().startswith(b"%PDF")
 
 
+@pytest.mark.slow
 def test_the_same_run_writes_the_same_files(runs, tmp_path):
     first = save_figures(runs("unicycle"), tmp_path / "first")
     again = save_figures(runs("unicycle"), tmp_path / "again")

@@ -76,6 +76,7 @@ def test_coincident_goals_warn():
     assert result.warnings == ("agents 1 and 2 have the same goal, and would collide there.",)
 
 
+@pytest.mark.slow
 def test_a_weak_coupling_is_named_as_the_cause_of_growth():
     result = run("paper-line", "follower.gain.coupling=0.5", "simulation.horizon=30")
     text = " ".join(ech.report(result).split())
@@ -85,6 +86,7 @@ def test_a_weak_coupling_is_named_as_the_cause_of_growth():
     )
 
 
+@pytest.mark.slow
 def test_a_swarm_shows_best_median_and_worst():
     model, graph = ech.models.SingleIntegrator(2), ech.Graph.star(30)
     result = simulate(
