@@ -78,11 +78,13 @@ class Chunks:
                 f"on; `echelon run {self.folder}` runs what is there now from the start."
             )
         for name, version in versions().items():
-            if begun["versions"].get(name) != version:
+            before = begun["versions"].get(name)
+            # Unknown where the checkout could not be asked.
+            if before not in (None, version):
                 raise OutputError(
-                    f"the run in `{self.folder}` was begun under {name} "
-                    f"`{begun['versions'].get(name)}`, and this is `{version}`, which may round "
-                    f"otherwise; `echelon run {self.folder}` runs it from the start."
+                    f"the run in `{self.folder}` was begun under {name} `{before}`, and this is "
+                    f"`{version}`, which may round otherwise; `echelon run {self.folder}` runs it "
+                    "from the start."
                 )
 
     def _digest(self) -> str:
