@@ -407,3 +407,31 @@ def test_design_overwrites_nothing(here, echelon):
     os.remove("gain.json")
     assert echelon("run", "o", "--no-figures", "--out", "again")[0] == 0
     assert_same(here / "o", here / "again")
+
+
+def test_a_comparison_that_is_interrupted_keeps_what_was_flown(here, echelon, monkeypatch):
+    from echelon.archive.comparison import Flights
+    from echelon.cli.stop import STOP
+
+    kept = Flights.write
+
+    def write(self, row):
+        kept(self, row)
+        # Each row is on disk as soon as it is there.
+        assert (here / "o" / "runs" / "literal.nc").exists()
+        if STOP.number is None:
+            os.kill(os.getpid(), signal.SIGTERM)
+        while STOP.number is None:
+            time.sleep(0.001)
+
+    monkeypatch.setattr(Flights, "write", write)
+    several = ["--method", "literal", "--method", "riccati", "--horizon", "0.1", "--no-figures"]
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        code, out, err = echelon("compare", "integrators", *several, "--out", "o")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert code == 143 and "stopping after this chunk" in err
+    assert "it was not flown, since it was interrupted" in out
+    assert [path.name for path in (here / "o" / "runs").iterdir()] == ["literal.nc"]
+    assert (here / "o" / "comparison.json").exists()

@@ -66,6 +66,8 @@ class Stop:
             mouth.close()
             thread.join()
             ears.close()
+            # Another call in the same process was told nothing.
+            self.number = None
 
     @contextlib.contextmanager
     def hold(self) -> Iterator[None]:

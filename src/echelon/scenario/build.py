@@ -133,12 +133,22 @@ def _with_laws(
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
-    with faults.at("simulation"):
-        check_memory(parts, _settings(scenario))
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()
     return Built(parts, _settings(scenario))
+
+
+def check_size(scenario: Scenario, built: Built) -> None:
+    """Check that what a run of a scenario stores has room; what only looks at it stores nothing.
+
+    Raises:
+        ScenarioError: it has not.
+    """
+    faults = _Faults(scenario)
+    with faults.at("simulation"):
+        check_memory(*built)
+    faults.settle()
 
 
 def run(
