@@ -33,7 +33,6 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     check_kind("parts", parts, Parts)
     check_kind("settings", settings, Settings)
     settings.check()
-    check_memory(parts, settings)
     model, graph, formation = parts.model, parts.graph, parts.formation
     # Gains, plans and starts are the same in a float32 run, and so is what is promised of them.
     with precision("float64"):

@@ -14,7 +14,7 @@ from echelon.core.types import Array
 from echelon.engine.drive import Stepper, Stopped
 from echelon.engine.grid import Grid
 from echelon.engine.parts import Parts
-from echelon.engine.prepare import Prepared, prepare
+from echelon.engine.prepare import Prepared, check_memory, prepare
 from echelon.engine.record import Recorder, Stretch, join
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
@@ -55,6 +55,7 @@ def simulate(
     """
     began = time.perf_counter()
     prepared = prepare(parts, settings)
+    check_memory(parts, settings)
     with precision("float64"):
         # Plans and solvers are made in float64, in whatever precision the run then is.
         stepper = prepared.parts.drive.stepper(prepared.problem)
