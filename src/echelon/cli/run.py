@@ -11,7 +11,7 @@ import typer
 from echelon.cli import tables
 from echelon.cli.console import JsonOption, foretell, show_progress, written
 from echelon.cli.stop import STOP
-from echelon.core.errors import EchelonError, Outcome, OutputError
+from echelon.core.errors import Outcome, OutputError
 
 if TYPE_CHECKING:
     from echelon.archive.chunks import Chunks
@@ -136,10 +136,10 @@ def _again(folder: Path) -> str:
 
 @contextmanager
 def _undone(chunks: "Chunks") -> Iterator[None]:
-    """Leave no folder behind where a run is refused before anything is computed."""
+    """Leave no folder behind where a run ends before anything is computed."""
     try:
         yield
-    except EchelonError:
+    except BaseException:
         chunks.forget()
         raise
 

@@ -11,6 +11,9 @@ from typing import final
 
 _SAID = "echelon: stopping after this chunk, and writing what was computed; again ends at once."
 
+_CURSOR = "\x1b[?25h\n"
+"""Shows the cursor again, which the bar of progress hides."""
+
 
 @final
 class Ended(BaseException):
@@ -95,6 +98,9 @@ class Stop:
             told += 1
             if told > 1:
                 # Nothing is lost: every file is either whole or under another name.
+                if sys.stderr.isatty():
+                    sys.stderr.write(_CURSOR)
+                    sys.stderr.flush()
                 os._exit(self.exit_code)
             self.number = number[0]
             if self._held:

@@ -102,8 +102,12 @@ class Laws(Drive):
         return _LawStepper(assemble(problem, self.leader, self.follower), problem.states)
 
 
-_AGENT_STEPS = 20_000
-"""Steps of one agent each in a chunk: a quadrotor's take 2 to 8 us, and a model may take longer."""
+_AGENT_STEPS, _FEWEST = 100_000, 4
+"""Steps of one agent each in a chunk, and the fewest of all agents.
+
+A quadrotor's take 1.4 to 7 us, and a model may take longer. A chunk computes the inputs at each of
+its frames once more, so that one of a single step would take twice the time.
+"""
 
 
 @final
@@ -115,8 +119,8 @@ class _LawStepper(Stepper):
 
     @property
     def longest(self) -> int:
-        """Steps that take a tenth of a second, and one where that takes longer."""
-        return max(1, _AGENT_STEPS // len(self.states))
+        """Steps that take some tenths of a second, or a few of very many agents."""
+        return max(_FEWEST, _AGENT_STEPS // len(self.states))
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""

@@ -81,6 +81,7 @@ class Recorder:
         """Begin; `nothing` are the sums of no step."""
         self.problem, self.grid, self.stretches = problem, grid, list(before)
         self.sums = before[-1].sums if before else nothing
+        self.frames = sum(len(each.times) for each in before)
 
     @property
     def done(self) -> int:
@@ -90,7 +91,7 @@ class Recorder:
     @property
     def complete(self) -> bool:
         """Whether every frame is there."""
-        return sum(len(each.times) for each in self.stretches) == self.grid.frames
+        return self.frames == self.grid.frames
 
     @property
     def ended(self) -> bool:
@@ -106,6 +107,10 @@ class Recorder:
         # One that is not finite is kept wherever it stands: it says when the run was lost.
         stored = self.grid.stored(points) | ~_finite(chunk.states, chunk.inputs).all(axis=1)
         self.sums = self.sums.plus(chunk.sums)
+        self.frames += int(stored.sum())
+        if self.stretches:
+            # Only the last one's are ever asked for, and many would fill the memory.
+            self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
         self.stretches.append(
             Stretch(
                 first,
