@@ -37,7 +37,7 @@ def pytest_configure(config):
     its optimizer, and by the older of its two emitters, XLA needs a third of the time for one. What
     is not only the quick tests (`-m slow`, `-m ""`) compiles as it does for users.
     """
-    if config.option.markexpr == "not slow":
+    if config.option.markexpr == "not slow and not study":
         os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)  # which JAX reads when it first runs
 
 

@@ -15,7 +15,7 @@ from test_hull import NO_INPUTS, euler_rate_quadrotor, quadrotor_box
 
 from echelon.certificates.exact import prove_contraction
 from echelon.core.errors import GainError
-from echelon.enclosure.hull import jacobian_hull
+from echelon.enclosure.hull import value_hull
 
 # --- definiteness -----------------------------------------------------------------------------
 
@@ -233,7 +233,7 @@ def least_coupling(vertices, B, rate, scale, largest=1e4):
 @pytest.fixture(scope="module")
 def quadrotor():
     start = time.perf_counter()
-    hull = jacobian_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
+    hull = value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
     B = np.zeros((13, 4))
     B[[12, 9, 10, 11], range(4)] = 1.0
     scale = np.repeat([1.0, 1.0, 0.3, 3.0, 3.0], [3, 3, 3, 3, 1])
@@ -260,5 +260,5 @@ def test_the_quadrotor_is_refused_what_is_not_so(quadrotor):
     assert not prove_contraction(
         hull.vertices, hull.error, B, P + 0.01 * (noise + noise.T), rho, ALPHA
     ).holds
-    wider = jacobian_hull(euler_rate_quadrotor, quadrotor_box(tilt=0.9, yaw=0.7), NO_INPUTS)
+    wider = value_hull(euler_rate_quadrotor, quadrotor_box(tilt=0.9, yaw=0.7), NO_INPUTS)
     assert not prove_contraction(wider.vertices, wider.error, B, P, rho, ALPHA).holds

@@ -1,5 +1,7 @@
 """The graph: spectra in closed form, networkx, and the laws of Laplacians."""
 
+from fractions import Fraction
+
 import jax.numpy as jnp
 import networkx as nx
 import numpy as np
@@ -10,6 +12,7 @@ from oracles import adjacency, connected, laplacian, relabelled
 
 from echelon.core import numerics
 from echelon.network.graph import Graph
+from echelon.verifier.exact import is_positive_definite
 
 
 def graphs(most=9, weighted=True):
@@ -283,3 +286,50 @@ def test_outward_goes_by_distance_and_lists_the_neighbours_passed_on_the_way(gra
         passed = {j for j in graph.neighbours(agent) if j in order[:place]}
         assert set(earlier) == (set() if agent in graph.leaders else passed)
         assert bool(earlier) == (agent not in graph.leaders)
+
+
+# ---- the smallest eigenvalue, proved --------------------------------------------------------
+
+
+def exceeds(graph, bound):
+    """Whether the smallest eigenvalue is above a number: exact signs of leading minors."""
+    place = {agent: k for k, agent in enumerate(graph.followers)}
+    rows = [[Fraction(0)] * len(place) for _ in place]
+    for (i, j), weight in zip(graph.edges.tolist(), graph.weights.tolist(), strict=True):
+        for a, b in ((i, j), (j, i)):
+            if a in place:
+                rows[place[a]][place[a]] += Fraction(weight)
+                if b in place:
+                    rows[place[a]][place[b]] -= Fraction(weight)
+    for k, row in enumerate(rows):
+        row[k] -= Fraction(bound)
+    return is_positive_definite(rows)
+
+
+@settings(max_examples=25)
+@given(
+    parents=st.lists(st.integers(0, 5), min_size=1, max_size=6),
+    decades=st.lists(st.floats(-8, 8), min_size=6, max_size=6),
+)
+def test_the_proved_eigenvalue_is_below_the_exact_one_and_sharp(parents, decades):
+    edges = [(min(p, k), k + 1, 10.0 ** decades[k]) for k, p in enumerate(parents)]
+    graph = Graph.from_edges(edges)
+    spectrum = graph.spectrum()
+    assert exceeds(graph, spectrum.proved * (1 - 1e-15))
+    assert not exceeds(graph, spectrum.proved * (1 + 2e-9))
+    # Floats alone would say more than is true of such weights.
+    assert spectrum.low <= spectrum.proved * (1 + 2e-9)
+
+
+@pytest.mark.parametrize("weights", [(1e-3, 1e13, 1.0), (1e-8, 1e8, 1e8), (1e-3, 1e11, 1.0)])
+def test_heavy_edges_beside_light_ones_take_nothing_from_the_bound(weights):
+    graph = Graph.from_edges([(k, k + 1, w) for k, w in enumerate(weights)])
+    proved = graph.spectrum().proved
+    assert exceeds(graph, proved * (1 - 1e-15)) and not exceeds(graph, proved * (1 + 2e-9))
+
+
+def test_the_bound_of_a_long_line_is_that_of_its_closed_form():
+    n = 460
+    exact = 2.0 - 2.0 * np.cos(np.pi / (2 * (n - 1) + 1))
+    spectrum = Graph.path(n).spectrum()
+    assert exact * (1 - 1e-8) < spectrum.proved <= exact * (1 + 1e-10)

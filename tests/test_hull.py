@@ -13,13 +13,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from echelon.certificates.jacobians import model_jacobian
+from echelon.certificates.jacobians import model_jacobian, velocity_of
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
 from echelon.enclosure.curves import power_points, wave_points
-from echelon.enclosure.hull import Box, jacobian_hull
+from echelon.enclosure.hull import Box, slope_hull, value_hull
 from echelon.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
-from echelon.enclosure.polynomial import Atoms, constant, corner_values
+from echelon.enclosure.polynomial import Atoms, OpenError, constant, corner_values, divides
+from echelon.enclosure.slopes import JumpError
 from echelon.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol
 
 TILT, YAW = math.radians(30.0), math.radians(20.0)
@@ -73,7 +74,7 @@ SYSTEMS = {
 
 @pytest.fixture(scope="module")
 def hulls():
-    return {name: jacobian_hull(*system[:3]) for name, system in SYSTEMS.items()}
+    return {name: value_hull(*system[:3]) for name, system in SYSTEMS.items()}
 
 
 def values(jacobian, states, inputs, fractions):
@@ -174,7 +175,7 @@ def test_the_error_is_that_of_rounding(hulls):
 
 
 def test_the_error_is_the_distance_to_the_exact_vertices():
-    hull = jacobian_hull(lambda x, v: 0.1 * x.reshape(1, 1), Box([0.3], [0.7]), NO_INPUTS)
+    hull = value_hull(lambda x, v: 0.1 * x.reshape(1, 1), Box([0.3], [0.7]), NO_INPUTS)
     exact = [Fraction(0.1) * Fraction(end) for end in (0.3, 0.7)]
     found = [abs(Fraction(v) - e) for v, e in zip(hull.vertices.ravel(), exact, strict=True)]
     assert 0 < max(found) <= Fraction(hull.error[0, 0]) <= max(found) * (1 + Fraction(1, 2**50))
@@ -194,7 +195,7 @@ def test_numbers_that_are_not_rational_leave_a_slack():
 
 def test_the_quadrotor_is_made_of_three_arcs_and_an_interval(hulls):
     names = [*"xyz", "vx", "vy", "vz", "roll", "pitch", "yaw", "dr", "dp", "dy", "thrust"]
-    hull = jacobian_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS, names)
+    hull = value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS, names)
     found = {atom.name: (atom.kind, atom.vertices, atom.upper) for atom in hull.atoms}
     assert found == {
         "roll": ("arc", 4, TILT),
@@ -248,7 +249,7 @@ def systems(draw):
 def test_jacobians_of_any_drift_lie_in_the_hull(system, seed):
     jacobian, box = system
     try:
-        hull = jacobian_hull(jacobian, box, NO_INPUTS)
+        hull = value_hull(jacobian, box, NO_INPUTS)
     except GainError as error:
         assert "vertices" in str(error)
         assume(False)
@@ -262,7 +263,7 @@ def test_waves_without_a_low_common_frequency_are_enclosed_apart(frequencies):
         return jnp.stack([jnp.stack([sum(waves), waves[0] * waves[-1]]), x])
 
     box = Box(np.array([-0.4, 0.0]), np.array([0.9, 0.5]))
-    hull = jacobian_hull(jacobian, box, NO_INPUTS)
+    hull = value_hull(jacobian, box, NO_INPUTS)
     assert_supported(hull, values(jacobian, box, NO_INPUTS, points_of(box, NO_INPUTS, 0)), 0)
 
 
@@ -271,7 +272,7 @@ def test_too_many_waves_are_refused_and_not_counted_out():
         return sum(jnp.cos(w * x[0]) + jnp.sin(w * x[0]) for w in np.sqrt(np.arange(2.0, 20.0)))
 
     with pytest.raises(GainError, match="has 65536 vertices"):
-        jacobian_hull(lambda x, v: jacobian(x, v)[None, None], Box([0.1], [0.5]), NO_INPUTS)
+        value_hull(lambda x, v: jacobian(x, v)[None, None], Box([0.1], [0.5]), NO_INPUTS)
 
 
 # --- a smaller box has a smaller hull ---------------------------------------------------------
@@ -285,7 +286,7 @@ def test_a_box_shrunk_about_its_middle_has_a_hull_inside(hulls, name):
         middle, half = (np.add(*box) / 2, np.subtract(box[1], box[0]) / 2)
         return Box(middle - 0.7 * half, middle + 0.7 * half)
 
-    inner = jacobian_hull(jacobian, shrunk(states), shrunk(inputs))
+    inner = value_hull(jacobian, shrunk(states), shrunk(inputs))
     assert_supported(hulls[name], inner.vertices)
 
 
@@ -293,7 +294,7 @@ def test_a_box_shrunk_about_its_middle_has_a_hull_inside(hulls, name):
 def test_any_box_inside_has_a_hull_inside_where_no_arc_is_cut(hulls, name):
     jacobian, states, inputs, _ = SYSTEMS[name]
     lower, upper = map(np.asarray, states)
-    inner = jacobian_hull(jacobian, Box(lower + 0.5 * (upper - lower), upper), inputs)
+    inner = value_hull(jacobian, Box(lower + 0.5 * (upper - lower), upper), inputs)
     assert_supported(hulls[name], inner.vertices)
 
 
@@ -302,7 +303,7 @@ def test_any_box_inside_has_a_hull_inside_where_no_arc_is_cut(hulls, name):
 
 def scalar_hull(function, low, high):
     """The smallest and largest vertex, with the error, of a function of one number."""
-    hull = jacobian_hull(lambda x, v: function(x).reshape(1, 1), Box([low], [high]), NO_INPUTS)
+    hull = value_hull(lambda x, v: function(x).reshape(1, 1), Box([low], [high]), NO_INPUTS)
     return hull.vertices.min() - hull.error.max(), hull.vertices.max() + hull.error.max()
 
 
@@ -412,7 +413,7 @@ SHUFFLES = {
 def test_at_a_point_the_hull_is_the_jacobian(name):
     jacobian = jax.jacfwd(SHUFFLES[name])
     x = np.array([0.7, -0.4, 1.3, 0.2])
-    hull = jacobian_hull(lambda x, v: jacobian(x), Box(x, x), NO_INPUTS)
+    hull = value_hull(lambda x, v: jacobian(x), Box(x, x), NO_INPUTS)
     with precision("float64"):
         expected = np.asarray(jacobian(jnp.asarray(x)))
     assert len(hull.vertices) == 1 and (hull.error < 1e-14).all()
@@ -550,7 +551,7 @@ def test_the_edge_of_the_chart_is_named(pitch):
     model = Quadrotor.crazyflie()
     box = about_zero(*[0] * 6, 0.1, pitch, 0, 0, 0, 0)
     with pytest.raises(GainError) as caught:
-        jacobian_hull(
+        value_hull(
             model_jacobian(model),
             box,
             about_zero(0, 0, 0, 0),
@@ -558,7 +559,7 @@ def test_the_edge_of_the_chart_is_named(pitch):
         )
     low = 6.12323e-17 if pitch == math.pi / 2 else -0.0291995
     assert str(caught.value) == (
-        "the Jacobian of the model divides by an expression of `pitch`, which may be anything in "
+        "the model divides by an expression of `pitch`, which may be anything in "
         f"[{low:g}, 1] on the domain, and must keep well away from 0; make the domain smaller."
     )
 
@@ -592,24 +593,239 @@ def test_what_cannot_be_enclosed_is_named(function, words):
 @pytest.mark.parametrize(
     ("states", "words"),
     [
-        (Box([1, 0], [0, 0]), "`x[0]` are 1 and 0, and must be finite and in rising order."),
+        (Box([1, 0], [0, 0]), "`x[0]` are 1 and 0, and must be in rising order."),
         (Box([0, math.nan], [0, 1]), "`x[1]` are nan and 1"),
-        (Box([0, 0], [0, math.inf]), "must be finite"),
+        (Box([0, 0], [math.inf, 0]), "leaves `x[0]` unbounded, and must give it a bound"),
         (Box([0, 0], [1]), "two vectors of the same length"),
     ],
 )
 def test_a_box_that_is_none_is_refused(states, words):
     with pytest.raises(GainError) as caught:
-        jacobian_hull(model_jacobian(Pendulum()), states, about_zero(1))
+        value_hull(model_jacobian(Pendulum()), states, about_zero(1))
     assert words in str(caught.value)
 
 
 def test_other_faults_of_a_call_are_refused(monkeypatch):
     box = about_zero(1, 1)
     with pytest.raises(GainError, match="has 2 entries, and must have 3"):
-        jacobian_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
+        value_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
     with pytest.raises(GainError, match="one matrix of floats"):
-        jacobian_hull(lambda x, v: x, box, NO_INPUTS)
+        value_hull(lambda x, v: x, box, NO_INPUTS)
     monkeypatch.setattr("echelon.enclosure.polynomial.MOST_VERTICES", 100)
     with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
-        jacobian_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
+        value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
+
+
+# --- slopes, found without JAX's derivatives ----------------------------------------------------
+
+MODELS = {
+    "pendulum": Pendulum(),
+    "van-der-pol": VanDerPol(),
+    "planar-quadrotor": PlanarQuadrotor(),
+    "unicycle-point": UnicyclePoint(),
+    "body-rates": Quadrotor.crazyflie(),
+}
+
+
+def slopes(function, half=1.0, n=1):
+    """The extreme slopes of a function of one number, or the hull of one of several."""
+    hull = slope_hull(lambda x, v: function(x), about_zero(*[half] * n), NO_INPUTS)
+    if n > 1:
+        return hull
+    return hull.vertices.min() - hull.error.max(), hull.vertices.max() + hull.error.max()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_slopes_are_the_jacobians_of_jax_where_models_are_smooth(hulls, name):
+    found = slope_hull(velocity_of(MODELS[name]), *SYSTEMS[name][1:3])
+    np.testing.assert_array_equal(found.vertices, hulls[name].vertices)
+    np.testing.assert_array_equal(found.error, hulls[name].error)
+
+
+SMOOTH = [name for name in FUNCTIONS if name not in ("abs", "sign", "max", "clip", "sqrt")]
+
+
+@pytest.mark.parametrize("name", [n for n in SMOOTH if n not in ("asin", "acos")])
+def test_each_function_has_the_derivative_that_jax_knows(name):
+    function, low, high = FUNCTIONS[name]
+    hull = slope_hull(lambda x, v: function(x), Box([low], [high]), NO_INPUTS)
+    with precision("float64"):
+        points = jnp.linspace(low, high, 2001)
+        wanted = np.asarray(jax.vmap(jax.grad(function))(points))
+    lower, upper = (hull.vertices.min() - hull.error.max(), hull.vertices.max() + hull.error.max())
+    size = np.abs(wanted).max()
+    assert lower <= wanted.min() + 1e-12 * size and wanted.max() - 1e-12 * size <= upper
+    # What is a product of several unknowns is wider than it is.
+    assert upper - lower <= 4 * np.ptp(wanted) + 1e-6 * size
+
+
+@pytest.mark.parametrize(
+    ("function", "wanted"),
+    [
+        (lambda x: -x + 3 * jnp.maximum(x, -x), (-4.0, 2.0)),
+        (lambda x: -x + 3 * jnp.abs(x), (-4.0, 2.0)),
+        (lambda x: jnp.maximum(x, -x) - jnp.abs(x), (0.0, 0.0)),
+        (lambda x: jnp.where(x > 0, x, 0.0) - jnp.maximum(0.0, x), (0.0, 0.0)),
+        (lambda x: jnp.where(2 * x < 0, 0.0, 3 * x) - 3 * jax.nn.relu(x), (0.0, 0.0)),
+        (lambda x: jnp.where(x >= 0, x, -x), (-1.0, 1.0)),
+        (lambda x: jnp.clip(x, -0.5, 0.5), (0.0, 1.0)),
+        (lambda x: -jnp.abs(x) * x, (-2.0, 0.0)),
+        (lambda x: -(2 * x - 0.6) * jnp.abs(x - 0.3), (-5.2, 0.0)),
+        (lambda x: jnp.where(x == 0.25, 0.25, x), (1.0, 1.0)),
+        (lambda x: jnp.minimum(x, 2.0), (1.0, 1.0)),
+        (lambda x: jnp.sign(x + 2.0) * x, (1.0, 1.0)),
+        (lambda x: -x + 5 * jax.lax.stop_gradient(x), (4.0, 4.0)),
+    ],
+)
+def test_what_bends_has_the_slopes_of_both_sides(function, wanted):
+    np.testing.assert_allclose(slopes(function), wanted, atol=1e-15)
+
+
+def test_two_bends_are_two_unknowns():
+    hull = slopes(lambda x: jnp.stack([jnp.maximum(x[0], x[1]), jnp.abs(x[0]), jnp.abs(x[1])]), n=2)
+    found = {tuple(v.ravel()) for v in hull.vertices}
+    one, other = ((1.0, 0.0), (0.0, 1.0))
+    sides = (-1.0, 1.0)
+    assert found == {(*m, a, 0.0, 0.0, b) for m in (one, other) for a in sides for b in sides}
+
+
+def test_a_derivative_written_by_hand_is_not_believed():
+    @jax.custom_jvp
+    def lying(x):
+        return 5 * x
+
+    lying.defjvp(lambda primals, tangents: (lying(*primals), -tangents[0]))
+    assert slopes(lambda x: lying(x) - x) == (4.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: -x + 5 * jnp.where(x > 1e-3, 1.0, 0.0),
+        lambda x: -x + 5 * jnp.where(x > 1e-3, 1, 0),
+        lambda x: -x + 5 * (x > 1e-3),
+        lambda x: 5 * jnp.sign(x),
+        lambda x: jnp.heaviside(x, 0.5),
+        lambda x: jnp.where((x > 0) & (x < 0.5), x, 0.0),
+        lambda x: jnp.where(x == 0, 1.0, x),
+        lambda x: x * (x.astype(int) + 1),
+        lambda x: jnp.where(jnp.sin(x) > 0.5, jnp.sin(x), 0.0),
+    ],
+)
+def test_a_jump_has_no_slopes(function):
+    with pytest.raises(JumpError, match="may jump with `x\\[0\\]` inside the domain"):
+        slopes(function)
+
+
+@pytest.mark.parametrize("function", [jnp.floor, lambda x: jnp.argmax(jnp.stack([x, -x])) * x])
+def test_what_has_no_rule_has_no_slopes(function):
+    with pytest.raises(GainError, match="does not know"):
+        slopes(function)
+
+
+def test_a_root_has_no_slope_at_zero():
+    with pytest.raises(GainError, match="must be positive"):
+        slope_hull(lambda x, v: jnp.sqrt(x), Box([0.0], [1.0]), NO_INPUTS)
+
+
+def test_an_open_state_may_stand_linearly_and_cancel_and_nothing_else():
+    box = Box([-np.inf, -2.0], [np.inf, 2.0])
+
+    def of(function):
+        return slope_hull(lambda x, v: jnp.stack(function(*x)), box, NO_INPUTS)
+
+    linear = of(lambda x, v: (v, -x - jnp.sin(v) + (x * x - x**2)))
+    assert set(linear.vertices[:, 1, 0]) == {-1.0} and len(linear.vertices) == 2
+    for bent in (
+        lambda x, v: (v, 50 * jnp.maximum(x - 1.1, 0.0)),
+        lambda x, v: (v, jnp.where(x > 1.1, x, 1.1)),
+        lambda x, v: (v, jnp.abs(x)),
+        lambda x, v: (v, jnp.clip(x, -1.0, 1.0)),
+        lambda x, v: (v, jnp.sign(x)),
+        lambda x, v: (v, jnp.sin(x)),
+        lambda x, v: (v, jnp.exp(x)),
+        lambda x, v: (v, x * x),
+        lambda x, v: (v, x * v),
+    ):
+        with pytest.raises(OpenError, match=r"leaves `x\[0\]` unbounded"):
+            of(bent)
+
+
+def test_a_box_far_away_is_not_rounded_to_a_point():
+    far = Fraction(10**15)
+    hull = slope_hull(lambda x, v: x * x, Box([far - 1], [far + 1]), NO_INPUTS)
+    assert np.ptp(hull.vertices) == 4.0
+
+
+def test_division_of_polynomials_is_exact():
+    atoms = Atoms()
+    x, y = (atoms.variable(n, Interval(Fraction(-1), Fraction(1))) for n in "xy")
+    one = constant(1)
+    assert divides(x - one, x * x - one) and divides(x - y, x.power(3) - y.power(3))
+    assert divides(x + y, constant(0)) and divides(x * y - one, (x * y - one) * (x + y) * x)
+    assert not divides(x - one, x * x + one) and not divides(x, x + y) and not divides(x * x, x)
+    sine = atoms.circle(x)[1]
+    assert divides(sine - one, (sine - one) * constant(3)) and divides(y, y * sine)
+    assert not divides(sine - one, sine + one) and not divides(x, sine)
+
+
+@st.composite
+def bent(draw):
+    """A continuous function of two states with bends wherever they fall, and a box."""
+    c = st.floats(-2, 2).map(lambda v: round(v, 3))
+
+    def plane():
+        a, b, d = draw(c), draw(c), draw(c)
+        return lambda x: a * x[0] + b * x[1] + d
+
+    joins = [
+        lambda p, q: lambda x: jnp.maximum(p(x), q(x)),
+        lambda p, q: lambda x: jnp.minimum(p(x), jnp.sin(q(x))),
+        lambda p, q: lambda x: jnp.clip(p(x), -0.3, 0.4) * q(x),
+        lambda p, q: lambda x: jnp.abs(p(x)) * p(x) - jax.nn.relu(q(x)),
+        lambda p, q: lambda x: jnp.where(p(x) > 0, p(x) * q(x), 0.0),
+        lambda p, q: lambda x: jnp.where((p(x) > 0) & (q(x) < 1), p(x) * (q(x) - 1), 0.0),
+        lambda p, q: lambda x: jnp.where(q(x) <= p(x), jnp.abs(q(x)), jnp.abs(p(x))),
+        lambda p, q: lambda x: jnp.tanh(jnp.maximum(p(x), 0.0)) + q(x),
+    ]
+    rows = [draw(st.sampled_from(joins))(plane(), plane()) for _ in range(2)]
+    return (lambda x, v: jnp.stack([row(x) for row in rows])), draw(st.integers(0, 99))
+
+
+def assert_secants_lie_in_the_hull(function, box, hull, seed, pairs=400):
+    """f(x) - f(y) is a matrix of the hull times x - y: no functional is larger than at a vertex."""
+    rng = np.random.default_rng(seed)
+    lower, upper = map(np.asarray, box)
+    x = rng.uniform(lower, upper, (pairs, len(lower)))
+    # Near and far partners: bends are felt by both, and jumps by the near ones.
+    y = np.clip(
+        x + rng.normal(size=x.shape) * 10.0 ** rng.uniform(-4, 0.5, (pairs, 1)), lower, upper
+    )
+    with precision("float64"):
+        value = jax.jit(jax.vmap(lambda x: function(x, None)))
+        moved = np.asarray(value(jnp.asarray(x))) - np.asarray(value(jnp.asarray(y)))
+    step = x - y
+    C = rng.normal(size=(60, moved.shape[1]))
+    reach = np.einsum("cr,krn,pn->cpk", C, hull.vertices, step).max(axis=2)
+    slack = np.abs(C) @ hull.error @ np.abs(step).T + 1e-13
+    assert (C @ moved.T <= reach + slack).all()
+
+
+@settings(max_examples=25)
+@given(system=bent())
+def test_secants_of_what_bends_lie_in_the_hull(system):
+    function, seed = system
+    box = about_zero(1.0, 1.5)
+    try:
+        hull = slope_hull(function, box, NO_INPUTS)
+    except JumpError:
+        # A choice between equal sizes is continuous, and no polynomial division shows it.
+        return
+    assert_secants_lie_in_the_hull(function, box, hull, seed)
+
+
+@pytest.mark.study
+@settings(max_examples=1000)
+@given(system=bent())
+def test_no_hull_of_a_thousand_is_left_by_a_secant(system):
+    test_secants_of_what_bends_lie_in_the_hull.hypothesis.inner_test(system)

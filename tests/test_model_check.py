@@ -1,5 +1,6 @@
 """What is said of a malformed agent, once, when it enters `synthesize` or `simulate`."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from echelon.gains.gain import synthesize
 from echelon.laws import TrimInput
 from echelon.models import ControlAffine, SingleIntegrator
 from echelon.models.check import check_model
+from echelon.models.linearization import at_trim
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 
@@ -288,3 +290,80 @@ def test_an_agent_without_a_flat_map_says_how_to_go_on():
 def test_a_sound_agent_needs_no_trim_of_its_own():
     assert checked(SingleIntegrator(2)) == ()
     assert checked(spoiled(trim=((0.0, 0.0), (0.0,)))) == ()
+
+
+# ---- derivatives that are none, and bends ----
+
+
+def scalar(drift, input_map=lambda x: jnp.ones((1, 1))):
+    """A model of one state from two functions."""
+
+    class Scalar(ControlAffine):
+        state_names = ("x",)
+        input_names = ("push",)
+
+        def drift(self, x):
+            return drift(x)
+
+        def input_map(self, x):
+            return input_map(x)
+
+    return Scalar()
+
+
+@jax.custom_jvp
+def lying(x):
+    return 5.0 * x
+
+
+lying.defjvp(lambda primals, tangents: (lying(*primals), -tangents[0]))
+
+
+@pytest.mark.parametrize(
+    ("drift", "said", "seen"),
+    [
+        (lambda x: -x + 5 * jax.lax.stop_gradient(x), "-1", "4"),
+        (lambda x: lying(x) - x, "-2", "4"),
+    ],
+)
+def test_a_derivative_that_is_none_is_refused(drift, said, seen):
+    with pytest.raises(ModelError) as caught:
+        check_model(scalar(drift))
+    assert f"the derivative {said} in `x` of `drift` for `x`" in str(caught.value)
+    assert f"its values show {seen};" in str(caught.value)
+
+
+def test_so_is_one_of_the_input_map():
+    with pytest.raises(ModelError, match="of `input_map` for `x` and `push`"):
+        check_model(scalar(lambda x: -x, lambda x: 1.0 + jax.lax.stop_gradient(x)[:, None]))
+
+
+def test_what_cannot_be_derived_is_one_sentence():
+    def called_back(x):
+        return jax.pure_callback(lambda v: -v, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    with pytest.raises(ModelError, match="`Scalar` has no derivative at its trim, by"):
+        check_model(scalar(called_back))
+
+
+@pytest.mark.parametrize(
+    ("drift", "bends"),
+    [
+        (lambda x: -x + 3 * jnp.abs(x), True),
+        (lambda x: jnp.where(x > 0, -2 * x, -x), True),
+        (lambda x: -x + 0.5 * jnp.sign(x), True),
+        (lambda x: -x - jnp.abs(x) * x, False),
+        (lambda x: -x - 1e3 * jnp.tanh(x), False),
+        (lambda x: -1e6 * x + 1e5 * jnp.sin(30 * x), False),
+        (lambda x: -x + jnp.where(x > 1e-3, 1.0, 0.0), False),
+    ],
+)
+def test_a_bend_at_the_trim_is_seen_and_a_curve_is_none(drift, bends):
+    assert check_model(scalar(drift)) == ()
+    assert at_trim(scalar(drift)).bends.any() == bends
+
+
+def test_an_input_map_may_bend_and_not_jump():
+    bent = scalar(lambda x: -x, lambda x: 1.0 + jnp.abs(x)[:, None])
+    jumping = scalar(lambda x: -x, lambda x: jnp.where(x > 0, 1.0, 2.0)[:, None])
+    assert not at_trim(bent).bends.any() and at_trim(jumping).bends.all()

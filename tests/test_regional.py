@@ -124,7 +124,7 @@ def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
         P = robust_lqr(jacobians(model, domain).matrices, B, np.diag(model.weights[0]), gain.R).P
         pairs = pairs_on(model, domain, gain.R)
     # Strength 2, as of c = 1 where lambda_min = 1.
-    unit = Spectrum(np.ones(1), 1)
+    unit = Spectrum(np.ones(1), 1, 1.0)
     assert contracting_region(pairs, P, B, gain.R, False, 1.0, unit) is None
 
 

@@ -92,6 +92,11 @@ class Domain:
         arrays = (self.lower, self.upper, self.input_lower, self.input_upper)
         return tuple(tuple(array.tolist()) for array in arrays)
 
+    @property
+    def box(self) -> tuple[Array, Array]:
+        """The bounds on x - x*, lower and upper."""
+        return self.lower, self.upper
+
     def margins(self) -> Array:
         """Return (n,) how far each state may deviate from the trim to both sides."""
         # The certified set is symmetric about the trim, so the nearer bound counts.

@@ -1,6 +1,7 @@
 """The Jacobians of a model on a domain: a hull that holds them all, or else samples of them."""
 
 from collections.abc import Callable
+from fractions import Fraction
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -8,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.domain import Domain
+from echelon.certificates.sampling import check_secants, sample_jacobians, unbounded_error
 from echelon.core.errors import GainError
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
-from echelon.enclosure.hull import Box, Hull, jacobian_hull
+from echelon.enclosure.hull import Box, slope_columns, slope_hull
+from echelon.enclosure.polynomial import OpenError
+from echelon.enclosure.slopes import JumpError
 from echelon.models.model import ControlAffine
 
-_SAMPLES = 400
-_FEW = 7
-"""Up to so many bounded states and inputs, every corner of a domain is among the samples."""
 _OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
@@ -44,9 +45,10 @@ def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     are sampled.
 
     Raises:
-        GainError: the Jacobian depends on a state that the domain leaves unbounded.
+        GainError: the Jacobian depends on a state that the domain leaves unbounded, or the model
+            jumps, or has derivatives that are not its slopes.
     """
-    return _enclose(model_jacobian(model), model, domain)
+    return _enclose(model, domain, velocity_of(model))
 
 
 @kept
@@ -56,27 +58,44 @@ def weighted_jacobians(model: ControlAffine, domain: Domain, R: Array) -> Jacobi
     They are enclosed together, as the two turn with the same angles.
 
     Raises:
-        GainError: either depends on a state that the domain leaves unbounded.
+        GainError: as in `jacobians`.
     """
-    jacobian, inverse = model_jacobian(model), np.linalg.inv(R)
+    inverse = np.linalg.inv(R)
 
-    def pair(x: jax.Array, v: jax.Array) -> jax.Array:
+    def weight(x: jax.Array, v: jax.Array) -> jax.Array:
         g = model.normalized_input_map(x)
-        return jnp.concatenate([jacobian(x, v), g @ jnp.asarray(inverse, x.dtype) @ g.T], axis=1)
+        return g @ jnp.asarray(inverse, x.dtype) @ g.T
 
-    return _enclose(pair, model, domain)
+    return _enclose(model, domain, velocity_of(model), weight)
 
 
-def _enclose(function: _OfState, model: ControlAffine, domain: Domain) -> Jacobians:
-    """Return a matrix function of state and normalized input over a domain."""
+def velocity_of(model: ControlAffine) -> _OfState:
+    """Return (x, v) -> f(x) + g(x) (u* + S v), v the normalized input."""
+    return lambda x, v: model.normalized_drift(x) + model.normalized_input_map(x) @ v
+
+
+def model_jacobian(model: ControlAffine) -> _OfState:
+    """Return (x, v) -> d/dx [f(x) + g(x) (u* + S v)], v the normalized input."""
+    return jax.jacfwd(velocity_of(model))
+
+
+def _enclose(
+    model: ControlAffine, domain: Domain, velocity: _OfState, weight: _OfState | None = None
+) -> Jacobians:
+    """Return the slopes of a model over a domain, with a weight to their right."""
     names = [*model.state_names, *model.input_names]
     with precision("float64"):
         try:
-            hull = jacobian_hull(function, *_boxes(model, domain), names)
+            hull = slope_hull(velocity, *_boxes(model, domain), names, weight)
+        except OpenError as error:
+            raise unbounded_error(model, error.name) from error
+        except JumpError:
+            # Samples would hardly meet the jump, and JAX's derivative there is 0.
+            raise
         except GainError as error:
-            samples, why = _sample(function, model, domain), str(error).rstrip(".")
-            return _freeze(Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES, why))
-    _check_bounded(model, domain, hull)
+            found, why = sample_jacobians(model, domain, velocity, weight), str(error).rstrip(".")
+            return _freeze(Jacobians(found, np.zeros(found.shape[1:]), Kind.SAMPLES, why))
+        check_secants(model, domain, velocity, hull)
     return _freeze(Jacobians(hull.vertices, hull.error, Kind.VERTICES))
 
 
@@ -91,80 +110,54 @@ def _freeze(found: Jacobians) -> Jacobians:
 def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
     """Tell whether g is proved constant on the domain: the condition of the nonlocal theorem T1."""
 
-    def slope(x: jax.Array, v: jax.Array) -> jax.Array:
-        n = len(model.state_names)
-        return jax.jacfwd(model.normalized_input_map)(x).reshape(-1, n)
+    def entries(x: jax.Array, v: jax.Array) -> jax.Array:
+        return model.normalized_input_map(x).reshape(-1)
 
+    found = _constant_columns(entries, *_boxes(model, domain))
+    return found is not None and bool(found.all())
+
+
+def offsets_are_symmetries(model: ControlAffine, domain: Domain, offsets: Array) -> bool:
+    """Tell whether f and g are proved not to notice the offsets (N, n) of a formation on a domain.
+
+    f(x + d) = f(x), and g likewise, wherever x lies in the domain: f and g have the slope 0 in
+    every state that d moves, from x to x + d.
+    """
+    moved = (offsets != offsets[0]).any(axis=0)
+    away = offsets - offsets[0]
+    low, high = np.minimum(away.min(axis=0), 0.0), np.maximum(away.max(axis=0), 0.0)
+    # Agents stand in the domain, and their goals' places without offsets within reach of them.
+    wider = Domain(domain.lower - high, domain.upper - low, domain.input_lower, domain.input_upper)
+
+    def entries(x: jax.Array, v: jax.Array) -> jax.Array:
+        return jnp.concatenate([model.drift(x), model.input_map(x).reshape(-1)])
+
+    found = _constant_columns(entries, *_boxes(model, wider))
+    return found is not None and bool(found[moved].all())
+
+
+def _constant_columns(function: _OfState, states: Box, inputs: Box) -> Array | None:
+    """Return (n,) in which states a function is proved to have no slope; None for no enclosure."""
+    found = np.zeros(len(states.lower), bool)
     try:
         with precision("float64"):
-            hull = jacobian_hull(slope, *_boxes(model, domain))
+            zero = slope_columns(function, states, inputs)
     except GainError:
-        return False
-    # g is proved constant where the hull of its slopes is the matrix 0 alone.
-    return not (hull.vertices.any() or hull.error.any())
-
-
-def _boxes(model: ControlAffine, domain: Domain) -> tuple[Box, Box]:
-    """Return the domain as absolute states and normalized inputs; unbounded states in +-1."""
-    trim = np.asarray(model.trim[0], float)
-    # Any stand-in will do: a Jacobian that depends on such a state is refused afterwards.
-    low = np.where(np.isfinite(domain.lower), domain.lower, -1.0)
-    high = np.where(np.isfinite(domain.upper), domain.upper, 1.0)
-    return Box(trim + low, trim + high), Box(domain.input_lower, domain.input_upper)
-
-
-def _check_bounded(model: ControlAffine, domain: Domain, hull: Hull) -> None:
-    """Refuse a domain that leaves open a state on which the Jacobian depends."""
-    used = {atom.name for atom in hull.atoms}
-    for k, name in enumerate(model.state_names):
-        if name in used and not np.isfinite([domain.lower[k], domain.upper[k]]).all():
-            raise _unbounded_error(model, name)
-
-
-def _unbounded_error(model: ControlAffine, name: str) -> GainError:
-    return GainError(
-        f"the domain leaves `{name}` unbounded, and the Jacobian of "
-        f"`{type(model).__name__}` depends on it; give it a bound."
-    )
-
-
-def _sample(function: _OfState, model: ControlAffine, domain: Domain) -> Array:
-    """Return the matrices inside the domain and at its corners, all of them where they are few.
-
-    Raises:
-        GainError: they depend on a state that the domain leaves unbounded.
-    """
-    states, inputs = domain.sample(2 * _SAMPLES)
-    box = np.array([[*domain.lower, *domain.input_lower], [*domain.upper, *domain.input_upper]])
-    used = np.flatnonzero(np.isfinite(box).all(axis=0) & (box[0] < box[1]))
-    both = np.concatenate([states, inputs], axis=1)
-    sides = np.random.default_rng(1).integers(0, 2, (_SAMPLES, len(used)))
-    if len(used) <= _FEW:
-        few = np.arange(2 ** len(used))[:, None] >> np.arange(len(used)) & 1
-        sides[: len(few)] = few
-    both[_SAMPLES:, used] = np.take_along_axis(box[:, used], sides, axis=0)
-    base = np.append(np.asarray(model.trim[0], float), np.zeros(len(model.input_names)))
-    n, at = len(model.state_names), jax.jit(jax.vmap(function))
-
-    def matrices(points: Array) -> Array:
-        return np.asarray(at(jnp.asarray((base + points)[:, :n]), jnp.asarray(points[:, n:])))
-
-    found = matrices(both)
-    for k in np.flatnonzero(~np.isfinite(box).all(axis=0)):
-        # 3 is no multiple of pi, so that no sine hides its state.
-        far = both + np.where(np.arange(len(base)) == k, 3.0, 0.0)
-        if np.abs(matrices(far) - found).max() > 1e-12 * np.abs(found).max():
-            raise _unbounded_error(model, model.state_names[k])
+        return None
+    found[list(zero)] = True
     return found
 
 
-def model_jacobian(model: ControlAffine) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return (x, v) -> d/dx [f(x) + g(x) (u* + S v)], v the normalized input."""
+def _boxes(model: ControlAffine, domain: Domain) -> tuple[Box, Box]:
+    """Return the domain as absolute states and normalized inputs, nothing rounded."""
+    trim = np.asarray(model.trim[0], float)
 
-    def jacobian(x: jax.Array, v: jax.Array) -> jax.Array:
-        def velocity(x: jax.Array) -> jax.Array:
-            return model.normalized_drift(x) + model.normalized_input_map(x) @ v
+    def shift(bounds: Array) -> list[float | Fraction]:
+        # A sum of floats would round a box far from 0 to a point.
+        return [
+            Fraction(float(x)) + Fraction(float(b)) if np.isfinite(b) else float(b)
+            for x, b in zip(trim, bounds, strict=True)
+        ]
 
-        return jax.jacfwd(velocity)(x)
-
-    return jacobian
+    states = Box(shift(domain.lower), shift(domain.upper))
+    return states, Box(domain.input_lower, domain.input_upper)

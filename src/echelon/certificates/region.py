@@ -94,7 +94,7 @@ def contracting_region(
         spectrum: whose smallest eigenvalue makes the strength 2 c lambda_min.
     """
     domain, found, A, W = pairs
-    strength, constant = 2.0 * coupling * spectrum.low, W is None
+    strength, constant = 2.0 * coupling * spectrum.proved, W is None
     # P A + A'P - strength P W P is affine in a pair, so the corners of the pairs' hull suffice.
     # With A - strength W P / 2 the drift's formula gives P A + A'P - strength P W P.
     rate = rate_of(P, A, B, R, strength) if W is None else rate_of(P, A - 0.5 * strength * W @ P)
@@ -138,7 +138,7 @@ def drift_region(
     if reach is not None and not has_constant_input_map(model, domain):
         # Then S = sum delta_i'P delta_i may rise, V = delta'(L kron P) delta may not, and
         # lambda_min S <= V <= lambda_max S.
-        reach *= float(np.sqrt(spectrum.low / spectrum.high))
+        reach *= float(np.sqrt(spectrum.proved / spectrum.high))
     return RegionCertificate(
         kind=found.kind,
         rate=0.0,

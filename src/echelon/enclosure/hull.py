@@ -1,7 +1,7 @@
-"""A polytope of matrices that provably contains every Jacobian of a model on a box.
+"""A polytope of matrices that provably contains all values, or slopes, of a function on a box.
 
-The Jacobian is traced and evaluated in exact polynomial arithmetic (`rules`, `polynomial`); each
-entry is affine in the coordinates of every atom (a variable's powers, an angle's waves), each atom
+The function is traced and evaluated in exact polynomial arithmetic (`rules`, `slopes`); each entry
+is affine in the coordinates of every atom (a variable's powers, an angle's waves), each atom
 lies in a polygon with rational vertices (`curves`), and so the products of these vertices hold
 every value.
 """
@@ -9,13 +9,13 @@ every value.
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import evaluate
+from echelon.core.jaxpr import each, evaluate
 from echelon.core.types import Array
 from echelon.enclosure.interval import Interval
 from echelon.enclosure.polynomial import (
@@ -24,16 +24,25 @@ from echelon.enclosure.polynomial import (
     CornerValues,
     Polynomial,
     check_count,
+    constant,
     corner_values,
 )
 from echelon.enclosure.rules import polynomials
+from echelon.enclosure.slopes import number, slopes_in, variable
+
+Bounds: TypeAlias = Sequence[float | Fraction] | Array
+_Function: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 class Box(NamedTuple):
-    """Bounds (k,) of k entries, each taken as the exact number that its float is."""
+    """Bounds (k,) of k entries, each taken exactly; infinite where an entry is open.
 
-    lower: Array
-    upper: Array
+    Nothing is known of an open entry. A function may be linear in it, and its slopes must not
+    depend on it.
+    """
+
+    lower: Bounds
+    upper: Bounds
 
 
 class HullAtom(NamedTuple):
@@ -63,58 +72,137 @@ class Hull(NamedTuple):
     atoms: tuple[HullAtom, ...]
 
 
-def jacobian_hull(
-    jacobian: Callable[[jax.Array, jax.Array], jax.Array],
-    states: Box,
-    inputs: Box,
-    names: Sequence[str] = (),
-) -> Hull:
-    """Return matrices whose hull holds jacobian(x, v) for every x and v of a box.
+def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[str] = ()) -> Hull:
+    """Return matrices whose hull holds function(x, v) for every x and v of a box.
 
     It is sound for the function over the reals, float constants taken exactly; what a primitive
     without a rule makes of constants alone (an inverse of the inertia, say) is a constant too, the
     float64 that the program computes.
 
     Args:
-        jacobian: (x (n,), v (m,)) -> (n, n), traceable by JAX.
+        function: (x (n,), v (m,)) -> (k, l), traceable by JAX.
         states: bounds of x, (n,) each.
         inputs: bounds of v, (m,) each.
         names: of the entries of x and v, for messages and `atoms`; else x[0], ..., v[0], ...
 
     Raises:
-        GainError: a bound is not finite or above its partner, the Jacobian has no enclosure on the
-            box (the primitive is named), or there are more than `MOST_VERTICES` vertices.
+        OpenError: the function depends on an entry that the box leaves open.
+        GainError: a bound is NaN or above its partner, the function has no enclosure on the box
+            (the primitive is named), or there are more than `MOST_VERTICES` vertices.
     """
+    atoms = Atoms()
+    return _hull_of(_values(function, *_variables(atoms, states, inputs, names), atoms), atoms)
+
+
+def slope_hull(
+    function: _Function,
+    states: Box,
+    inputs: Box,
+    names: Sequence[str] = (),
+    weight: _Function | None = None,
+) -> Hull:
+    """Return matrices whose hull H holds every slope in x of a function on a box.
+
+    For any x, y and v of the box function(x, v) - function(y, v) is a matrix of H times x - y,
+    whether the function is smooth or only bends. No derivative is taken from JAX.
+
+    Args:
+        function: (x (n,), v (m,)) -> (k,), traceable by JAX.
+        states: bounds of x, (n,) each.
+        inputs: bounds of v, (m,) each.
+        names: of the entries of x and v.
+        weight: (x, v) -> (k, l), whose values stand to the right of the slopes, enclosed together.
+
+    Raises:
+        OpenError: the slopes depend on an entry that the box leaves open.
+        GainError: as in `value_hull`; or the function or the weight jumps inside the box.
+    """
+    atoms = Atoms()
+    x, v = _variables(atoms, states, inputs, names)
+    found = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    if weight is not None:
+        # A weight is asked for its slopes too, which one that jumps has not.
+        beside = _evaluate_sloped(weight, x, v, atoms)
+        found = np.concatenate([found, each(lambda entry: entry.value, beside)], axis=1)
+    return _hull_of(found, atoms)
+
+
+def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
+    """Return in which entries of x a function (x, v) -> (k,) has the slope 0 all over a box.
+
+    Nothing is multiplied out, so that slopes elsewhere may be as many as they like.
+
+    Raises:
+        OpenError: the function bends with an entry that the box leaves open.
+        GainError: as in `slope_hull`.
+    """
+    atoms = Atoms()
+    x, v = _variables(atoms, states, inputs, ())
+    slopes = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    return tuple(k for k in range(len(x)) if not any(p.terms for p in slopes[:, k]))
+
+
+def _values(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
+    """Return the values (k, l) of a matrix function, polynomials."""
+    [found] = evaluate(function, [x, v], polynomials(atoms))
+    if found.ndim != 2 or found.dtype != object:
+        raise GainError("a function of a hull must return one matrix of floats.")
+    return found
+
+
+def _evaluate_sloped(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
+    """Return the values of a function with their slopes in x."""
+    states = np.empty(len(x), object)
+    states[:] = [variable(k, p) for k, p in enumerate(x)]
+    [found] = evaluate(function, [states, each(number, v)], slopes_in(atoms))
+    return found if found.dtype == object else each(number, found)
+
+
+def _slopes(values: np.ndarray, n: int, atoms: Atoms) -> np.ndarray:
+    """Return the slopes (k, n) of values (k,), polynomials."""
+    slopes = np.full((len(values), n), constant(0), object)
+    for row, entry in enumerate(values):
+        for k, slope in entry.slopes.items():
+            slopes[row, k] = atoms.settle(slope)
+    return slopes
+
+
+def _variables(
+    atoms: Atoms, states: Box, inputs: Box, names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return x (n,) and v (m,) as variables with their ranges."""
     n, m = _count_bounds(states, "x"), _count_bounds(inputs, "v")
     called = list(names) or [f"x[{k}]" for k in range(n)] + [f"v[{k}]" for k in range(m)]
     if len(called) != n + m:
         raise GainError(f"`names` has {len(called)} entries, and must have {n + m}.")
-    atoms = Atoms()
     bounds = [*zip(*states, strict=True), *zip(*inputs, strict=True)]
-    variables = np.empty(n + m, object)
+    found = np.empty(n + m, object)
     for k, (low, high) in enumerate(bounds):
-        # A float is a fraction with a power of two below, so nothing is rounded here.
-        interval = Interval(Fraction(float(low)), Fraction(float(high)))
-        variables[k] = atoms.variable(called[k], interval)
-    results = evaluate(jacobian, [variables[:n], variables[n:]], polynomials(atoms))
-    if len(results) != 1 or results[0].ndim != 2 or results[0].dtype != object:
-        raise GainError("`jacobian` must return one matrix of floats.")
-    return _hull_of(results[0], atoms)
+        found[k] = atoms.variable(called[k], _interval(low, high))
+    return found[:n], found[n:]
+
+
+def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
+    """Return a range, nothing rounded: a float is a fraction with a power of two below."""
+    if math.isinf(low) or math.isinf(high):
+        return None
+    ends = (x if isinstance(x, Fraction) else Fraction(float(x)) for x in (low, high))
+    return Interval(*ends)
 
 
 def _count_bounds(box: Box, name: str) -> int:
     """Return how many bounds a box has."""
-    lower, upper = (np.asarray(side, float) for side in box)
-    if lower.ndim != 1 or lower.shape != upper.shape:
+    lower, upper = (list(side) for side in box)
+    if len(lower) != len(upper):
         raise GainError(
-            f"the bounds of `{name}` have shapes {lower.shape} and {upper.shape}, "
+            f"the bounds of `{name}` have {len(lower)} and {len(upper)} entries, "
             "and must be two vectors of the same length."
         )
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+        if not low <= high:
             raise GainError(
-                f"the bounds of `{name}[{k}]` are {low:g} and {high:g}, "
-                "and must be finite and in rising order."
+                f"the bounds of `{name}[{k}]` are {float(low):g} and {float(high):g}, "
+                "and must be in rising order."
             )
     return len(lower)
 
@@ -150,7 +238,7 @@ def _round_values(
             # To the nearest float; what that moves is measured exactly and becomes part of `error`.
             rounded[place] = float(exact)
         except OverflowError as fault:
-            raise GainError("an entry of the Jacobian exceeds float64 on the domain.") from fault
+            raise GainError("an entry of the hull exceeds float64 on the domain.") from fault
         worst = max(worst, abs(Fraction(float(rounded[place])) - exact))
     return values, rounded, _round_up(worst + values.slack)
 
@@ -178,6 +266,6 @@ def _describe_atoms(
         known = atoms.known[atom]
         powers = [e for e in used[atom] if isinstance(e, int)]
         kind = "arc" if not powers else "interval" if powers == [1] else "powers"
-        low, high = float(known.interval.lo), float(known.interval.hi)
+        low, high = float(known.reach.lo), float(known.reach.hi)
         found.append(HullAtom(known.name, "constant" if count == 1 else kind, low, high, count))
     return tuple(found)

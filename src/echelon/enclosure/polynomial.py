@@ -30,6 +30,7 @@ _HALF = Fraction(1, 2)
 MOST_VERTICES = 16384
 """A hull with more vertices is refused; no solver could use it."""
 
+_MOST_TERMS = 256  # of a quotient
 _MOST_ORDER = 16  # of the waves that share a polygon
 _FEW = 64  # a range is sharpened at the corners where there are no more than these
 _THIN = Fraction(1, 1 << 64)  # relative width of what is a number in all but name
@@ -135,13 +136,73 @@ def constant(x: Fraction | int | float) -> Polynomial:
     return Polynomial({(): Fraction(x)})
 
 
+def divides(divisor: Polynomial, p: Polynomial) -> bool:
+    """Tell whether p is a polynomial times the divisor, and so 0 wherever the divisor is."""
+    lead = max(divisor.terms, key=_order)
+    quotient, rest = constant(0), p
+    # By one divisor, a remainder is 0 if and only if each of its leading terms can be divided.
+    for _ in range(_MOST_TERMS):
+        if not rest.terms:
+            # A wave times a wave is no monomial, and so the product is made again.
+            return (quotient * divisor - p).terms == {}
+        top = max(rest.terms, key=_order)
+        factor = _monomial_quotient(top, lead)
+        if factor is None:
+            return False
+        step = Polynomial({factor: rest.terms[top] / divisor.terms[lead]})
+        quotient, rest = quotient + step, rest - step * divisor
+    return False
+
+
+def _order(monomial: Monomial) -> list[tuple[int, int, str]]:
+    """Return what sorts monomials lexicographically, atoms of low numbers first."""
+    # An atom that is missing has the power 0, which sorts below any other: hence the minus.
+    return [(-atom, e, "") if isinstance(e, int) else (-atom, 1, repr(e)) for atom, e in monomial]
+
+
+def _monomial_quotient(top: Monomial, lead: Monomial) -> Monomial | None:
+    """Return the monomial that makes `top` of `lead`, or None."""
+    left = dict(top)
+    for atom, e in lead:
+        held = left.pop(atom, None)
+        if isinstance(held, int) and isinstance(e, int) and held >= e:
+            if held > e:
+                left[atom] = held - e
+        elif held != e:
+            return None
+    return tuple(sorted(left.items()))
+
+
 @dataclass(frozen=True)
 class Atom:
-    """A variable or an angle: its range, what it is called, and the box variables behind it."""
+    """A variable or an angle: its range, what it is called, and the box variables behind it.
+
+    A variable that the box leaves open has no range.
+    """
 
     name: str
-    interval: Interval
+    interval: Interval | None
     sources: frozenset[str]
+    border: Polynomial | None = None  # of a side, see `Atoms.side`
+
+    @property
+    def reach(self) -> Interval:
+        """Return the range.
+
+        Raises:
+            OpenError: there is none.
+        """
+        if self.interval is None:
+            raise OpenError(self.name)
+        return self.interval
+
+
+class OpenError(GainError):
+    """What is asked needs the range of a variable that the box leaves open."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        super().__init__(f"the domain leaves `{name}` unbounded, and must give it a bound.")
 
 
 class Atoms:
@@ -158,9 +219,9 @@ class Atoms:
             self.known.append(atom)
         return self._numbers[key]
 
-    def variable(self, name: str, interval: Interval) -> Polynomial:
-        """Return a new box variable, or the number that it is fixed at."""
-        if interval.lo == interval.hi:
+    def variable(self, name: str, interval: Interval | None) -> Polynomial:
+        """Return a new box variable, open where it has no range, or the number it is fixed at."""
+        if interval is not None and interval.lo == interval.hi:
             return constant(interval.lo)
         atom = self._add(("box", len(self.known)), Atom(name, interval, frozenset([name])))
         return Polynomial({((atom, 1),): Fraction(1)})
@@ -177,6 +238,54 @@ class Atoms:
         atom = self._add(("fresh", key), Atom(name, interval, sources))
         return Polynomial({((atom, 1),): Fraction(1)})
 
+    def side(self, border: Polynomial) -> Polynomial:
+        """Return an unknown that is 1 where a border is positive and 0 where it is negative.
+
+        The same for each positive multiple of a border, and what is left of 1 for each negative
+        one: where the border is 0, it may be anything between.
+        """
+        lead = border.terms[max(border.terms, key=_order)]
+        if lead < 0:
+            return constant(1) - self.side(-border)
+        scaled = constant(1 / lead) * border
+        name = f"side of {', '.join(sorted(self.sources(scaled)))}"
+        range_ = Interval(Fraction(0), Fraction(1))
+        atom = self._add(("side", scaled.key()), Atom(name, range_, self.sources(scaled), scaled))
+        return Polynomial({((atom, 1),): Fraction(1)})
+
+    def settle(self, p: Polynomial) -> Polynomial:
+        """Return a polynomial with what its sides imply: s d is (d + |d|) / 2, and s s is s.
+
+        So the slope of x |x|, which is found as |x| + (2 s - 1) x, becomes 2 |x|.
+        """
+        for atom in p.exponents():
+            border = self.known[atom].border
+            if border is not None:
+                p = self._settle(p, atom, border)
+        return p
+
+    def _settle(self, p: Polynomial, side: int, border: Polynomial) -> Polynomial:
+        chosen, lead = Polynomial({((side, 1),): Fraction(1)}), max(border.terms, key=_order)
+        # The lead times s is s d, which is settled, less s times the rest of d.
+        rest = chosen * (border - Polynomial({lead: Fraction(1)}))
+        settled = constant(_HALF) * (border + self.elementary("abs", border)) - rest
+        done, left = constant(0), p
+        while left.terms:
+            top = max(left.terms, key=_order)
+            c, factors = left.terms[top], dict(top)
+            left = left - Polynomial({top: c})
+            if side not in factors:
+                done = done + Polynomial({top: c})
+                continue
+            factors.pop(side)
+            others = tuple(sorted(factors.items()))
+            q = _monomial_quotient(others, lead)
+            if q is None:
+                done = done + Polynomial({others: c}) * chosen
+            else:
+                left = left + Polynomial({q: c}) * settled
+        return done
+
     def sources(self, p: Polynomial) -> frozenset[str]:
         """Return the names of the box variables that a polynomial depends on."""
         return frozenset().union(*(self.known[atom].sources for atom in p.exponents()))
@@ -192,7 +301,7 @@ class Atoms:
             verb = "divides by" if name == "reciprocal" else f"takes `{name}` of"
             behind = listing(sorted(self.sources(p))) or "constants"
             raise GainError(
-                f"the Jacobian of the model {verb} an expression of {behind}, which may be "
+                f"the model {verb} an expression of {behind}, which may be "
                 f"anything in {interval.text()} on the domain, and {function.domain}; "
                 "make the domain smaller."
             )
@@ -227,7 +336,7 @@ class Atoms:
         """Return cos and sin of factor x + shift for a variable x."""
         # factor x + shift = factor (x + phase).
         phase, behind = shift / factor, self.known[atom]
-        theta = Atom(behind.name, behind.interval + point(phase), behind.sources)
+        theta = Atom(behind.name, behind.reach + point(phase), behind.sources)
         angle = self._add(("angle", atom, phase), theta)
         # cos is even and sin is odd, so frequencies can be positive.
         cosine = Polynomial({((angle, (abs(factor), 0)),): Fraction(1)})
@@ -238,7 +347,7 @@ class Atoms:
         """Return the range of a power or of a wave of an atom."""
         key = (atom, exponent)
         if key not in self._ranges:
-            interval = self.known[atom].interval
+            interval = self.known[atom].reach
             self._ranges[key] = (
                 interval.power(exponent)
                 if isinstance(exponent, int)
@@ -273,8 +382,8 @@ class Atoms:
             return _gather_points(self._ends(atom, wanted[0]))
         powers = [e for e in wanted if isinstance(e, int)]
         if powers:
-            return _gather_points([{**p} for p in power_points(self.known[atom].interval, powers)])
-        arc, found = self.known[atom].interval, [dict[Exponent, Fraction]()]
+            return _gather_points([{**p} for p in power_points(self.known[atom].reach, powers)])
+        arc, found = self.known[atom].reach, [dict[Exponent, Fraction]()]
         for group in _harmonics(e for e in wanted if isinstance(e, tuple)):
             around = _wave_corners(arc, group) if len(group) > 1 else self._ends(atom, group[0])
             check_count(len(found) * len(around))

@@ -29,37 +29,38 @@ def polynomials(atoms: Atoms) -> Algebra:
     domain, and at a constant that is complex or not finite.
     """
     bound = {name: functools.partial(rule, atoms) for name, rule in RULES.items()}
-    return Algebra({**bound, **_SUMS}, constant, _lift, _outside, _fold)
+    return Algebra({**bound, **_SUMS}, constant, lift, outside, fold)
 
 
-def _lift(array: np.ndarray) -> np.ndarray:
+def lift(array: np.ndarray) -> np.ndarray:
     """Return floats as constant polynomials, each taken exactly, and anything else as it is."""
     if array.dtype.kind in "biu":
         return array
     if array.dtype.kind == "c":
-        raise GainError("the Jacobian of the model is complex, and must be real.")
+        raise GainError("the model is complex, and must be real.")
     numbers = array.astype(np.float64)
     if not np.isfinite(numbers).all():
-        raise GainError("the Jacobian of the model holds a constant that is not finite.")
+        raise GainError("the model holds a constant that is not finite.")
     return each(constant, numbers)
 
 
-def _outside() -> object:
-    raise GainError("the Jacobian of the model reads outside of an array.")
+def outside() -> object:
+    """Refuse what stands outside of an array, of which nothing is known."""
+    raise GainError("the model reads outside of an array.")
 
 
-def _fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+def fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return what an unknown primitive makes of parameters alone, in float64: parameters again."""
     values = [each(number, a) if a.dtype == object else a for a in operands]
     if any(v is None for a in values for v in a.flat):
         raise GainError(
-            f"the Jacobian of the model uses `{equation.primitive.name}`, which the hull of "
+            f"the model uses `{equation.primitive.name}`, which the hull of "
             "Jacobians does not know; allowed are arithmetic, powers, trigonometric and hyperbolic "
             "functions, exponentials, logarithms, absolute values and choices by `where`."
         )
     # In float64, since that is what the program itself computes of its constants.
     numbers = [np.asarray(a, np.float64) if a.dtype == object else a for a in values]
-    return [_lift(a) for a in compute(equation, numbers)]
+    return [lift(a) for a in compute(equation, numbers)]
 
 
 # ---- the rules -----------------------------------------------------------------------------------
@@ -78,54 +79,62 @@ def _elementary(name: str) -> Rule:
     return _function(lambda atoms, p: atoms.elementary(name, p))
 
 
-def _reciprocal(atoms: Atoms, p: Polynomial) -> Polynomial:
+def reciprocal(atoms: Atoms, p: Polynomial) -> Polynomial:
+    """Return 1 / p, exactly where p is a number."""
     value = p.value()
     return constant(1 / value) if value else atoms.elementary("reciprocal", p)
 
 
 def _quotient(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
-    return a * _reciprocal(atoms, b)
+    return a * reciprocal(atoms, b)
 
 
-def _whole_power(atoms: Atoms, p: Polynomial, k: int) -> Polynomial:
-    return p.power(k) if k >= 0 else _reciprocal(atoms, p).power(-k)
+def whole_power(atoms: Atoms, p: Polynomial, k: int) -> Polynomial:
+    """Return p to the power of a whole number, which may be negative."""
+    return p.power(k) if k >= 0 else reciprocal(atoms, p).power(-k)
 
 
-def _power(atoms: Atoms, p: Polynomial, exponent: Any) -> Polynomial:
+def power(atoms: Atoms, p: Polynomial, exponent: Any) -> Polynomial:
     """Return p to a constant power: whole, a half, or exp(k log p)."""
     k = exponent.value() if isinstance(exponent, Polynomial) else Fraction(int(exponent))
     if k is None:
         raise GainError(
-            "the Jacobian of the model raises to a power that varies, which the hull of Jacobians "
+            "the model raises to a power that varies, which the hull of Jacobians "
             "does not know; write it by `exp` and `log`."
         )
     if k.denominator == 1:
-        return _whole_power(atoms, p, int(k))
+        return whole_power(atoms, p, int(k))
     # A root has an enclosure of its own, which holds at 0 too, where a logarithm has none.
     if abs(k) == Fraction(1, 2):
         return atoms.elementary("sqrt" if k > 0 else "rsqrt", p)
     return atoms.elementary("exp", constant(k) * atoms.elementary("log", p))
 
 
-def _atan2(atoms: Atoms, y: Polynomial, x: Polynomial) -> Polynomial:
+def atan2(atoms: Atoms, y: Polynomial, x: Polynomial) -> Polynomial:
+    """Return the angle of the point (x, y) for x > 0.
+
+    Raises:
+        GainError: x may be anything else.
+    """
     reached = atoms.range(x)
     if reached.lo <= 0:
         raise GainError(
-            "the Jacobian of the model takes `atan2` with a second argument that may be anything "
+            "the model takes `atan2` with a second argument that may be anything "
             f"in {reached.text()} on the domain, and must be positive; make the domain smaller."
         )
     # atan2(y, x) = atan(y / x) for x > 0; elsewhere it jumps, and a hull over the jump says little.
     return atoms.elementary("atan", _quotient(atoms, y, x))
 
 
-def _absolute(atoms: Atoms, p: Polynomial) -> Polynomial:
+def absolute(atoms: Atoms, p: Polynomial) -> Polynomial:
+    """Return |p|, p itself or -p where its sign is certain."""
     reached = atoms.range(p)
     if reached.lo >= 0:
         return p
     return -p if reached.hi <= 0 else atoms.elementary("abs", p)
 
 
-def _larger(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
+def larger(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
     """Return max(a, b)."""
     left, right = atoms.range(a), atoms.range(b)
     # Equal terms cancel in a - b, so its sign may be certain where the ranges overlap.
@@ -139,11 +148,11 @@ def _larger(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
 def _smaller(atoms: Atoms, a: Polynomial, b: Polynomial) -> Polynomial:
     """Return min(a, b)."""
     # min(a, b) = -max(-a, -b), which keeps one variable for both.
-    return -_larger(atoms, -a, -b)
+    return -larger(atoms, -a, -b)
 
 
 def _clamp(atoms: Atoms, low: Polynomial, p: Polynomial, high: Polynomial) -> Polynomial:
-    return _smaller(atoms, _larger(atoms, low, p), high)
+    return _smaller(atoms, larger(atoms, low, p), high)
 
 
 def _comparison(certain: Callable[[Interval], bool], never: Callable[[Interval], bool]) -> Rule:
@@ -192,19 +201,19 @@ def _choose_case(atoms: Atoms, which: Any, *cases: Any) -> Any:
         return cases[0] if all(case is cases[0] for case in cases) else None
     if not all(isinstance(case, Polynomial) for case in cases):
         raise GainError(
-            "the Jacobian of the model picks a whole number by a comparison that the domain does "
+            "the model picks a whole number by a comparison that the domain does "
             "not decide; make the domain smaller."
         )
-    keys = [case.key() for case in cases]
     # Cases that agree need no decision.
-    if all(key == keys[0] for key in keys):
+    if all(case.key() == cases[0].key() for case in cases):
         return cases[0]
-    # Sound and coarse: of the choice nothing is kept but a range that holds all cases.
+    # Sound and coarse: of the choice nothing is kept but a range that holds all cases. Each is an
+    # unknown of its own, as another choice between the same cases may be decided otherwise.
     reached = functools.reduce(Interval.union, (atoms.range(case) for case in cases))
-    return atoms.fresh(("choice", frozenset(keys)), reached, *cases)
+    return atoms.fresh(("choice", object()), reached, *cases)
 
 
-def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     """Return entries under another type; a change of float precision is none to the reals."""
     kind = np.dtype(params["new_dtype"]).kind
     polynomials = all(isinstance(v, Polynomial) for v in x.flat)
@@ -215,7 +224,7 @@ def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarr
     numbers = each(number, x)
     if any(v is None for v in numbers.flat):
         raise GainError(
-            "the Jacobian of the model turns a state into a whole number, "
+            "the model turns a state into a whole number, "
             "which the hull of Jacobians does not know."
         )
     return each(bool if kind == "b" else math.trunc, numbers).astype(params["new_dtype"])
@@ -233,13 +242,13 @@ RULES: dict[str, Rule] = {
     # JAX has no `reciprocal`, and `abs` looks at the sign first.
     **{name: _elementary(name) for name in ELEMENTARY if name not in ("reciprocal", "abs")},
     "div": _function(_quotient),
-    "integer_pow": lambda atoms, params, x: each(lambda p: _whole_power(atoms, p, params["y"]), x),
-    "pow": _function(_power),
+    "integer_pow": lambda atoms, params, x: each(lambda p: whole_power(atoms, p, params["y"]), x),
+    "pow": _function(power),
     "sin": _function(lambda atoms, p: atoms.circle(p)[1]),
     "cos": _function(lambda atoms, p: atoms.circle(p)[0]),
-    "atan2": _function(_atan2),
-    "abs": _function(_absolute),
-    "max": _function(_larger),
+    "atan2": _function(atan2),
+    "abs": _function(absolute),
+    "max": _function(larger),
     "min": _function(_smaller),
     "clamp": _function(_clamp),
     "lt": _comparison(lambda d: d.hi < 0, lambda d: d.lo >= 0),
@@ -254,7 +263,7 @@ RULES: dict[str, Rule] = {
     "or": _logic(_or),
     "not": _logic(_not),
     "select_n": _function(_choose_case),
-    "convert_element_type": _convert,
+    "convert_element_type": convert,
 }
 """What each primitive of JAX means for polynomials, beyond what the walk itself knows."""
 

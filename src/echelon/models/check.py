@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.numerics import precision
-from echelon.models.linearization import at_trim
+from echelon.models.linearization import AtTrim, at_trim
 from echelon.models.model import ControlAffine
 
 # Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
@@ -123,12 +123,40 @@ def _check_values(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray)
     for (what, function), shape in zip(functions.items(), ((n,), (n, m), (q,)), strict=True):
         _check_shape(name, what, _shape(name, what, function, x), shape)
     _check_shape(name, "limit", _shape(name, "limit", model.limit, u), (m,))
-    there = at_trim(model)
+    there = _differentiate(model, name)
     slopes = (there.drift_slope, there.input_slope, there.output_slope)
     for what, value, slope in zip(functions, there[:3], slopes, strict=True):
         for which, array in ((f"`{what}`", value), (f"the Jacobian of `{what}`", slope)):
             if not np.isfinite(array).all():
                 raise ModelError(f"{which} of `{name}` is not finite at the trim {x.tolist()}.")
+
+
+def _differentiate(model: ControlAffine, name: str) -> AtTrim:
+    """Return a model at its trim, after checking that JAX's derivatives are its slopes there."""
+    try:
+        there = at_trim(model)
+    # The model is anyone's code, and JAX says in many ways that it cannot derive it.
+    except Exception as error:
+        message = str(error).splitlines()[0].rstrip(".") if str(error) else "no message"
+        raise ModelError(
+            f"`{name}` has no derivative at its trim, by {type(error).__name__}: {message}; write "
+            "it with `jax.numpy` alone."
+        ) from error
+    gap = there.gap
+    if gap is not None:
+        n, state = len(model.state_names), model.state_names[gap.variable]
+        row, column = divmod(gap.entry - n, len(model.input_names))
+        which = (
+            f"`drift` for `{model.state_names[gap.entry % n]}`"
+            if gap.entry < n
+            else (f"`input_map` for `{model.state_names[row]}` and `{model.input_names[column]}`")
+        )
+        raise ModelError(
+            f"JAX finds the derivative {gap.said:.4g} in `{state}` of {which} of `{name}` at the "
+            f"trim, and its values show {gap.seen:.4g}; write it without `stop_gradient` and "
+            "derivatives of its own."
+        )
+    return there
 
 
 def _shape(name: str, what: str, function: Any, at: np.ndarray) -> tuple[int, ...]:

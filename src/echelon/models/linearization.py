@@ -9,8 +9,9 @@ import numpy as np
 
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
-from echelon.core.types import Array, Input, State
+from echelon.core.types import Array, Input, State, States
 from echelon.models.model import ControlAffine
+from echelon.models.secants import Gap, Sides, sides, stencil
 
 
 class Linearization(NamedTuple):
@@ -35,6 +36,10 @@ class AtTrim(NamedTuple):
         drift, input_map, output: f (n,), g (n, m), h (q,).
         drift_slope, input_slope, output_slope: their Jacobians, with n as the last dimension more.
         delivered: what the actuators make of u*, (m,).
+        bends: (n, n) whether the slope of f + g u*, by its values on either side, jumps with a
+            state; or where g does, for all inputs.
+        gap: the entry of the drift or the input map whose derivative by JAX is most clearly not
+            what its values show; None where there is none.
     """
 
     drift: Array
@@ -44,6 +49,8 @@ class AtTrim(NamedTuple):
     input_slope: Array
     output_slope: Array
     delivered: Array
+    bends: Array
+    gap: Gap | None
 
 
 @kept
@@ -56,14 +63,36 @@ def at_trim(model: ControlAffine) -> AtTrim:
     x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are kept in files, so they must not depend on the precision of the run that needs them.
     with precision("float64"):
-        return AtTrim(*map(_freeze, _evaluate(model, jnp.asarray(x), jnp.asarray(u))))
+        found = _evaluate(model, jnp.asarray(x), jnp.asarray(u), jnp.asarray(stencil(x)))
+    *there, around = map(_freeze, found)
+    said, seen = np.concatenate([there[3], there[4].reshape(-1, len(x))]), sides(x, around)
+    return AtTrim(*there, bends=_bends(seen, u), gap=seen.gap(said))  # pyright: ignore
 
 
 @eqx.filter_jit
-def _evaluate(model: ControlAffine, x: State, u: Input) -> list[jax.Array]:
+def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[jax.Array]:
     functions = (model.drift, model.input_map, model.output)
     slopes = [jax.jacfwd(function)(x) for function in functions]
-    return [*(function(x) for function in functions), *slopes, model.limit(u)]
+
+    def entries(x: State) -> jax.Array:
+        return jnp.concatenate([model.drift(x), model.input_map(x).reshape(-1)])
+
+    # Values around the trim, which know what derivatives of a trace do not.
+    around = jax.vmap(entries)(points)
+    return [*(function(x) for function in functions), *slopes, model.limit(u), around]
+
+
+def _bends(seen: Sides, u: Array) -> Array:
+    """Return (n, n) where f + g u* bends, or g jumps, with which state."""
+    n = seen.forward.shape[-1]
+    below, above = (np.split(side, [n], axis=1) for side in seen)
+    velocity = (
+        side[0] + np.einsum("hikn,k->hin", side[1].reshape(2, n, -1, n), u)
+        for side in (below, above)
+    )
+    bent = Sides(*velocity).bends()
+    jumps = Sides(below[1], above[1]).jumps().reshape(n, -1, n).any(axis=1)
+    return bent | jumps
 
 
 @kept

@@ -186,19 +186,29 @@ class Formation:
         group = group.ravel()
         return tuple((int(first[g]), k) for k, g in enumerate(group) if first[g] != k)
 
-    def broken_symmetries(self, model: ControlAffine) -> dict[int, str]:
+    def broken_symmetries(
+        self, model: ControlAffine, lower: Array | float = -0.5, upper: Array | float = 0.5
+    ) -> dict[int, str]:
         """Return which agents' offsets change the dynamics, each with one reason; empty if none.
 
         An offset d keeps the formation law exact only if f(x + d) = f(x) and g(x + d) = g(x). Both
-        are compared at random states about the trim, values and Jacobians, in float64. It is a
-        sampled test, of at most 64 distinct offsets spread over all of them.
+        are compared at random states, values and Jacobians, in float64. It is a sampled test, of at
+        most 64 distinct offsets spread over all of them.
+
+        Args:
+            model: whose f and g.
+            lower: from where on states are drawn, (n,) or for all, as deviations from the trim.
+            upper: up to where.
         """
         offsets = self.offsets - self.offsets[0] + 0.0  # which makes -0.0 the same as 0.0
         distinct = np.unique(offsets, axis=0)
         tested = distinct[:: max(1, -(-len(distinct) // _TESTED))]
         # In float32 rounding alone would exceed the tolerance.
         with precision("float64"):
-            reasons = {d.tobytes(): _describe_change(model, d) if d.any() else None for d in tested}
+            reasons = {
+                d.tobytes(): _describe_change(model, d, lower, upper) if d.any() else None
+                for d in tested
+            }
         found = {agent: reasons.get(offset.tobytes()) for agent, offset in enumerate(offsets)}
         return {agent: reason for agent, reason in found.items() if reason}
 
@@ -227,11 +237,13 @@ def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> n
     )
 
 
-def _describe_change(model: ControlAffine, offset: np.ndarray) -> str | None:
+def _describe_change(
+    model: ControlAffine, offset: np.ndarray, lower: Array | float, upper: Array | float
+) -> str | None:
     """Return how f or g changes under x -> x + offset, or None where it does not."""
     base = np.asarray(model.trim[0], float)
-    # Near the trim, so that no angle leaves its chart.
-    states = base + np.random.default_rng(0).uniform(-0.5, 0.5, (_SAMPLES, len(base)))
+    # Near the trim where nothing else is asked, so that no angle leaves its chart.
+    states = base + np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, len(base)))
     both = jnp.asarray(np.concatenate([states, states + offset]))
     for name, (values, slopes) in _local(model, both).items():
         here, there = np.split(np.asarray(values), 2)

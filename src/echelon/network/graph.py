@@ -13,6 +13,7 @@ import scipy.sparse.linalg as spla
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array, States
+from echelon.network.bound import Grounded, least_eigenvalue_bound
 from echelon.network.edges import (
     check_edges,
     check_leaders,
@@ -29,6 +30,11 @@ if TYPE_CHECKING:
 
 # Below this many followers the dense eigenvalue routine is both faster and exact to rounding.
 _DENSE = 400
+_RESOLVED = 1e-6
+_LEFT_OUT = 1e-6
+_ITERATIONS = 30
+_ROUNDED = 1.0 - 1e-9
+"""A bound this near to an eigenvalue takes nothing from it."""
 
 
 @final
@@ -194,10 +200,35 @@ class Graph:
         """
         if self._spectrum is None:
             L, count = self.grounded_laplacian(), len(self.followers)
-            eigenvalues = np.linalg.eigvalsh(L.toarray()) if count <= _DENSE else _extremes(L)
+            if count <= _DENSE:
+                dense = L.toarray()
+                eigenvalues, vector = np.linalg.eigvalsh(dense), np.linalg.eigh(dense)[1][:, 0]
+            else:
+                eigenvalues, vector = _extremes(L)
+            low, high = float(eigenvalues[0]), float(eigenvalues[-1])
+            # Floats know it to the rounding of the largest.
+            known = low if low > _RESOLVED * high else np.inf
+            proved = least_eigenvalue_bound(self._grounded(), _spread(L, vector), known)
+            if not proved > 0.0:
+                raise GraphError(
+                    f"the weights of the graph lie between {self.weights.min():.3g} and "
+                    f"{self.weights.max():.3g}, too far apart to tell its smallest eigenvalue "
+                    "from 0; bring them nearer to each other."
+                )
+            # Where rounding may have raised it, the eigenvalue is no better known than its bound.
+            eigenvalues[0] = min(eigenvalues[0], proved / _ROUNDED)
             eigenvalues.setflags(write=False)
-            self._spectrum = Spectrum(eigenvalues, count)
+            self._spectrum = Spectrum(eigenvalues, count, proved)
         return self._spectrum
+
+    def _grounded(self) -> Grounded:
+        """Return the grounded Laplacian by its weights."""
+        place = np.full(self.agents, -1)
+        place[list(self.followers)] = np.arange(len(self.followers))
+        ends = place[self.edges]
+        free, held = (ends >= 0).all(axis=1), (ends >= 0).sum(axis=1) == 1
+        holds = np.stack([ends[held].max(axis=1), self.weights[held]], axis=1)
+        return Grounded(ends[free], self.weights[free], holds, len(self.followers))
 
     def parent_spectrum(self) -> Spectrum:
         """Return the eigenvalues where each agent of a tree is sent its parent's input.
@@ -207,7 +238,7 @@ class Graph:
         led = np.isin(self.edges, self.leaders).all(axis=1)
         weights = np.unique(self.weights[~led])
         weights.setflags(write=False)
-        return Spectrum(weights, len(weights))
+        return Spectrum(weights, len(weights), float(weights[0]))
 
     def neighbours(self, agent: int) -> tuple[int, ...]:
         """Return the agents linked to `agent`, sorted."""
@@ -317,13 +348,32 @@ def factor_inverse(L: sp.csr_array) -> spla.LinearOperator:
     return spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
 
 
-def _extremes(L: sp.csr_array) -> Array:
-    """Return the smallest and the largest eigenvalue of a sparse positive definite matrix."""
+def _extremes(L: sp.csr_array) -> tuple[Array, Array]:
+    """Return the ends of the spectrum of a sparse positive definite matrix, and the low vector."""
     # About 0 the smallest is far from the others, relative to itself; Lanczos on L finds it last.
     inverse = factor_inverse(L)
-    smallest = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
+    smallest, vectors = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse)
     largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
-    return np.concatenate([smallest, largest])
+    return np.concatenate([smallest, largest]), vectors[:, 0]
+
+
+def _spread(L: sp.csr_array, vector: Array) -> Array:
+    """Return an eigenvector with entries on all pieces of a network that its leaders cut apart.
+
+    On a piece that it leaves out, inverse iteration finds the piece's own.
+    """
+    _, piece = csgraph.connected_components(L, directed=False)
+    size = np.zeros(piece.max() + 1)
+    np.maximum.at(size, piece, np.abs(vector))
+    if (size > _LEFT_OUT).all():
+        return vector
+    inverse, other = factor_inverse(L), np.ones(len(vector))
+    for _ in range(_ITERATIONS):
+        other = inverse.matvec(other)
+        largest = np.zeros_like(size)
+        np.maximum.at(largest, piece, other)
+        other = other / largest[piece]
+    return np.where(size[piece] > _LEFT_OUT, vector, other)
 
 
 def _name_leaders(graph: Graph) -> str:

@@ -12,10 +12,12 @@ class Spectrum(NamedTuple):
         eigenvalues: (K,), positive, ascending and read-only: all of them, or of a large graph the
             extreme two.
         total: how many there are in truth, K or more.
+        proved: a bound that the smallest is not below, whatever was rounded.
     """
 
     eigenvalues: Array
     total: int
+    proved: float
 
     @property
     def low(self) -> float:

@@ -69,7 +69,7 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
         return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
     shrink = 1.0
     if region.theorem is Theorem.A5 and not _constant(parts, region):
-        shrink = np.sqrt(parts.graph.spectrum().low / parts.graph.spectrum().high)
+        shrink = np.sqrt(parts.graph.spectrum().proved / parts.graph.spectrum().high)
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
     text += f" less {away[j]:.3g} of the leader" if away.any() else ", leader at the trim"
     return CertifiedSet(float(shrink * radii[j]), kind, text)

@@ -120,10 +120,10 @@ def modes_of(parts: Parts) -> Modes:
         return Modes(graph.spectrum(), True)
     if graph.agents <= _DENSE:
         whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
-        return Modes(Spectrum(whole, len(whole)), False)
+        return Modes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
     degrees = graph.laplacian().diagonal()
     ends = np.array([graph.spectrum().low, degrees[graph.edges].sum(axis=1).max()])
-    return Modes(Spectrum(ends, graph.agents - 1), False)
+    return Modes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
 
 
 def all_alike(drive: Drive, model: ControlAffine) -> bool:
@@ -155,7 +155,7 @@ def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:
 
 def _representatives(modes: Modes) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
-    (values, total), _, what = modes
+    (values, total, _), _, what = modes
     if len(values) < total:
         between = np.geomspace(values[0], values[-1], SHOWN)
         return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.certificates.domain import Domain
+from echelon.certificates.jacobians import offsets_are_symmetries
 from echelon.certificates.margins import detectability
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
@@ -22,6 +24,7 @@ from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.laws.law import Law
 from echelon.models.check import trim_shortfall
+from echelon.models.linearization import at_trim
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.leaders import Leaders, apart
@@ -31,12 +34,13 @@ _LINEAR = Kind.LINEARIZATION
 
 
 class Case(NamedTuple):
-    """What runs, prepared, its loop near the trim and its leaders."""
+    """What runs, prepared, its loop near the trim, its leaders, and the domain of a region."""
 
     parts: Parts
     settings: Settings
     loop: Loop
     leaders: Leaders
+    domain: Domain | None = None
 
     @property
     def governed(self) -> bool:
@@ -72,6 +76,7 @@ def hypotheses(case: Case) -> Iterator[Statement]:
     yield _exact(case)
     yield _agreement(case)
     yield _symmetric(case)
+    yield _smooth(case)
     yield _detectable(case)
     yield _matched(case)
     yield _coupled(case)
@@ -185,15 +190,44 @@ def _drifting(case: Case, name: Hypothesis) -> Statement:
 
 
 def _symmetric(case: Case) -> Statement:
-    broken = case.parts.formation.broken_symmetries(case.parts.model)
-    text, remedy, reason = "f and g do not notice them", "", ""
+    """Offsets are tried near the trim, and proved on the domain that a region speaks of."""
+    name, parts, domain = Hypothesis.SYMMETRY, case.parts, case.domain
+    model, formation = parts.model, parts.formation
+    if not np.ptp(formation.offsets, axis=0).any():
+        return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text="there are none")
+    broken = formation.broken_symmetries(model)
+    kind, where = Kind.SAMPLES, ""
+    if domain is not None and not broken:
+        where = ", all over the domain"
+        if offsets_are_symmetries(model, domain, formation.offsets):
+            kind = Kind.PROOF
+        else:
+            bounds = (np.where(np.isfinite(b), b, s) for b, s in zip(domain.box, (-0.5, 0.5)))
+            broken = formation.broken_symmetries(model, *bounds)
+    text, remedy, reason = f"f and g do not notice them{where}", "", ""
     if broken:
         agent, why = next(iter(broken.items()))
-        text, remedy = f"agent {agent}: {why}", "offset only states that f and g ignore"
+        text, remedy = f"agent {agent}: {why}{where}", "offset only states that f and g ignore"
         reason = "an offset is no symmetry of the dynamics"
     verdict, count = Verdict.of(not broken), len(broken)
-    name, shown = Hypothesis.SYMMETRY, f"{count} broken"
-    return Statement(name, verdict, Kind.SAMPLES, count, shown, text, remedy, reason)
+    return Statement(name, verdict, kind, count, f"{count} broken", text, remedy, reason)
+
+
+def _smooth(case: Case) -> Statement:
+    """Lyapunov's first method wants slopes at the trim: one matrix A, whatever the side."""
+    name, parts = Hypothesis.SMOOTH, case.parts
+    bends = at_trim(parts.model).bends
+    if not bends.any():
+        text = "values of f and g on either side of it show the slopes that A is made of"
+        return Statement(name, Verdict.HOLDS, Kind.SAMPLES, text=text)
+    entry, variable = (parts.model.state_names[k] for k in np.argwhere(bends)[0])
+    text = f"the rate of `{entry}` bends or jumps with `{variable}` at the trim"
+    remedy, reason = "", ""
+    if case.domain is None:
+        remedy = "use `robust-lqr` or `contraction`, whose hull holds the slopes of both sides"
+        reason = f"{text}, where nothing linear holds"
+    verdict = Verdict.FAILS
+    return Statement(name, verdict, Kind.SAMPLES, None, "", text, remedy, reason)
 
 
 # ---- the law near the trim ----------------------------------------------------------------------

@@ -22,7 +22,7 @@ from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
 from echelon.promises.hypotheses import Case, hypotheses
 from echelon.promises.leaders import leaders_of
-from echelon.promises.region import region_of
+from echelon.promises.region import region_of, weaken
 from echelon.promises.statement import Hypothesis, Statement
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
@@ -190,10 +190,14 @@ def promise(parts: Parts, settings: Settings) -> Promise:
 def _compute(prepared: Prepared, settings: Settings) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
-    case, region = Case(parts, settings, loop, leaders), region_of(parts, leaders)
+    region = region_of(parts, leaders)
+    domain = None if region.certificate is None else region.certificate.domain
+    case = Case(parts, settings, loop, leaders, domain)
+    lines = list(hypotheses(case))
+    region = weaken(parts, region, lines)
     certificate = region.certificate
     found = certified_set(parts, settings, leaders, certificate)
-    lines = [*hypotheses(case), region.line, *set_lines(parts, states, certificate, found)]
+    lines += [region.line, *set_lines(parts, states, certificate, found)]
     lines.append(claims_line(parts, loop, region.relayed))
     return Promise(
         loop=loop,

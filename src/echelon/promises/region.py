@@ -5,6 +5,8 @@ Jacobians are enclosed from the model that runs, the strength 2 c lambda_min is 
 and graph, and a proof is proved anew. All of that is kept in a process, so it is not paid twice.
 """
 
+import dataclasses
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from echelon.certificates.certificate import RegionCertificate
@@ -70,7 +72,7 @@ def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCerti
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
-    return 2.0 * gain.coupling * parts.graph.spectrum().low
+    return 2.0 * gain.coupling * parts.graph.spectrum().proved
 
 
 def _withheld(
@@ -92,6 +94,17 @@ def _withheld(
     if not leaders.agree:
         return f"{theorem} speaks of one leader, or of leaders that agree", "start them alike"
     return "", ""
+
+
+def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:
+    """Return a region no stronger than what its hypotheses say of the offsets on its domain."""
+    [line] = (x for x in lines if x.statement is Hypothesis.SYMMETRY)
+    found, needed = region.certificate, line.verdict is not Verdict.NOT_NEEDED
+    if found is None or not needed or line.kind.strength >= found.kind.strength:
+        return region
+    why = "the offsets are tried at samples of the domain, and not proved"
+    found = dataclasses.replace(found, kind=line.kind, why=why)
+    return region._replace(certificate=found, line=_line(parts, found))
 
 
 def _lost(text: str, remedy: str) -> Statement:

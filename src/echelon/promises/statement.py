@@ -13,6 +13,7 @@ class Hypothesis(Word):
     EXACT = "Assumption 3, exact states"
     AGREEMENT = "leaders agree"
     SYMMETRY = "offsets are symmetries"
+    SMOOTH = "smooth at the trim"
     DETECTABLE = "detectability of (A, g'P)"
     MATCHED = "leader's motion is matched"
     COUPLED = "coupling"

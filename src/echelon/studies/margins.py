@@ -45,7 +45,8 @@ def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
     slopes = trim_slopes(model) - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
     worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
     text, shown = (
-        "inputs 30 % weaker or stronger, as by a wrong mass or inertia",
+        "each input 30 % weaker or stronger (at these corners, not between them), as by a wrong "
+        "mass or inertia",
         f"{worst:.3g} 1/s",
     )
     remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
