@@ -71,7 +71,9 @@ class Chunks:
         try:
             begun = json.loads((self.place / _BEGUN).read_text("utf-8"))
         except _DAMAGED as error:
-            raise OutputError(f"`{self.folder}` holds no run that was begun: {error}.") from error
+            raise OutputError(
+                f"`{self.folder}` holds no run that can go on; give the folder of one that ended."
+            ) from error
         if begun["inputs"] != self._digest():
             raise OutputError(
                 f"the scenario in `{self.folder}` was changed since the run began, so it cannot go "

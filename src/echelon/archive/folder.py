@@ -133,7 +133,8 @@ def _named_folder(out: Path, force: bool, by: str) -> Path:
     if out.exists() and not out.is_dir():
         raise OutputError(f"`{out}` is a file, and the output must be a folder.")
     out.mkdir(parents=True, exist_ok=True)
-    present = sorted(path.name for path in out.iterdir())
+    # A person's files before those that a run is just writing under hidden names.
+    present = sorted((path.name for path in out.iterdir()), key=lambda name: (name[0] == ".", name))
     if present and not force:
         raise OutputError(
             f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, "
