@@ -340,7 +340,7 @@ def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
     lines, found = checked(
         {"gain": gain},
         model={"name": "single-integrator"},
-        simulation={"horizon": 10.0, "dt": dt},
+        simulation={"horizon": 16 * dt, "dt": dt},
     )
     assert lines["step, input held"].verdict is verdict
     assert found.promised is (verdict is Verdict.HOLDS)

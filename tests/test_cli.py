@@ -1,10 +1,6 @@
 """The command line: what a user types, sees, and finds in the output folder."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -233,33 +229,6 @@ def test_a_diverging_run_is_a_result(here, echelon):
     assert told["followers"][0]["rmse"] is None and told["followers"][0]["steady_rmse"] is None
     with xr.open_dataset(here / "o" / "run.nc", engine="h5netcdf") as data:
         assert len(data.time) > 10 and bool(np.isfinite(data.states).all())
-
-
-def test_interrupting_keeps_what_was_computed(here):
-    (here / "mine.yaml").write_text(
-        SCENARIO.replace("horizon: 1.0, dt: 0.01", "horizon: 1.0e+6, dt: 0.01, store_every: 1000")
-    )
-    command = [sys.executable, "-m", "echelon", "run", "mine.yaml", "--no-figures"]
-    process = subprocess.Popen(
-        [*command, "--out", "o"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    deadline = time.time() + 120
-    while not (here / "o").exists() and time.time() < deadline:
-        time.sleep(0.2)
-    time.sleep(8)
-    # A press that lands in a callback of the interpreter is lost, and so a person presses again.
-    for _ in range(4):
-        os.kill(process.pid, signal.SIGINT)
-        try:
-            out, err = process.communicate(timeout=30)
-            break
-        except subprocess.TimeoutExpired:
-            continue
-    assert process.returncode == 130, err
-    told = json.loads((here / "o" / "summary.json").read_text())
-    assert told["outcome"]["name"] == "interrupted"
-    assert "was interrupted at t = " in out
-    assert (here / "o" / "run.nc").exists()
 
 
 def test_list_names_everything_in_one_line_each(echelon):

@@ -411,8 +411,8 @@ def test_an_unknown_scenario_is_refused_with_the_bundled_names(tmp_path, monkeyp
     with pytest.raises(ScenarioError) as caught:
         load_scenario("papr.yaml")
     assert str(caught.value) == (
-        "got the scenario `papr.yaml`, no such file exists, allowed is a file or a bundled"
-        f" scenario: {listing(bundled_scenarios())} (did you mean `paper`?)."
+        "got the scenario `papr.yaml`, no such file exists, allowed is a file, the folder of"
+        f" a run or a bundled scenario: {listing(bundled_scenarios())} (did you mean `paper`?)."
     )
 
 

@@ -390,7 +390,7 @@ def test_frames_are_those_of_a_run_that_stores_every_step():
         (1.0, 0.1, 10, 2, 1.0),
         (1.0, 0.1, 1000, 2, 1.0),
         (0.1, 0.1, 1, 2, 0.1),
-        (0.32, 0.1, 1, 4, 0.3),
+        (0.3, 0.1, 1, 4, 0.3),
     ],
 )
 def test_the_last_state_is_stored_whatever_divides(horizon, dt, every, frames, last):

@@ -21,7 +21,12 @@ from . import (
 from . import (
     references as references,
 )
-from .archive.run import save_run as save_run
+from .archive.run import (
+    load_run as load_run,
+)
+from .archive.run import (
+    save_run as save_run,
+)
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome

@@ -2,14 +2,19 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
+from echelon.archive.chunks import Chunks
 from echelon.archive.folder import claim_folder, unwritable
+from echelon.core.errors import OutputError
+from echelon.core.files import write_whole
 from echelon.core.types import PathLike
 from echelon.engine.result import Result
+from echelon.engine.simulate import reassemble
 from echelon.reports.run import report
 from echelon.results.dataset import save_dataset, summary
 from echelon.results.lyapunov import lyapunov
+from echelon.scenario.build import build, note_origin
+from echelon.scenario.scenario import KEPT, load_scenario
 
 
 def save_run(
@@ -28,40 +33,46 @@ def save_run(
     """
     name = result.provenance.get("scenario") or type(result.model).__name__
     place = claim_folder(name, None if folder is None else Path(folder), force)
-    # The data first: a figure that fails then costs no run.
-    write_data(result, place)
+    # A run from Python has no scenario file.
+    if "scenario_text" in result.provenance:
+        _write(place, KEPT, result.provenance["scenario_text"])
     write_findings(result, place, figures)
+    Chunks(place).remove()
     return place
 
 
-def write_data(result: Result, folder: Path) -> None:
-    """Write a run's dataset and scenario: what must not be lost, before all else.
+def load_run(folder: PathLike) -> Result:
+    """Return what is kept of a run that was ended before its horizon: killed, or interrupted.
+
+    A run that is complete is in its `run.nc`, which xarray opens.
+
+    Args:
+        folder: of the run, as `echelon run` made it.
+
+    Raises:
+        OutputError: no part of a run is kept there.
+        ScenarioError: its scenario cannot be read.
+    """
+    place = Path(folder)
+    if not Chunks(place).exist:
+        raise OutputError(f"`{place}` keeps no part of a run; where one is complete, see `run.nc`.")
+    scenario = load_scenario(place / KEPT)
+    return note_origin(reassemble(*build(scenario), Chunks(place).read()), scenario)
+
+
+def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
+    """Write what is made of a run, the dataset first: then summary, report and figures.
 
     Raises:
         OutputError: a file cannot be written.
     """
     try:
-        # A run from Python has no scenario file.
-        if "scenario_text" in result.provenance:
-            text = result.provenance["scenario_text"]
-            (folder / "scenario.yaml").write_text(text, "utf-8")
+        # The data first: a figure that fails then costs no run.
         save_dataset(result, folder / "run.nc")
-    except OSError as error:
-        raise unwritable(folder, error) from error
-
-
-def write_findings(result: Result, folder: Path, figures: bool = True) -> dict[str, Any]:
-    """Write what is made of a run: summary, report and figures; return the summary.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
-    numbers = summary(result)
-    try:
         # NaN is no JSON: whoever reads the file with another parser would stop there.
-        content = json.dumps(numbers, indent=2, allow_nan=False)
-        (folder / "summary.json").write_text(content + "\n", "utf-8")
-        (folder / "report.txt").write_text(report(result) + "\n", "utf-8")
+        content = json.dumps(summary(result), indent=2, allow_nan=False)
+        write_whole(folder / "summary.json", content + "\n")
+        write_whole(folder / "report.txt", report(result) + "\n")
         if figures and len(result.times):
             # Here, since matplotlib takes long to load, and a run without figures needs none of it.
             from echelon.plots.run import save_figures
@@ -70,4 +81,10 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> dict[s
             save_figures(result, folder, None if v is None else (v.value, v.rate))
     except OSError as error:
         raise unwritable(folder, error) from error
-    return numbers
+
+
+def _write(folder: Path, name: str, text: str) -> None:
+    try:
+        write_whole(folder / name, text)
+    except OSError as error:
+        raise unwritable(folder, error) from error

@@ -3,9 +3,12 @@
 Heavy modules are imported inside each command, so that `--help` is quick.
 """
 
+import errno
+import functools
 import os
 import sys
-from typing import Annotated, Final
+from collections.abc import Callable
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -13,20 +16,24 @@ from echelon import __version__
 from echelon.cli.cache import keep_compiled_code
 from echelon.cli.check import check
 from echelon.cli.compare import compare
+from echelon.cli.crash import CRASHED, note_crash
 from echelon.cli.design import design
 from echelon.cli.doctor import doctor
 from echelon.cli.listing import list_, schema
 from echelon.cli.run import run
+from echelon.cli.stop import STOP, Ended
 from echelon.cli.verify import verify
-from echelon.core.errors import EchelonError
+from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
-    "Exit codes: 0 done, 1 checked and not promised, 2 bad input, 3 diverged, "
-    "4 an optional part is not installed, 5 verified as far as it could be checked, "
-    "130 interrupted. "
+    "Exit codes: 0 done, or promised; 1 not promised, or refused by verify or doctor; 2 bad input, "
+    "or a file that cannot be written; 3 diverged; 4 an optional part is not installed; 5 verified "
+    "as far as it could be checked; 70 a fault of echelon's own; 130 ended by Ctrl-C and 143 by "
+    "SIGTERM, what was computed kept. "
     "ECHELON_CACHE names the folder where compiled code is kept between runs; `off` keeps none."
 )
-_INTERRUPTED: Final = 130
+_PIPE_CLOSED: Final = 141
+"""128 + SIGPIPE, what shells report of a program whose reader has left."""
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -41,16 +48,42 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line; an echelon error becomes one sentence and its exit code."""
+    """Run the command line; an error becomes one sentence and its exit code."""
     keep_compiled_code(os.environ)
+    with STOP.listen():
+        try:
+            _call()
+        except EchelonError as error:
+            _leave(str(error), error.exit_code)
+        except Ended:
+            _leave("ended before anything was computed, or left to write.", STOP.exit_code)
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+                _leave(f"nothing more can be written: {error.strerror}.", EchelonError.exit_code)
+            _leave(note_crash(error), CRASHED)
+
+
+def _call() -> None:
     try:
-        app()
-    except EchelonError as error:
-        print(f"echelon: {error}", file=sys.stderr)
-        raise SystemExit(error.exit_code) from None
-    except KeyboardInterrupt:
-        print("echelon: interrupted before anything was computed.", file=sys.stderr)
-        raise SystemExit(_INTERRUPTED) from None
+        try:
+            app()
+        finally:
+            # Here, since what fails after `main` has no exit code of ours.
+            sys.stdout.flush()
+    except SystemExit as left:
+        # What typer makes of it is 1, which means that nothing is promised.
+        if isinstance(left.__context__, BrokenPipeError):
+            raise SystemExit(_PIPE_CLOSED) from None
+        raise
+    except BrokenPipeError:
+        # Python would flush it once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(_PIPE_CLOSED) from None
+
+
+def _leave(sentence: str, code: int) -> None:
+    print(f"echelon: {sentence}", file=sys.stderr)
+    raise SystemExit(code) from None
 
 
 @app.callback(invoke_without_command=True)
@@ -65,6 +98,22 @@ def _about(
         raise typer.Exit()
 
 
+def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command that a file of the user's cannot end."""
+
+    @functools.wraps(command)
+    def call(*args: Any, **named: Any) -> Any:
+        try:
+            return command(*args, **named)
+        # Typer's own way out is another exception.
+        except SystemExit as error:
+            raise ModelError(
+                f"a file that the scenario names calls `sys.exit({error.code!r})`, and must not."
+            ) from error
+
+    return call
+
+
 # Listed here and not decorated at home, so that a command's file knows nothing of the program.
 for _command in (run, check, design, compare, verify, list_, doctor, schema):
-    app.command(_command.__name__.rstrip("_"))(_command)
+    app.command(_command.__name__.rstrip("_"))(_guarded(_command))

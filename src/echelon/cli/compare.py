@@ -2,12 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.cli import tables
 from echelon.cli.console import JsonOption, announce, written
+from echelon.cli.stop import STOP
+
+if TYPE_CHECKING:
+    from echelon.scenario.build import Built
+    from echelon.scenario.scenario import Scenario
+    from echelon.studies.compare import Comparison
 
 
 def compare(
@@ -37,28 +43,47 @@ def compare(
 
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
     checked = [load_scenario(each, changes) for each in scenarios]
-    from echelon.archive.comparison import write_comparison
     from echelon.archive.folder import claim_folders
-    from echelon.reports.comparison import (
-        comparison_mapping,
-        comparison_report,
-        print_comparison,
-    )
-    from echelon.scenario.build import build
-    from echelon.studies.compare import compare as fly
+    from echelon.reports.comparison import comparison_mapping
+    from echelon.scenario.build import build, check_size
     from echelon.studies.compare import known_labels
 
     labels = known_labels(method)
     parts = [build(each) for each in checked]
+    for each, built in zip(checked, parts, strict=True):
+        check_size(each, built)
     folders = claim_folders([each.name for each in checked], out, force)
-    told = []
-    for scenario, built, folder in zip(checked, parts, folders, strict=True):
-        found = fly(scenario, built, labels, announce(quiet=as_json))
-        told.append(comparison_mapping(found))
-        text = comparison_report(found)
-        write_comparison(found, told[-1], text, folder, figures)
-        if not as_json:
-            print_comparison(tables.console(), found)
-            print(f"- Written to {folder}: {written(folder)}.")
+    with STOP.hold():
+        found = [
+            _compare(*each, labels, figures, as_json)
+            for each in zip(checked, parts, folders, strict=True)
+        ]
     if as_json:
+        told = [comparison_mapping(each) for each in found]
         print(json.dumps(told[0] if len(told) == 1 else told, indent=2))
+    raise typer.Exit(STOP.exit_code)
+
+
+def _compare(
+    scenario: "Scenario",
+    built: "Built",
+    folder: Path,
+    labels: tuple[str, ...],
+    figures: bool,
+    quiet: bool,
+) -> "Comparison":
+    """Fly all methods on a scenario, show what they did, and write it."""
+    from echelon.archive.comparison import Flights, write_comparison
+    from echelon.reports.comparison import comparison_mapping, comparison_report, print_comparison
+    from echelon.studies.compare import compare as fly
+
+    flights = Flights(folder)
+    found = fly(scenario, built, labels, announce(quiet), STOP.check, flights.write)
+    # Shown before anything more is written: a full disk takes nothing of it.
+    if not quiet:
+        print_comparison(tables.console(), found)
+    flights.check()
+    write_comparison(found, comparison_mapping(found), comparison_report(found), folder, figures)
+    if not quiet:
+        print(f"- Written to {folder}: {written(folder)}.")
+    return found

@@ -25,6 +25,9 @@ def design(
     figures: Annotated[
         Path | None, typer.Option(help="Draw modes and certified set into this folder.")
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the gain in --out, or earlier figures.")
+    ] = False,
     slice_: Annotated[
         str | None, typer.Option("--slice", metavar="STATE,STATE", help="What the set is drawn in.")
     ] = None,
@@ -34,6 +37,10 @@ def design(
     from echelon.scenario.scenario import load_scenario
 
     checked = load_scenario(scenario, set_ or [])
+    from echelon.archive.folder import claim_design
+    from echelon.scenario.kept import files_of
+
+    claim_design(out, figures, force, files_of(checked))
     from echelon.gains.file import save_gain
     from echelon.studies.design import design as study
 

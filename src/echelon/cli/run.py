@@ -1,17 +1,40 @@
 """`echelon run`: simulate a scenario and keep what it shows."""
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from echelon.cli import tables
-from echelon.cli.console import JsonOption, ScenarioArgument, foretell, show_progress, written
+from echelon.cli.console import JsonOption, foretell, show_progress, written
+from echelon.cli.stop import STOP
+from echelon.core.errors import Outcome, OutputError
+
+if TYPE_CHECKING:
+    from echelon.archive.chunks import Chunks
+    from echelon.engine.record import Stretch
+    from echelon.engine.result import Result
+    from echelon.scenario.build import Built
+    from echelon.scenario.scenario import Scenario
+
+
+class _Job(NamedTuple):
+    """A run to do, and what is computed of it already."""
+
+    scenario: "Scenario"
+    built: "Built"
+    chunks: "Chunks"
+    before: "Sequence[Stretch]" = ()
 
 
 def run(
-    scenario: ScenarioArgument,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A bundled scenario's name, a YAML file, or the folder of a run."),
+    ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -19,6 +42,9 @@ def run(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-TIME.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Go on with the run in this folder.")
+    ] = None,
     force: Annotated[
         bool, typer.Option("--force", help="Replace an earlier run in --out.")
     ] = False,
@@ -26,28 +52,123 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a scenario; write its table, figures and dataset."""
+    if resume is None:
+        job = _begin(scenario, set_ or [], out, force, as_json)
+    elif scenario or set_ or out or force:
+        raise OutputError("`--resume` goes on with what a folder holds, and takes no other input.")
+    else:
+        job = _continue(resume)
+    from echelon.archive.folder import writing
+
+    with writing(job.chunks.folder), STOP.hold():
+        result = _fly(job, as_json)
+        _show(result, as_json)
+        _write(job.chunks, result, figures, as_json)
+    if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
+        # Then the disk ended it, and its message says so.
+        raise OutputError(f"{result.message[:-1]}, and {_again(job.chunks.folder)}.")
+    raise typer.Exit(STOP.exit_code or result.outcome.exit_code)
+
+
+def _begin(
+    scenario: str | None, changes: Sequence[str], out: Path | None, force: bool, quiet: bool
+) -> _Job:
+    """Return a new run, its folder taken and its inputs kept there."""
+    if scenario is None:
+        raise OutputError("got no scenario, allowed is one, or `--resume` with a run's folder.")
     from echelon.scenario.scenario import load_scenario
 
-    checked = load_scenario(scenario, set_ or [])
+    checked = load_scenario(scenario, changes)
+    from echelon.archive.chunks import Chunks
     from echelon.archive.folder import claim_folder
-    from echelon.archive.run import write_data, write_findings
-    from echelon.reports.run import print_report, say
-    from echelon.results.metrics import metrics
-    from echelon.scenario import build
+    from echelon.scenario.build import build, check_size
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
-    built = build.build(checked)
-    folder = claim_folder(checked.name, out, force)
-    console = tables.console()
-    foretell(built, quiet=as_json)
-    with show_progress(quiet=as_json) as progress:
-        result = build.run(checked, progress, built)
-    write_data(result, folder)
-    numbers = metrics(result)
-    findings = write_findings(result, folder, figures)
+    built = build(checked)
+    check_size(checked, built)
+    chunks = Chunks(claim_folder(checked.name, out, force))
+    with _undone(chunks):
+        chunks.begin(checked)
+        foretell(built, quiet)
+    return _Job(checked, built, chunks)
+
+
+def _continue(folder: Path) -> _Job:
+    """Return a run that was ended before, or leave where it is complete."""
+    from echelon.archive.chunks import Chunks
+    from echelon.scenario.scenario import KEPT, load_scenario
+
+    chunks = Chunks(folder)
+    if not chunks.exist and (folder / "summary.json").is_file():
+        print(f"echelon: the run in `{folder}` is complete, and nothing is left to do.")
+        raise typer.Exit()
+    chunks.check()
+    checked = load_scenario(folder / KEPT)
+    from echelon.scenario.build import build
+
+    return _Job(checked, build(checked), chunks, chunks.read())
+
+
+def _fly(job: _Job, quiet: bool) -> "Result":
+    """Return the run, written while it lasts."""
+    from echelon.engine.drive import Stopped
+    from echelon.scenario import build
+
+    def keep(stretch: "Stretch") -> None:
+        try:
+            job.chunks.write(stretch)
+        except OSError as error:
+            raise Stopped(f"its folder cannot be written: {error.strerror or error},") from error
+
+    with _undone(job.chunks), show_progress(quiet) as show:
+
+        def progress(done: int, steps: int) -> None:
+            if show is not None:
+                show(done, steps)
+            STOP.check()
+
+        return build.run(job.scenario, progress, job.built, keep, job.before)
+
+
+def _again(folder: Path) -> str:
+    return f"`echelon run --resume {folder}` goes on"
+
+
+@contextmanager
+def _undone(chunks: "Chunks") -> Iterator[None]:
+    """Leave no folder behind where a run ends before anything is computed."""
+    try:
+        yield
+    except BaseException:
+        chunks.forget()
+        raise
+
+
+def _show(result: "Result", as_json: bool) -> None:
+    """Print what a run shows, before anything more is written."""
     if as_json:
-        print(json.dumps(findings, indent=2))
-    else:
-        print_report(console, result, numbers)
-        say(console, f"Written to {folder}: {written(folder)}.")
-    raise typer.Exit(result.outcome.exit_code)
+        from echelon.results.dataset import summary
+
+        print(json.dumps(summary(result), indent=2), flush=True)
+        return
+    from echelon.reports.run import print_report
+    from echelon.results.metrics import metrics
+
+    print_report(tables.console(), result, metrics(result))
+
+
+def _write(chunks: "Chunks", result: "Result", figures: bool, quiet: bool) -> None:
+    """Write what a run shows; its chunks stay until all of it is written, and nothing is left."""
+    from echelon.archive.run import write_findings
+
+    try:
+        write_findings(result, chunks.folder, figures)
+    except OutputError as error:
+        again = f"what was computed is kept, and {_again(chunks.folder)}"
+        raise OutputError(f"{str(error)[:-1]}; {again}.") from error
+    if result.outcome in (Outcome.COMPLETED, Outcome.DIVERGED):
+        chunks.remove()
+    if not quiet:
+        from echelon.reports.run import say
+
+        say(tables.console(), f"Written to {chunks.folder}: {written(chunks.folder)}.")

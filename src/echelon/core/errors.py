@@ -74,12 +74,13 @@ class Outcome(enum.Enum):
     COMPLETED = "The run reached its horizon."
     DIVERGED = "A state stopped being finite; everything computed before it is kept."
     INTERRUPTED = "The run was interrupted; everything computed before it is kept."
+    STOPPED = "The run was ended from outside; everything until its last chunk is kept."
 
     @property
     def exit_code(self) -> int:
         """Exit code of the command line for a run that ended so."""
         # 130 is 128 + SIGINT, what shells report of a program that was interrupted.
-        return {Outcome.COMPLETED: 0, Outcome.DIVERGED: 3, Outcome.INTERRUPTED: 130}[self]
+        return {Outcome.COMPLETED: 0, Outcome.DIVERGED: 3}.get(self, 130)
 
 
 def did_you_mean(got: object, allowed: Iterable[str]) -> str:

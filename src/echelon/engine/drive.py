@@ -5,6 +5,7 @@ another one here.
 """
 
 import abc
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -71,8 +72,35 @@ class Chunk(NamedTuple):
     stopped: str | None = None
 
 
+def numbers(now: Moment) -> tuple[Array, ...]:
+    """Return the numbers of a moment, in the order of its tree."""
+    leaves = jax.tree.leaves(now)
+    return tuple(np.asarray(jax.random.key_data(x) if _is_key(x) else x) for x in leaves)
+
+
+def _leaf(stored: Array, like: Any) -> Any:
+    """Return one of the numbers as the leaf that it was."""
+    if _is_key(like):
+        return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
+    return jnp.asarray(stored, like.dtype)
+
+
+def _is_key(leaf: Any) -> bool:
+    """Tell whether a law remembers a random key, which is no number to NumPy."""
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+class Stopped(Exception):
+    """Raised by what a run asks on its way, where the run is to end there; the reason in words."""
+
+
 class Stepper(abc.ABC):
     """Moves all agents from step to step."""
+
+    @property
+    @abc.abstractmethod
+    def longest(self) -> int:
+        """The most steps of a chunk, so that one takes well under two seconds."""
 
     @abc.abstractmethod
     def start(self) -> Moment:
@@ -86,6 +114,18 @@ class Stepper(abc.ABC):
         meter measures them against; None where they follow nothing. A chunk that meets a state
         that is not finite may end early, with that state in its last frame.
         """
+
+    def recall(self, leaves: Sequence[Array]) -> Moment:
+        """Return the moment of which these are the numbers, in the order of its tree.
+
+        Raises:
+            SimulationError: a moment is not all that decides what comes next, or another run's.
+        """
+        # The moment at the start says of what kind and shape each of the numbers is.
+        wanted, tree = jax.tree.flatten(self.start())
+        if [np.shape(each) for each in numbers(wanted)] != [np.shape(each) for each in leaves]:
+            raise SimulationError("the kept moment has another shape than this run's.")
+        return tree.unflatten(map(_leaf, leaves, wanted))
 
     @property
     def work(self) -> SolverStats | None:

@@ -1,6 +1,6 @@
 """Agents whose inputs come from the host: a pilot gives them every few steps, the plant moves."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias, final
 
 import equinox as eqx
@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import SimulationError
 from echelon.core.types import Array, Inputs, States
-from echelon.engine.drive import Chunk, Problem, Stepper
+from echelon.engine.drive import Chunk, Problem, Stepper, Stopped
 from echelon.engine.motion import Motion
 from echelon.engine.sums import Meter, Sums, on_host, reference_at
 from echelon.engine.work import SolverStats
@@ -17,9 +18,8 @@ from echelon.engine.work import SolverStats
 Pilot: TypeAlias = Callable[[int, Array], Array]
 """(step, states (N, n)) -> wanted physical inputs (N, m) from that step on."""
 
-
-class Stopped(Exception):
-    """Raised by a pilot that gives no further inputs, with the reason in words."""
+_PLANS = 64
+"""Plans of one agent each in a chunk: a solver takes some 20 ms for one."""
 
 
 @final
@@ -47,6 +47,19 @@ class HostStepper(Stepper):
     def work(self) -> SolverStats:
         """What solving took so far."""
         return self._work()
+
+    @property
+    def longest(self) -> int:
+        """Steps in which a few dozen plans are made."""
+        return self.hold * max(1, _PLANS // len(self.problem.states))
+
+    def recall(self, leaves: Sequence[Array]) -> "_Held":
+        """Refuse: what a pilot has planned is no part of the moment.
+
+        Raises:
+            SimulationError: always.
+        """
+        raise SimulationError("a run whose inputs are planned cannot go on from what was kept.")
 
     def start(self) -> "_Held":
         """Return the moment at which the run begins, before the pilot gives any input."""

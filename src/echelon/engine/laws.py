@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, final
 import jax
 import jax.numpy as jnp
 
-from echelon.core.errors import ModelError, check_kind
+from echelon.core.errors import check_kind
 from echelon.core.types import Array, State
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
@@ -103,6 +103,14 @@ class Laws(Drive):
         return _LawStepper(assemble(problem, self.leader, self.follower), problem.states)
 
 
+_AGENT_STEPS, _FEWEST = 100_000, 4
+"""Steps of one agent each in a chunk, and the fewest of all agents.
+
+A quadrotor's take 1.4 to 7 us, and a model may take longer. A chunk computes the inputs at each of
+its frames once more, so that one of a single step would take twice the time.
+"""
+
+
 @final
 class _LawStepper(Stepper):
     """The closed loop of laws, traced by JAX: many steps a call."""
@@ -110,27 +118,16 @@ class _LawStepper(Stepper):
     def __init__(self, loop: Loop, states: Array) -> None:
         self.loop, self.states = loop, states
 
+    @property
+    def longest(self) -> int:
+        """Steps that take some tenths of a second, or a few of very many agents."""
+        return max(_FEWEST, _AGENT_STEPS // len(self.states))
+
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
         return begin(self.loop, jnp.asarray(self.states))
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
-        """Store frames and take steps; what happens on the way is seen afterwards.
-
-        Raises:
-            ModelError: a NumPy constant stands in the model or a law that JAX has seen in another
-                precision.
-        """
-        try:
-            now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
-        except ValueError as error:
-            # JAX caches traces by shape and type: a NumPy constant met in float64 stays so in a
-            # float32 run, and all that JAX says of it is this.
-            if "Cannot lower jaxpr" not in str(error):
-                raise
-            raise ModelError(
-                f"`{type(self.loop.model).__name__}` or a law uses a NumPy constant that JAX has "
-                "already seen in another precision; write it as Python numbers or as "
-                "`jnp.asarray(constant, x.dtype)`."
-            ) from error
+        """Store frames and take steps; what happens on the way is seen afterwards."""
+        now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
         return Chunk(now, *on_host((states, inputs, sums)))

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from echelon.core.errors import SimulationError, check_kind
+from echelon.core.limits import excess_frames
 from echelon.core.numerics import precision
 from echelon.engine.drive import Problem
 from echelon.engine.initial import initial_states
@@ -53,6 +54,21 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     warnings += formation_warnings(model, formation)
     # Model and drive may say the same; a dictionary keeps the first, and the order.
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
+
+
+def check_memory(parts: Parts, settings: Settings) -> None:
+    """Check that what the run stores has room, before any of it is made.
+
+    Raises:
+        SimulationError: it has not, and what would.
+    """
+    n, m = len(parts.model.state_names), len(parts.model.input_names)
+    every = settings.store_every
+    # The last term is the reference.
+    numbers = parts.graph.agents * (n + m) + n
+    excess = excess_frames(1 + -(-settings.steps // every), numbers, every)
+    if excess is not None:
+        raise SimulationError(f"the run {excess}.")
 
 
 def _check_offsets(model: ControlAffine, parts: Parts) -> None:

@@ -1,22 +1,50 @@
 """What is kept of a run while it goes on, and how it ended."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, final
 
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array
-from echelon.engine.drive import Chunk, Problem
-from echelon.engine.settings import Settings
+from echelon.engine.drive import Chunk, Problem, numbers
+from echelon.engine.grid import Grid
 from echelon.engine.sums import Sums
 
-_INTERRUPTED = "The run was interrupted"
+_VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
 
-def frame_counts(settings: Settings) -> Array:
-    """Return the number of steps after each stored frame; zero after the last."""
-    whole, rest = divmod(settings.steps, settings.store_every)
-    return np.array([settings.store_every] * whole + [rest] * (rest > 0) + [0], dtype=np.int32)
+class Stretch(NamedTuple):
+    """A part of a run, all in NumPy; the last one is all that going on from there needs.
+
+    Attributes:
+        first: the step at which it begins.
+        done: the step at which it ends.
+        times: (T,) s, of the stored frames in it.
+        states: (T, N, n) of these.
+        inputs: (T, N, m) delivered from each of them on.
+        reference: (T, n) what the leaders follow at each; None where they follow nothing.
+        sums: over all steps of the run up to its end.
+        moment: the numbers of the moment at its end.
+        stopped: why no further step can be taken, in words; None where one can.
+        seconds: of computing, since the run began.
+    """
+
+    first: int
+    done: int
+    times: Array
+    states: Array
+    inputs: Array
+    reference: Array | None
+    sums: Sums
+    moment: tuple[Array, ...]
+    stopped: str | None
+    seconds: float
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number of its frames is."""
+        return bool(np.isfinite(self.states).all() and np.isfinite(self.inputs).all())
 
 
 class Record(NamedTuple):
@@ -30,6 +58,7 @@ class Record(NamedTuple):
         sums: over all steps.
         outcome: how it ended.
         message: the same with time and agent.
+        seconds: of computing.
     """
 
     times: Array
@@ -39,72 +68,126 @@ class Record(NamedTuple):
     sums: Sums
     outcome: Outcome
     message: str
+    seconds: float
 
 
 @final
 class Recorder:
-    """Collects the chunks of a run."""
+    """Collects the stretches of a run, after those that were computed before."""
 
-    def __init__(self, problem: Problem) -> None:
-        """Begin with nothing."""
-        self.problem = problem
-        self.chunks: list[Chunk] = []
-        self.followed: list[Array] = []
+    def __init__(
+        self, problem: Problem, grid: Grid, nothing: Sums, before: Sequence[Stretch] = ()
+    ) -> None:
+        """Begin; `nothing` are the sums of no step."""
+        self.problem, self.grid, self.stretches = problem, grid, list(before)
+        self.sums = before[-1].sums if before else nothing
+        self.frames = sum(len(each.times) for each in before)
 
-    def keep(self, chunk: Chunk, counts: Array, reference: Array | None) -> bool:
-        """Keep a chunk and what was followed at its frames; tell whether the run can go on.
+    @property
+    def done(self) -> int:
+        """How many steps were taken."""
+        return self.stretches[-1].done if self.stretches else 0
 
-        `counts` are the steps after each of its frames, `reference` (S, n) is for each step.
-        """
-        self.chunks.append(chunk)
-        if reference is not None:
-            # The row of a frame is the number of steps before it; a stopped chunk has fewer.
-            self.followed.append(reference[np.cumsum(counts) - counts][: len(chunk.states)])
-        finite = np.isfinite(chunk.states).all() and np.isfinite(chunk.inputs).all()
-        return chunk.stopped is None and bool(finite)
+    @property
+    def complete(self) -> bool:
+        """Whether every frame is there."""
+        return self.frames == self.grid.frames
 
-    def close(self, nothing: Sums) -> Record:
+    @property
+    def ended(self) -> bool:
+        """Whether no further step is to be taken."""
+        last = self.stretches[-1] if self.stretches else None
+        return self.complete or not (last is None or last.stopped is None and last.finite)
+
+    def keep(self, chunk: Chunk, reference: Array | None, seconds: float) -> Stretch:
+        """Keep and return the stretch of a chunk that followed a reference (S, n) step by step."""
+        first, counts = self.done, self.grid.counts(self.done)
+        # One that stopped has fewer points.
+        points = (first + np.cumsum(counts) - counts)[: len(chunk.states)]
+        # One that is not finite is kept wherever it stands: it says when the run was lost.
+        stored = self.grid.stored(points) | ~_finite(chunk.states, chunk.inputs).all(axis=1)
+        self.sums = self.sums.plus(chunk.sums)
+        self.frames += int(stored.sum())
+        if self.stretches:
+            # Only the last one's are ever asked for, and many would fill the memory.
+            self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
+        self.stretches.append(
+            Stretch(
+                first,
+                first + int(chunk.sums.steps[0]),
+                self.problem.settings.dt * points[stored],
+                chunk.states[stored],
+                chunk.inputs[stored],
+                None if reference is None else reference[points - first][stored],
+                self.sums,
+                numbers(chunk.now),
+                chunk.stopped,
+                seconds,
+            )
+        )
+        return self.stretches[-1]
+
+    def stop(self, reason: str) -> None:
+        """Note why the run goes no further."""
+        self.stretches[-1] = self.stretches[-1]._replace(stopped=reason)
+
+    def close(self, unfinished: Outcome) -> Record:
         """Return the record, cut at the first frame that is not finite.
 
-        `nothing` are the sums of no step.
+        `unfinished` is how a run ended that neither reached its horizon nor was lost.
         """
-        settings, m = self.problem.settings, len(self.problem.model.input_names)
-        counts, agents = frame_counts(settings), self.problem.graph.agents
-        # So that a run without a frame has arrays of the right shape all the same.
-        none = np.zeros((0, *self.problem.states.shape)), np.zeros((0, agents, m))
-        states = np.concatenate([none[0], *(c.states for c in self.chunks)])[: len(counts)]
-        inputs = np.concatenate([none[1], *(c.inputs for c in self.chunks)])[: len(counts)]
-        times = settings.dt * np.concatenate([[0], np.cumsum(counts[:-1])])[: len(states)]
-        sums = nothing
-        for chunk in self.chunks:
-            sums = sums.plus(chunk.sums)
+        whole = join(self.stretches) or self._nothing()
+        lost = np.argwhere(~_finite(whole.states, whole.inputs))
         # In the order of frames, then agents: the first row is the first to be lost.
-        lost = np.argwhere(~(np.isfinite(states).all(axis=2) & np.isfinite(inputs).all(axis=2)))
-        cut = int(lost[0, 0]) if len(lost) else len(times)
-        reached = float(times[-1]) if len(times) else 0.0
-        # One that stopped did so between two frames; the steps themselves were counted.
-        if self.chunks and self.chunks[-1].stopped:
-            reached = float(sums.steps[0]) * settings.dt
-        complete = len(states) == len(counts)
-        outcome, message = self._verdict(times, lost, complete, reached)
-        followed = np.concatenate(self.followed)[:cut] if self.followed else None
-        return Record(times[:cut], states[:cut], inputs[:cut], followed, sums, outcome, message)
+        cut = slice(int(lost[0, 0]) if len(lost) else None)
+        return Record(
+            whole.times[cut],
+            whole.states[cut],
+            whole.inputs[cut],
+            None if whole.reference is None else whole.reference[cut],
+            self.sums,
+            *self._verdict(whole, lost, unfinished),
+            whole.seconds,
+        )
 
-    def _verdict(
-        self, times: Array, lost: Array, complete: bool, reached: float
-    ) -> tuple[Outcome, str]:
+    def _nothing(self) -> Stretch:
+        """Return a stretch without a frame, its arrays of the right shape all the same."""
+        agents, m = self.problem.graph.agents, len(self.problem.model.input_names)
+        states, inputs = np.zeros((0, *self.problem.states.shape)), np.zeros((0, agents, m))
+        return Stretch(0, 0, np.zeros(0), states, inputs, None, self.sums, (), None, 0.0)
+
+    def _verdict(self, whole: Stretch, lost: Array, unfinished: Outcome) -> tuple[Outcome, str]:
         """Return how the run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
             role = "leader" if agent in self.problem.graph.leaders else "follower"
-            return (
-                Outcome.DIVERGED,
-                f"The state of {role} {agent} stopped being finite by t = {times[frame]:.6g} s.",
-            )
-        stopped = self.chunks[-1].stopped if self.chunks else None
-        if complete and stopped is None:
+            when = f"by t = {whole.times[frame]:.6g} s"
+            return Outcome.DIVERGED, f"The state of {role} {agent} stopped being finite {when}."
+        if whole.stopped is None and self.complete:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
-        return (
-            Outcome.INTERRUPTED,
-            f"{stopped or _INTERRUPTED} at t = {reached:.6g} s; what was computed is kept.",
-        )
+        reached = float(whole.times[-1]) if len(whole.times) else 0.0
+        # One that stopped did so between two frames; the steps themselves were counted.
+        if whole.stopped:
+            reached = whole.done * self.problem.settings.dt
+        said = whole.stopped or f"The run was {_VERBS[unfinished]}"
+        return unfinished, f"{said} at t = {reached:.6g} s; what was computed is kept."
+
+
+def join(stretches: Sequence[Stretch]) -> Stretch | None:
+    """Return stretches that follow each other as one; None where there is none."""
+    if not stretches:
+        return None
+    times, states, inputs = (
+        np.concatenate([getattr(each, name) for each in stretches])
+        for name in ("times", "states", "inputs")
+    )
+    followed = [each.reference for each in stretches if each.reference is not None]
+    reference = np.concatenate(followed) if followed else None
+    return stretches[-1]._replace(
+        first=stretches[0].first, times=times, states=states, inputs=inputs, reference=reference
+    )
+
+
+def _finite(states: Array, inputs: Array) -> Array:
+    """Return which agents are finite in which frames, (T, N)."""
+    return np.logical_and(np.isfinite(states).all(axis=2), np.isfinite(inputs).all(axis=2))

@@ -5,6 +5,7 @@ import numbers
 from typing import NamedTuple
 
 from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.limits import MOST_STEPS, horizon_fault
 from echelon.core.numerics import INTEGRATORS, Precision
 
 
@@ -12,7 +13,7 @@ class Settings(NamedTuple):
     """How a run is computed.
 
     Attributes:
-        horizon: length of the run, s; rounded to whole steps.
+        horizon: length of the run, s; a whole number of steps.
         dt: step, s.
         integrator: `rk4`, `euler` or `printed`; the input is held over a step.
         limits: whether the actuators' limits act.
@@ -64,21 +65,28 @@ class Settings(NamedTuple):
         # Any text that is not empty would count as true.
         if not isinstance(self.limits, bool):
             raise SimulationError(f"`limits` is {self.limits!r}, and must be True or False.")
-        if self.horizon < self.dt:
+        fault = horizon_fault(self.horizon, self.dt)
+        if fault is not None:
+            raise SimulationError(f"`horizon` is {self.horizon} s, and {fault}.")
+        window = self.window
+        if not 0.0 < window <= self.horizon:
             raise SimulationError(
-                f"`horizon` is {self.horizon} s, and must be at least one step `dt` = {self.dt} s."
+                f"`steady_window` is {window} s, and must be above 0 and at most the horizon, "
+                f"{self.horizon} s."
             )
         for name, allowed in (
             ("integrator", tuple(INTEGRATORS)),
             ("precision", ("float64", "float32")),
         ):
             _check_name(name, getattr(self, name), allowed)
-        for name, least in (("seed", 0), ("store_every", 1)):
+        for name, least, most in (("seed", 0, 2**63 - 1), ("store_every", 1, MOST_STEPS)):
             value = getattr(self, name)
             # By its type: neither a seed nor a count of list entries may be 2.0, or NaN.
-            if not isinstance(value, numbers.Integral) or value < least:
+            whole = isinstance(value, numbers.Integral)
+            if not whole or not least <= int(value) <= most:
+                end = f"to {most}" if whole and int(value) > most else "on"
                 raise SimulationError(
-                    f"`{name}` is {value}, and must be a whole number from {least} on."
+                    f"`{name}` is {value}, and must be a whole number from {least} {end}."
                 )
 
 

@@ -1,37 +1,53 @@
 """The closed loop in time: parts in, one `Result` out, whatever drives the agents."""
 
-import math
+import contextlib
 import time
-from collections.abc import Callable
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, final
 
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.engine.drive import Stepper
+from echelon.engine.drive import Stepper, Stopped
+from echelon.engine.grid import Grid
 from echelon.engine.parts import Parts
-from echelon.engine.prepare import Prepared, prepare
-from echelon.engine.record import Recorder, frame_counts
+from echelon.engine.prepare import Prepared, check_memory, prepare
+from echelon.engine.record import Recorder, Stretch, join
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
 from echelon.engine.sums import on_host
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Called now and then with the steps done and the steps in all."""
+"""Called between chunks with the steps done and the steps in all."""
+Keep: TypeAlias = Callable[[Stretch], None]
+"""Called with every stretch of a run while it lasts, each following the one before.
 
-_CHUNKS = 100
-"""Parts of a run between which progress is reported, and Ctrl-C or a divergence ends it."""
+Where it raises `Stopped`, with the reason in words, the run ends there.
+"""
+
+_SECONDS = 2.0
+"""Of wall time that a stretch takes: what is lost at most where a run is killed."""
 
 
-def simulate(parts: Parts, settings: Settings, progress: Progress | None = None) -> Result:
+def simulate(
+    parts: Parts,
+    settings: Settings,
+    progress: Progress | None = None,
+    keep: Keep | None = None,
+    before: Sequence[Stretch] = (),
+) -> Result:
     """Run the closed loop and return what happened.
 
     Args:
         parts: agents, graph, formation, what drives them, starts and world.
         settings: horizon, step and the like.
-        progress: called about a hundred times with (steps done, steps in all).
+        progress: called a hundred times or more with (steps done, steps in all).
+        keep: called with what was computed, every two seconds and at the end.
+        before: all that an earlier run of the same parts and settings gave to `keep`; the run goes
+            on from there, to the same bits.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others. A run that diverges or is
@@ -39,12 +55,43 @@ def simulate(parts: Parts, settings: Settings, progress: Progress | None = None)
     """
     began = time.perf_counter()
     prepared = prepare(parts, settings)
+    check_memory(parts, settings)
     with precision("float64"):
         # Plans and solvers are made in float64, in whatever precision the run then is.
         stepper = prepared.parts.drive.stepper(prepared.problem)
     with precision(settings.precision):
-        recorder = _run(stepper, prepared, progress)
-        record = recorder.close(on_host(prepared.problem.meter.nothing()))
+        recorder = _recorder(prepared, stepper, before)
+        _Flight(stepper, prepared, recorder, began).fly(progress, keep)
+    return _result(prepared, recorder, stepper, Outcome.INTERRUPTED)
+
+
+def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:
+    """Return what a run had computed when it was ended from outside.
+
+    Args:
+        parts: those of the run.
+        settings: those of the run.
+        stretches: all that it gave to `keep`.
+
+    Raises:
+        EchelonError: as in `simulate`.
+    """
+    prepared = prepare(parts, settings)
+    with precision("float64"):
+        stepper = prepared.parts.drive.stepper(prepared.problem)
+    return _result(prepared, _recorder(prepared, stepper, stretches), stepper, Outcome.STOPPED)
+
+
+def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Stretch]) -> Recorder:
+    problem = prepared.problem
+    grid = Grid(problem.settings, stepper.longest)
+    return Recorder(problem, grid, on_host(problem.meter.nothing()), before)
+
+
+def _result(
+    prepared: Prepared, recorder: Recorder, stepper: Stepper, unfinished: Outcome
+) -> Result:
+    record = recorder.close(unfinished)
     return Result(
         times=record.times,
         states=record.states,
@@ -55,38 +102,56 @@ def simulate(parts: Parts, settings: Settings, progress: Progress | None = None)
         message=record.message,
         warnings=prepared.warnings,
         parts=prepared.parts,
-        settings=settings,
-        wall_time=time.perf_counter() - began,
+        settings=prepared.problem.settings,
+        wall_time=record.seconds,
         work=stepper.work,
     )
 
 
-def _run(stepper: Stepper, prepared: Prepared, progress: Progress | None) -> Recorder:
-    """Advance chunk by chunk, so that Ctrl-C or a divergence keeps what was computed."""
-    problem = prepared.problem
-    counts = frame_counts(problem.settings)
-    size = math.ceil(len(counts) / _CHUNKS)
-    # Chunks of one length compile once; the padding stores the last frame again, and is cut off.
-    padded = np.concatenate([counts, np.zeros(-len(counts) % size, np.int32)])
-    chunks = padded.reshape(-1, size)
-    # The last chunks have fewer steps; a reference of one length keeps them from compiling anew.
-    longest = int(chunks.sum(axis=1).max())
-    recorder, done = Recorder(problem), 0
-    try:
-        now = stepper.start()
-        for chunk in chunks:
-            # One more row, for a frame at a chunk's end, which no step follows.
-            reference = _sample_reference(prepared, done, longest + 1)
-            made = stepper.advance(now, chunk, reference)
-            now, done = made.now, done + int(chunk.sum())
-            if not recorder.keep(made, chunk, reference):
-                break
-            if progress is not None:
-                progress(done, int(counts.sum()))
-    # Between chunks, or within one of JAX's: that chunk is lost, and what was recorded is kept.
-    except KeyboardInterrupt:
-        pass
-    return recorder
+@final
+class _Flight:
+    """A run on its way, chunk by chunk, so that Ctrl-C or a divergence keeps what was computed."""
+
+    def __init__(
+        self, stepper: Stepper, prepared: Prepared, recorder: Recorder, began: float
+    ) -> None:
+        self.stepper, self.prepared, self.recorder = stepper, prepared, recorder
+        last = recorder.stretches[-1] if recorder.stretches else None
+        self.now = stepper.start() if last is None else stepper.recall(last.moment)
+        # As if it had begun so much earlier: what was computed before counts too.
+        self.began = began - (0.0 if last is None else last.seconds)
+        self.given, self.gave = len(recorder.stretches), time.perf_counter()
+
+    def fly(self, progress: Progress | None, keep: Keep | None) -> None:
+        """Take all steps that are left, or those that can be taken."""
+        try:
+            # Between chunks, or within one of JAX's: that chunk is lost, the others are kept.
+            with contextlib.suppress(KeyboardInterrupt):
+                while not self.recorder.ended:
+                    self._advance()
+                    if time.perf_counter() - self.gave > _SECONDS:
+                        self._give(keep)
+                    if progress is not None:
+                        progress(self.recorder.done, self.recorder.grid.steps)
+            self._give(keep)
+        except Stopped as reason:
+            self.recorder.stop(f"The run was stopped, since {reason}")
+
+    def _advance(self) -> None:
+        first, grid = self.recorder.done, self.recorder.grid
+        # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
+        # last chunks, which have fewer steps, keep them from compiling anew.
+        reference = _sample_reference(self.prepared, first, grid.longest + 1)
+        made = self.stepper.advance(self.now, grid.counts(first), reference)
+        self.recorder.keep(made, reference, time.perf_counter() - self.began)
+        self.now = made.now
+
+    def _give(self, keep: Keep | None) -> None:
+        """Hand over what was computed since the last time."""
+        new = join(self.recorder.stretches[self.given :])
+        if keep is not None and new is not None:
+            keep(new)
+        self.given, self.gave = len(self.recorder.stretches), time.perf_counter()
 
 
 def _sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:

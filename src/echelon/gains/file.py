@@ -11,6 +11,7 @@ import numpy as np
 from echelon.certificates.certificate import Certificate, RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.core.errors import GainError, OutputError
+from echelon.core.files import write_whole
 from echelon.core.types import Array, PathLike
 from echelon.core.words import Kind, Theorem
 from echelon.gains.gain import Gain, check_strength
@@ -147,7 +148,7 @@ def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) ->
     # A line a key: a diff then shows what changed. NaN is refused, since no promise rests on one.
     lines = [f"{json.dumps(key)}: {json.dumps(stored[key], allow_nan=False)}" for key in stored]
     try:
-        Path(path).write_text("{\n" + ",\n".join(lines) + "\n}\n", "utf-8")
+        write_whole(Path(path), "{\n" + ",\n".join(lines) + "\n}\n")
     except OSError as error:
         raise OutputError(f"`{path}` cannot be written: {error.strerror or error}.") from error
 

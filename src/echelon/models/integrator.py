@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.errors import ModelError
+from echelon.core.limits import excess_states
 from echelon.core.types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, check_not_negative
 
@@ -18,13 +19,16 @@ def _axes(dimension: int) -> tuple[str, ...]:
     return _AXES[:dimension] if dimension <= 3 else tuple(f"x{k + 1}" for k in range(dimension))
 
 
-def _check_dimension(model: eqx.Module, dimension: int) -> None:
+def _check_dimension(model: ControlAffine, dimension: int) -> None:
     # True is an integer to Python, and no dimension.
     if isinstance(dimension, bool) or not isinstance(dimension, numbers.Integral) or dimension < 1:
         raise ModelError(
             f"`dimension` of `{type(model).__name__}` is {dimension}, "
             "and must be a whole number of at least 1."
         )
+    excess = excess_states(model.flat_order * dimension)
+    if excess is not None:
+        raise ModelError(f"`dimension` of `{type(model).__name__}` is too large: {excess}.")
 
 
 class SingleIntegrator(ControlAffine):

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from echelon.core.errors import GraphError
+from echelon.core.limits import excess_agents, excess_edges
 from echelon.core.types import Array
 
 
@@ -46,7 +47,7 @@ def count_agents(pairs: Array, agents: int | None) -> int:
     named = int(pairs.max(initial=0)) + 1
     if agents is None:
         agents = named
-    check_at_least(agents, 2, "graph")
+    check_size(agents, 2, "graph", len(pairs))
     if named > agents:
         raise GraphError(
             f"an edge names agent {named - 1}, and with {agents} agents the last is {agents - 1}."
@@ -93,10 +94,13 @@ def check_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
     return chosen
 
 
-def check_at_least(agents: int, least: int, kind: str) -> None:
-    """Check that a kind of graph has enough agents."""
+def check_size(agents: int, least: int, kind: str, edges: float = 0.0) -> None:
+    """Check that a kind of graph has enough agents, and no more than fit; nor its edges."""
     if agents < least:
         raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
+    excess = excess_agents(agents) or excess_edges(edges)
+    if excess is not None:
+        raise GraphError(f"the graph is too large: {excess}.")
 
 
 def name_agents(agents: np.ndarray) -> str:

@@ -123,7 +123,8 @@ class Formation:
         columns = int(np.ceil(np.sqrt(graph.agents))) if columns is None else columns
         if columns < 1:
             raise FormationError(f"`columns` of a grid is {columns}, and must be at least 1.")
-        number = np.arange(graph.agents)
+        # More columns than agents are one row, and may be more than an array's numbers can count.
+        number, columns = np.arange(graph.agents), min(columns, graph.agents)
         plan = np.column_stack([-(number // columns), number % columns])
         return cls._place_plan(model, graph, plan, spacing)
 

@@ -15,9 +15,9 @@ from echelon.core.errors import GraphError
 from echelon.core.types import Array, States
 from echelon.network.bound import Grounded, least_eigenvalue_bound
 from echelon.network.edges import (
-    check_at_least,
     check_edges,
     check_leaders,
+    check_size,
     count_agents,
     name_agents,
     split_weights,
@@ -120,31 +120,31 @@ class Graph:
     @classmethod
     def path(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the line 0 - 1 - ... - (agents - 1)."""
-        check_at_least(agents, 2, "path")
+        check_size(agents, 2, "path")
         return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents)
 
     @classmethod
     def ring(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the closed line."""
-        check_at_least(agents, 3, "ring")
+        check_size(agents, 3, "ring")
         return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents)
 
     @classmethod
     def star(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the star with agent 0 in the middle."""
-        check_at_least(agents, 2, "star")
+        check_size(agents, 2, "star")
         return cls([(0, i) for i in range(1, agents)], leaders, agents)
 
     @classmethod
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the graph with every edge."""
-        check_at_least(agents, 2, "complete")
+        check_size(agents, 2, "complete", agents * (agents - 1) // 2)
         return cls(np.stack(np.triu_indices(agents, 1), axis=1), leaders, agents)
 
     @classmethod
     def grid(cls, rows: int, columns: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return rows x columns agents, numbered row by row, linked to the nearest four."""
-        check_at_least(rows * columns, 2, "grid")
+        check_size(rows * columns, 2, "grid")
         number = np.arange(rows * columns).reshape(rows, columns)
         across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
         down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
@@ -162,7 +162,9 @@ class Graph:
         # Imported here: random graphs alone need it.
         from scipy.spatial import KDTree
 
-        check_at_least(agents, 2, "geometric")
+        # An agent's neighbours are those in its disc, as far as that lies in the square.
+        share = min(1.0, np.pi * float(radius) * float(radius))
+        check_size(agents, 2, "geometric", share * agents * (agents - 1) / 2)
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
         pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
         # The tree returns pairs in no promised order; sorted, a seed is one graph everywhere.

@@ -11,8 +11,8 @@ import numpy as np
 
 from echelon.core.errors import check_kind
 from echelon.core.types import Array, State
-from echelon.engine.drive import Drive, Information, Problem, Stepper
-from echelon.engine.host import HostStepper, Stopped
+from echelon.engine.drive import Drive, Information, Problem, Stepper, Stopped
+from echelon.engine.host import HostStepper
 from echelon.engine.settings import Settings
 from echelon.engine.work import SolverStats, solver_stats
 from echelon.models.model import ControlAffine

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from echelon.core.files import make_whole
 from echelon.core.types import Array
 
 if TYPE_CHECKING:
@@ -256,9 +257,10 @@ def save(figures: "Mapping[str, Figure]", folder: Path) -> list[Path]:
     for name, figure in figures.items():
         png, pdf = (folder / f"{name}.{kind}" for kind in ("png", "pdf"))
         with style():
-            figure.savefig(png)
+            make_whole(png, lambda part: figure.savefig(part, format="png"))
             # Without its date, the same run writes the same file.
-            figure.savefig(pdf, metadata={"CreationDate": None})
+            dated = {"CreationDate": None}
+            make_whole(pdf, lambda part: figure.savefig(part, format="pdf", metadata=dated))
         paths += [png, pdf]
     return paths
 

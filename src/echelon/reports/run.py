@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from echelon.core.errors import Outcome
 from echelon.engine.result import Result
 from echelon.reports.explain import explain
 from echelon.reports.printed import PRINTED, ROUNDING, is_papers_experiment
@@ -56,13 +57,21 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
-    title = f"{_title(result)}, {result.settings.horizon:g} s, seed {result.settings.seed}"
+    title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
     for row in _rows(result, numbers, printed):
         table.add_row(*row)
     return table
+
+
+def _length(result: Result) -> str:
+    """Return how long the run was, and how long it should have been where that is not the same."""
+    horizon = f"{result.settings.horizon:g} s"
+    if result.outcome is Outcome.COMPLETED:
+        return horizon
+    return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
 
 
 def _title(result: Result) -> str:

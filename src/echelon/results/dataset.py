@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from echelon.core.files import write_whole
 from echelon.engine.result import Result
 from echelon.promises.promise import promise
 from echelon.results.lyapunov import lyapunov
@@ -91,8 +92,13 @@ def _attributes(result: Result) -> dict[str, Any]:
 
 
 def save_dataset(result: Result, path: Path) -> None:
-    """Write the dataset of a run as netCDF."""
-    dataset(result).to_netcdf(path, engine="h5netcdf")
+    """Write the dataset of a run as netCDF, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    # In memory first: on a disk that is full the library under it ends the whole process.
+    write_whole(path, bytes(dataset(result).to_netcdf(None, engine="h5netcdf")))
 
 
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:

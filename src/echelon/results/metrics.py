@@ -83,7 +83,9 @@ def metrics(result: Result) -> Metrics:
 
 def formation_errors(result: Result) -> Array:
     """Return each agent's error length over time, (T, N), in the result's unit."""
-    return np.linalg.norm(result.errors[:, :, list(result.measured)], axis=2)
+    # Where a square is beyond all numbers, the length is infinite, which says enough.
+    with np.errstate(over="ignore"):
+        return np.linalg.norm(result.errors[:, :, list(result.measured)], axis=2)
 
 
 def output_errors(result: Result) -> Array | None:

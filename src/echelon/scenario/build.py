@@ -6,7 +6,7 @@ Names are looked up in the registry alone.
 import contextlib
 import importlib
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
@@ -20,11 +20,14 @@ from echelon.core.errors import (
 )
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
+from echelon.engine.initial import initial_states
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
+from echelon.engine.prepare import check_memory
+from echelon.engine.record import Stretch
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
-from echelon.engine.simulate import Progress, simulate
+from echelon.engine.simulate import Keep, Progress, simulate
 from echelon.gains.file import load_gain
 from echelon.gains.gain import Gain, Method, synthesize
 from echelon.laws.check import prepare_law
@@ -84,6 +87,8 @@ def build(scenario: Scenario) -> Built:
     faults = _Faults(scenario)
     with precision("float64"):
         model = graph = None
+        with faults.at("simulation"):
+            _settings(scenario).check()
         with faults.at("model"):
             model = _model(scenario)
             check_model(model)
@@ -137,6 +142,9 @@ def _with_laws(
         start_error=scenario.leader.start_error,
         world=World(plant, disturbance),
     )
+    with faults.at("initial"):
+        initial_states(parts, scenario.seed)
+    faults.settle()
     return Built(parts, _settings(scenario))
 
 
@@ -145,14 +153,39 @@ def _initial(scenario: Scenario) -> Any:
     return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
 
 
-def run(scenario: Scenario, progress: Progress | None = None, built: Built | None = None) -> Result:
+def check_size(scenario: Scenario, built: Built) -> None:
+    """Check that what a run of a scenario stores has room; what only looks at it stores nothing.
+
+    Raises:
+        ScenarioError: it has not.
+    """
+    faults = _Faults(scenario)
+    with faults.at("simulation"):
+        check_memory(*built)
+    faults.settle()
+
+
+def run(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    built: Built | None = None,
+    keep: Keep | None = None,
+    before: Sequence[Stretch] = (),
+) -> Result:
     """Simulate a scenario, built unless its parts are given, and note where the result comes from.
+
+    `progress`, `keep` and `before` are those of `simulate`.
 
     Raises:
         ScenarioError: a part cannot be made.
     """
     _check_scenario(scenario)
-    result = simulate(*(build(scenario) if built is None else built), progress)
+    parts = build(scenario) if built is None else built
+    return note_origin(simulate(*parts, progress, keep, before), scenario)
+
+
+def note_origin(result: Result, scenario: Scenario) -> Result:
+    """Return a result with its scenario and the versions of what computed it."""
     told = {f"version_{name}": text for name, text in versions().items()}
     return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
 

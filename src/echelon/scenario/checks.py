@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from echelon.core.errors import did_you_mean
+from echelon.core.limits import horizon_fault
 from echelon.scenario import registry
 from echelon.scenario.yaml import Document, KeyPath, are, shown
 
@@ -247,12 +248,12 @@ def _changed(data: Part) -> Iterator[Finding]:
 def _durations(data: Part) -> Iterator[Finding]:
     simulation = section(data, "simulation")
     horizon, dt = number_of(simulation.get("horizon")), number_of(simulation.get("dt"))
-    if horizon is not None and dt is not None and 0 < horizon < dt:
-        said = f"got {shown(simulation['horizon'])}, allowed is at least one step"
-        yield (
-            ("simulation", "horizon"),
-            f"{said}, and `simulation.dt` is {shown(simulation['dt'])}.",
-        )
+    if horizon is None or dt is None or not (0 < horizon < math.inf and 0 < dt < math.inf):
+        return
+    fault = horizon_fault(horizon, dt)
+    if fault is not None:
+        got = f"got {shown(simulation['horizon'])}, which {fault}"
+        yield ("simulation", "horizon"), f"{got}."
 
 
 def cross_faults(document: Document) -> Iterator[Finding]:

@@ -30,6 +30,8 @@ from echelon.scenario.yaml import (
 )
 
 _BUNDLED = Path(__file__).parent / "bundled"
+KEPT = "scenario.yaml"
+"""The name of the scenario in the folder of a run."""
 
 
 @final
@@ -54,7 +56,7 @@ class Scenario(BaseModel, **sections.STRICT):
 
     _document: Document = PrivateAttr(Document({}, {(): "scenario"}))
     _text: str = PrivateAttr("")
-    _folder: Path = PrivateAttr(Path())
+    _file: Path = PrivateAttr(Path())
 
     @property
     def text(self) -> str:
@@ -62,9 +64,19 @@ class Scenario(BaseModel, **sections.STRICT):
         return self._text
 
     @property
+    def data(self) -> dict[Any, Any]:
+        """The same as plain data; not to be changed."""
+        return self._document.data
+
+    @property
     def folder(self) -> Path:
         """The folder to which the paths in the file are relative."""
-        return self._folder
+        return self._file.parent
+
+    @property
+    def file(self) -> Path:
+        """The file that it was read from; one that is not there for a mapping."""
+        return self._file
 
     def place(self, *path: str | int) -> str:
         """Return where a key stands, as in `paper.yaml:4`; else its parent's place."""
@@ -155,7 +167,7 @@ def refuse(faults: Iterable[Fault]) -> NoReturn:
     raise error
 
 
-def _scenario(document: Document, text: str, folder: Path) -> Scenario:
+def _scenario(document: Document, text: str, file: Path) -> Scenario:
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
         said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
@@ -169,7 +181,7 @@ def _scenario(document: Document, text: str, folder: Path) -> Scenario:
     faults = [Fault(document.place(path), joined(path), said) for path, said in found.items()]
     if scenario is None or faults or document.faults:
         refuse([*document.faults, *faults])
-    scenario._document, scenario._text, scenario._folder = document, text, folder
+    scenario._document, scenario._text, scenario._file = document, text, file
     return scenario
 
 
@@ -185,9 +197,12 @@ def _found(source: str | Path) -> tuple[Path, str]:
     names = list(bundled_scenarios())
     if str(source) in names:
         return _BUNDLED / f"{source}.yaml", f"{source}.yaml"
-    if Path(source).is_file():
-        return Path(source), str(source)
-    said = f"no such file exists, allowed is a file or a bundled scenario: {listing(names)}"
+    # The folder of a run holds the scenario that was run.
+    file = Path(source) / KEPT if Path(source).is_dir() else Path(source)
+    if file.is_file():
+        return file, str(file)
+    what = f"it is a folder without `{KEPT}`" if file != Path(source) else "no such file exists"
+    said = f"{what}, allowed is a file, the folder of a run or a bundled scenario: {listing(names)}"
     close = did_you_mean(Path(source).stem, names)
     raise ScenarioError(f"got the scenario `{source}`, {said}{close}.")
 
@@ -196,7 +211,8 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     """Read and check a scenario.
 
     Args:
-        source: Path to a YAML file, or the name of a bundled scenario (which wins over a file).
+        source: Path to a YAML file, the folder of a run, or the name of a bundled scenario (which
+            wins over a file).
         overrides: Texts such as `simulation.horizon=10`, laid over the file before it is checked.
             A path among them is relative to the working folder, one in the file to the file.
 
@@ -213,7 +229,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     if overrides:
         document = settle_overrides(apply_overrides(document, overrides))
         text = dump_yaml(document.data)
-    return _scenario(document, text, file.parent)
+    return _scenario(document, text, file)
 
 
 def _plain(value: object) -> object:
@@ -236,7 +252,7 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
         ScenarioError: The scenario has faults, as in `load_scenario`.
     """
     plain = _plain(data)
-    return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder))
+    return _scenario(Document(plain, {(): "mapping"}), dump_yaml(plain), Path(folder) / "mapping")
 
 
 def json_schema() -> dict[str, Any]:

@@ -140,6 +140,8 @@ def compare(
     built: Built | None = None,
     only: tuple[str, ...] = (*LABELS, OWN),
     began: Callable[[str], None] = lambda label: None,
+    check: Callable[[], None] = lambda: None,
+    landed: Callable[[Row], None] = lambda row: None,
 ) -> Comparison:
     """Fly each method on a scenario from the same starts, under the same limits and wind.
 
@@ -148,6 +150,9 @@ def compare(
         built: its parts and settings, built unless given.
         only: the labels of the methods to fly, `own` among them for the scenario's own drive.
         began: called with each method's label before it flies.
+        check: called between chunks of steps and between flights; where it raises
+            KeyboardInterrupt, what is left is not flown, and has a row that says so.
+        landed: called with each row as soon as it is there.
 
     A method that does not apply, or whose solver is missing, is a row with its reason. The
     scenario's own drive is a row under the name of its gain, unless another row is the same.
@@ -157,22 +162,32 @@ def compare(
     """
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
-    rows = []
+    rows = list[Row]()
+
+    def fly(label: str, drive: DriveOf) -> None:
+        try:
+            check()
+            began(label)
+            rows.append(_row(label, drive, scene, settings, check))
+        except KeyboardInterrupt:
+            rows.append(Row(label, None, None, "it was not flown, since it was interrupted."))
+        landed(rows[-1])
+
     for label in (label for label in only if label != OWN):
-        began(label)
-        rows.append(_row(label, _DRIVES[label], scene, settings))
+        fly(label, _DRIVES[label])
     own = _own_label(parts, rows) if OWN in only else None
     if own is not None:
-        began(own)
-        rows.append(_row(own, lambda parts: parts.drive, scene, settings))
+        fly(own, lambda parts: parts.drive)
     return Comparison(
         scenario.name, tuple(rows), settings.horizon, settings.window, _conditions(parts)
     )
 
 
-def _row(label: str, drive: DriveOf, parts: Parts, settings: Settings) -> Row:
+def _row(
+    label: str, drive: DriveOf, parts: Parts, settings: Settings, check: Callable[[], None]
+) -> Row:
     try:
-        flight = _fly(parts.replace(drive=drive(parts)), settings)
+        flight = _fly(parts.replace(drive=drive(parts)), settings, check)
     except EchelonError as error:
         return Row(label, None, None, str(error))
     return Row(label, flight, metrics(flight.result))
@@ -192,9 +207,9 @@ def _conditions(parts: Parts) -> tuple[str, ...]:
     return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
-def _fly(parts: Parts, settings: Settings) -> Flight:
+def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> Flight:
     """Run a method, and take its time: of solving, or else of the compiled steps."""
-    watch = _Watch()
+    watch = _Watch(check)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
@@ -215,11 +230,13 @@ def _consensus(
 class _Watch:
     """Times the steps of a run, all but the first chunk, which compiles."""
 
-    def __init__(self) -> None:
+    def __init__(self, check: Callable[[], None]) -> None:
         self.ticks: list[tuple[float, int, int]] = []
+        self.check = check
 
     def __call__(self, done: int, total: int) -> None:
         self.ticks.append((time.perf_counter(), done, total))
+        self.check()
 
     @property
     def seconds(self) -> float:

@@ -1,0 +1,105 @@
+"""How large an experiment may be: reckoned here, and here alone, before anything is allocated.
+
+Each function returns why something is too large, with what would fit, or None where it is not. The
+sentence has no subject and no full stop; who asks knows what it speaks of.
+"""
+
+import math
+import os
+from pathlib import Path
+from typing import Final
+
+MOST_STEPS: Final = 2**31 - 1
+"""The number of a step is an integer of 32 bits in the compiled loop."""
+MOST_AGENTS: Final = 1_000_000
+MOST_EDGES: Final = 10_000_000
+MOST_STATES: Final = 300
+"""Of one agent: a gain takes the cube of it, and a formation of some has the square in P."""
+
+_ROUNDING: Final = 1e-6
+"""Part of a step: 2^31 steps are rounded to less, and no horizon is meant to end so near one."""
+_COPIES: Final = 6
+"""Of what is stored: as it comes, joined, as errors, in the dataset, and twice in its file."""
+_UNKNOWN: Final = 8 * 2**30
+"""Bytes of memory where the system does not say."""
+
+
+def excess_agents(agents: int) -> str | None:
+    """Return why a graph has too many agents."""
+    return _most(agents, MOST_AGENTS, "agents")
+
+
+def excess_edges(edges: float) -> str | None:
+    """Return why a graph has too many edges."""
+    return _most(edges, MOST_EDGES, "edges")
+
+
+def excess_states(states: int) -> str | None:
+    """Return why an agent has too many states."""
+    return _most(states, MOST_STATES, "states of an agent")
+
+
+def horizon_fault(horizon: float, dt: float) -> str | None:
+    """Return what is wrong with a horizon (s) for steps of dt (s), both positive and finite.
+
+    None where the horizon is a whole number of steps, and not too many of them.
+    """
+    if horizon < dt:
+        return f"must be at least one step `dt` = {dt:g} s"
+    # A quotient may be beyond all numbers.
+    steps = horizon / dt if horizon / 1e300 < dt else math.inf
+    if steps > MOST_STEPS + _ROUNDING:
+        size = math.log10(horizon) - math.log10(dt)
+        shown = f"1e{size:+.0f}" if steps == math.inf else f"{steps:.3g}"
+        return f"has {shown} steps of {dt:g} s, and must be at most {MOST_STEPS * dt:.6g} s"
+    # 0.3 / 0.1 is a little less than 3: rounding is no part of a step.
+    if abs(steps - round(steps)) <= _ROUNDING:
+        return None
+    near = " or ".join(f"{k * dt:.12g}" for k in (math.floor(steps), math.ceil(steps)))
+    return f"must be a whole number of steps `dt` = {dt:g} s, such as {near} s"
+
+
+def excess_frames(frames: int, numbers: int, every: int) -> str | None:
+    """Return why so many frames of so many numbers, one every so many steps, are too many.
+
+    Half of the machine's memory is for them.
+    """
+    asked, room = 8 * _COPIES * frames * numbers, memory() // 2
+    if asked <= room:
+        return None
+    wanted = every * -(-asked // room)
+    return (
+        f"stores {frames} frames, which need {_bytes(asked)} of memory, and {_bytes(room)} fit: "
+        f"a `store_every` of {wanted}, or a horizon {asked / room:.3g} times shorter"
+    )
+
+
+def memory() -> int:
+    """Return the bytes of memory that this process may have."""
+    found = [limit for limit in (_machine(), _group()) if limit is not None]
+    return min(found, default=_UNKNOWN)
+
+
+def _machine() -> int | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # Windows has no such call
+        return None
+
+
+def _group() -> int | None:
+    """Return the limit that a container has under Linux."""
+    try:
+        return int(Path("/sys/fs/cgroup/memory.max").read_text())
+    except (OSError, ValueError):  # no container, or `max`
+        return None
+
+
+def _most(asked: float, most: int, what: str) -> str | None:
+    # A number of a hundred digits is told by its size.
+    shown = str(asked) if isinstance(asked, int) and asked < 10**12 else f"{asked:.3g}"
+    return None if asked <= most else f"{shown} {what} are asked for, and {most} fit"
+
+
+def _bytes(count: int) -> str:
+    return f"{count / 2**30:.3g} GiB"

@@ -1,0 +1,58 @@
+"""A scenario with all the files that it names, so that its folder alone repeats the run."""
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from echelon.scenario.scenario import Scenario
+from echelon.scenario.yaml import KeyPath, dump_yaml
+
+
+def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]]:
+    """Return the YAML in which every named file lies in the folder `place` beside it.
+
+    With it come the names there, each with the file that belongs there. A scenario that names no
+    file is as it was, comments included.
+    """
+    data = copy.deepcopy(scenario.data)
+    files: dict[str, Path] = {}
+    for path, (file, rest) in list(_named(data, ())):
+        source = (scenario.folder / file).resolve()
+        name = _free(f"{place}/{source.name}", source, files)
+        files[name] = source
+        _replace(data, path, name + rest)
+    return (dump_yaml(data) if files else scenario.text), files
+
+
+def files_of(scenario: Scenario) -> list[Path]:
+    """Return the file of a scenario and all that it names."""
+    return [scenario.file, *self_contained(scenario, "")[1].values()]
+
+
+def _named(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, tuple[str, str]]]:
+    """Yield the place of every file in plain data, its name, and what stands after that."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _named(item, (*path, key))
+    elif isinstance(value, str) and path[-1] == "file":
+        yield path, (value, "")
+    elif isinstance(value, str) and path[-1] == "python":
+        file, colon, name = value.rpartition(":")
+        yield path, (file, colon + name)
+
+
+def _free(name: str, source: Path, taken: dict[str, Path]) -> str:
+    """Return a name that no other file has, such as `inputs/2/gain.json`."""
+    folder, _, base = name.rpartition("/")
+    count = 1
+    while taken.get(name, source) != source:
+        count += 1
+        name = f"{folder}/{count}/{base}"
+    return name
+
+
+def _replace(data: Any, path: KeyPath, value: str) -> None:
+    for key in path[:-1]:
+        data = data[key]
+    data[path[-1]] = value
