@@ -16,10 +16,11 @@ from scipy.optimize import linprog
 from echelon.certificates.jacobians import model_jacobian, velocity_of
 from echelon.core.errors import GainError
 from echelon.core.numerics import precision
+from echelon.enclosure.atoms import Atoms, OpenError, corner_values
 from echelon.enclosure.curves import power_points, wave_points
 from echelon.enclosure.hull import Box, slope_hull, value_hull
 from echelon.enclosure.interval import ELEMENTARY, Interval, circle, pi, point, wave
-from echelon.enclosure.polynomial import Atoms, OpenError, constant, corner_values, divides
+from echelon.enclosure.polynomial import constant, divides
 from echelon.enclosure.slopes import JumpError
 from echelon.models import Pendulum, PlanarQuadrotor, Quadrotor, UnicyclePoint, VanDerPol
 
@@ -611,7 +612,7 @@ def test_other_faults_of_a_call_are_refused(monkeypatch):
         value_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
     with pytest.raises(GainError, match="one matrix of floats"):
         value_hull(lambda x, v: x, box, NO_INPUTS)
-    monkeypatch.setattr("echelon.enclosure.polynomial.MOST_VERTICES", 100)
+    monkeypatch.setattr("echelon.enclosure.atoms.MOST_VERTICES", 100)
     with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
         value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
 

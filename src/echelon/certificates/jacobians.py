@@ -15,8 +15,8 @@ from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
+from echelon.enclosure.atoms import OpenError
 from echelon.enclosure.hull import Box, slope_columns, slope_hull
-from echelon.enclosure.polynomial import OpenError
 from echelon.enclosure.slopes import JumpError
 from echelon.models.model import ControlAffine
 

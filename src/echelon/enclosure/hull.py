@@ -17,16 +17,9 @@ import numpy as np
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import each, evaluate
 from echelon.core.types import Array
+from echelon.enclosure.atoms import Atoms, Corners, CornerValues, check_count, corner_values
 from echelon.enclosure.interval import Interval
-from echelon.enclosure.polynomial import (
-    Atoms,
-    Corners,
-    CornerValues,
-    Polynomial,
-    check_count,
-    constant,
-    corner_values,
-)
+from echelon.enclosure.polynomial import Polynomial, constant
 from echelon.enclosure.rules import polynomials
 from echelon.enclosure.slopes import number, slopes_in, variable
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import Algebra, compute, dot, each, reduction
+from echelon.enclosure.atoms import Atoms
 from echelon.enclosure.interval import ELEMENTARY, Interval
-from echelon.enclosure.polynomial import Atoms, Polynomial, constant
+from echelon.enclosure.polynomial import Polynomial, constant
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(atoms, parameters of the primitive, operands) -> result."""

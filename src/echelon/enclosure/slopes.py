@@ -19,7 +19,8 @@ import numpy as np
 from echelon.core.errors import GainError, listing
 from echelon.core.jaxpr import Algebra, dot, each, reduction
 from echelon.enclosure import rules
-from echelon.enclosure.polynomial import Atoms, Polynomial, constant, divides
+from echelon.enclosure.atoms import Atoms
+from echelon.enclosure.polynomial import Polynomial, constant, divides
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(parameters of the primitive, operands) -> result."""
