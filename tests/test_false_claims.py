@@ -229,6 +229,12 @@ def test_a_small_graph_has_edges(files, said):
     assert "`graph.edges` must be given: 4 agents cannot have so many." in said(told)
 
 
+def test_no_graph_has_more_than_a_thousand_million_agents(files, said):
+    words = "`graph.agents` must be a whole number from 2 on (to 1e9)"
+    assert words in said(edited(files["riccati"], "graph.agents", 10**9 + 1))
+    assert words not in said(edited(files["riccati"], "graph.agents", 10**9))
+
+
 def test_of_two_equal_keys_none_is_read(files, said):
     text = json.dumps(files["riccati"])
     twice = text[:-1] + ', "coupling": 1e-9}'
@@ -392,14 +398,17 @@ def test_a_slope_at_the_trim_that_is_none_is_refused(files, said, name):
 
 
 @pytest.mark.parametrize(("slower", "fine"), [(0.015, True), (0.025, False)])
-def test_samples_promise_a_rate_to_two_parts_in_a_hundred(files, said, slower, fine):
-    told = edited(files["plain"], "certificate.region.kind", "samples")
+def test_samples_promise_a_rate_to_two_parts_in_a_hundred(said, tmp_path, slower, fine):
+    told = saved(
+        agent(lambda x: -4.0 * x), LINE, ech.gains.Contraction({"x0": 1.0}, rate=1.0), tmp_path
+    )
+    told = edited(told, "certificate.region.kind", "samples")
     told = edited(told, "certificate.region.error", [[0.0]])
     told = edited(told, "certificate.region.rate", rate_at_the_trim(told))
     height = slower * rate_at_the_trim(told)
-    # Its slope is -1 at the trim and at the corners, and -1 + height between them.
+    # Its slope is -4 at the trim and at the corners, and -4 + height between them.
     turn = 2.0 * np.pi
-    model = agent(lambda x: -x + height * (x / 2 - jnp.sin(turn * x) / (2 * turn)))
+    model = agent(lambda x: -4.0 * x + height * (x / 2 - jnp.sin(turn * x) / (2 * turn)))
     wanted = [] if fine else ["pairs come together as promised", "rate at 258 states, 1/s"]
     assert said(told, model) == wanted
 

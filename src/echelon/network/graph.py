@@ -356,7 +356,14 @@ def _extremes(L: sp.csr_array) -> tuple[Array, Array]:
     # About 0 the smallest is far from the others, relative to itself; Lanczos on L finds it last.
     inverse = factor_inverse(L)
     smallest, vectors = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse)
-    largest = spla.eigsh(L, k=1, which="LA", return_eigenvectors=False)
+    # The same about a bound of the largest, the sum of two neighbours' degrees (Anderson, Morley):
+    # of a line the largest lie so close together that Lanczos on L hardly parts them.
+    rows, columns = L.nonzero()
+    degrees = L.diagonal()
+    bound = 1.000001 * float((degrees[rows] + degrees[columns]).max())
+    above = factor_inverse(sp.csr_array(bound * sp.eye_array(L.shape[0]) - L))
+    away = spla.LinearOperator(L.shape, lambda x: -above.matvec(x), dtype=np.float64)  # pyright: ignore
+    largest = spla.eigsh(L, k=1, sigma=bound, OPinv=away, return_eigenvectors=False)
     return np.concatenate([smallest, largest]), vectors[:, 0]
 
 
