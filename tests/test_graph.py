@@ -333,3 +333,10 @@ def test_the_bound_of_a_long_line_is_that_of_its_closed_form():
     exact = 2.0 - 2.0 * np.cos(np.pi / (2 * (n - 1) + 1))
     spectrum = Graph.path(n).spectrum()
     assert exact * (1 - 1e-8) < spectrum.proved <= exact * (1 + 1e-10)
+
+
+def test_both_ends_of_a_line_of_20000_are_those_of_its_closed_form():
+    n = 20_000
+    spectrum = Graph.path(n + 1).spectrum()
+    for k, found in ((1, spectrum.low), (n, spectrum.high)):
+        assert found == pytest.approx(4 * np.sin((2 * k - 1) * np.pi / (4 * n + 2)) ** 2, rel=1e-7)

@@ -358,10 +358,9 @@ def _extremes(L: sp.csr_array) -> tuple[Array, Array]:
     smallest, vectors = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse)
     # The same about a bound of the largest, the sum of two neighbours' degrees (Anderson, Morley):
     # of a line the largest lie so close together that Lanczos on L hardly parts them.
-    rows, columns = L.nonzero()
-    degrees = L.diagonal()
-    bound = 1.000001 * float((degrees[rows] + degrees[columns]).max())
-    above = factor_inverse(sp.csr_array(bound * sp.eye_array(L.shape[0]) - L))
+    entries, degrees = sp.coo_array(L), L.diagonal()
+    bound = 1.000001 * float((degrees[entries.row] + degrees[entries.col]).max())
+    above = factor_inverse(sp.csr_array(bound * sp.eye_array(len(degrees)) - L))
     away = spla.LinearOperator(L.shape, lambda x: -above.matvec(x), dtype=np.float64)  # pyright: ignore
     largest = spla.eigsh(L, k=1, sigma=bound, OPinv=away, return_eigenvectors=False)
     return np.concatenate([smallest, largest]), vectors[:, 0]
