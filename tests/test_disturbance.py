@@ -29,7 +29,8 @@ from echelon.reports.run import report
 from echelon.results.dataset import dataset, summary
 from echelon.results.lyapunov import lyapunov
 from echelon.scenario import registry
-from echelon.scenario.build import build, resolve
+from echelon.scenario.build import build
+from echelon.scenario.part import resolve
 from echelon.scenario.scenario import load_scenario, scenario_from_mapping
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import differences, vary_parameters

@@ -121,7 +121,7 @@ def combinations():
                 yield pytest.param(scenario, method, feedforward, marks=marks)
 
 
-@pytest.mark.parametrize(("scenario", "method", "feedforward"), combinations())
+@pytest.mark.parametrize(("scenario", "method", "feedforward"), list(combinations()))
 def test_everyone_says_the_same_of_everything(scenario, method, feedforward, tmp_path):
     agree(scenario, method, feedforward, tmp_path)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import echelon.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
 from echelon.scenario import registry
-from echelon.scenario.build import resolve
+from echelon.scenario.part import resolve
 from echelon.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.scenario.scenario import (
     Fault,

@@ -18,6 +18,8 @@ _EFFORT = 1200
 _FEW = 150
 """Up to so many followers the vector is sharpened, in `_EFFORT` / n rounds: seconds at most."""
 _DIGITS = 60
+_DECADES = 1e40
+"""Of weights that lie farther apart so many digits tell nothing."""
 _SHARP = 1.0 - 1e-9
 
 
@@ -38,7 +40,7 @@ class Grounded(NamedTuple):
 
 
 def least_eigenvalue_bound(matrix: Grounded, vector: Array, near: float) -> float:
-    """Return a float that the smallest eigenvalue is not below.
+    """Return a float that the smallest eigenvalue is not below; 0 where no better is found.
 
     Args:
         matrix: whose eigenvalue it is.
@@ -48,6 +50,9 @@ def least_eigenvalue_bound(matrix: Grounded, vector: Array, near: float) -> floa
     """
     tried = [Fraction(max(abs(x), 1e-300)) for x in vector.tolist()]
     best, above = _quotients(matrix, tried)
+    weights = np.concatenate([matrix.weights, matrix.held[:, 1]])
+    if weights.max() > _DECADES * weights.min():
+        return 0.0
     for _ in range(_EFFORT // matrix.size if matrix.size <= _FEW else 0):
         if best >= _SHARP * min(above, near) > 0:
             break

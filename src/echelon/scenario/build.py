@@ -4,10 +4,7 @@ Names are looked up in the registry alone.
 """
 
 import contextlib
-import importlib
-import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 from echelon.core.errors import (
@@ -15,8 +12,6 @@ from echelon.core.errors import (
     MissingExtraError,
     ModelError,
     ScenarioError,
-    did_you_mean,
-    listing,
 )
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
@@ -38,9 +33,10 @@ from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references.reference import Reference, check_reference
 from echelon.scenario import registry
-from echelon.scenario.own import own_class, own_code
+from echelon.scenario.own import own_code
+from echelon.scenario.part import Part, accepted, known, law_part, offered, part_of
 from echelon.scenario.scenario import Fault, Scenario, refuse
-from echelon.scenario.sections import GainSpec, OwnClass
+from echelon.scenario.sections import GainSpec
 from echelon.scenario.yaml import joined
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import check_plant, vary_parameters
@@ -193,102 +189,22 @@ def note_origin(result: Result, scenario: Scenario) -> Result:
 # ---- parts --------------------------------------------------------------------------------------
 
 
-def resolve(entry: registry.Entry) -> Any:
-    """Return what a registry entry names."""
-    module, _, name = entry.target.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
-def _accepted(make: Callable[..., Any]) -> list[str]:
-    """Return the names of the parameters that a class or function takes."""
-    return list(inspect.signature(make).parameters)
-
-
-def _offered(make: Callable[..., Any], offers: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the offers that `make` takes."""
-    return {name: offers[name] for name in _accepted(make) if name in offers}
-
-
-def _checked(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the given parameters, after checking that `make` takes each and has all it needs."""
-    allowed = inspect.signature(make).parameters
-    _known(make, what, given)
-    for name, parameter in allowed.items():
-        if parameter.default is inspect.Parameter.empty and name not in given:
-            raise ScenarioError(f"`{what}` needs the parameter `{name}`, which is missing.")
-    return dict(given)
-
-
-def _known(make: Callable[..., Any], what: str, given: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the given parameters, after checking that `make` takes each."""
-    allowed = inspect.signature(make).parameters
-    for name in given:
-        if name not in allowed:
-            verb = "is" if len(allowed) == 1 else "are"
-            taken = f"allowed {verb} {listing(allowed)}" if allowed else "it takes none"
-            raise ScenarioError(
-                f"got the parameter `{name}` of `{what}`, {taken}{did_you_mean(name, allowed)}."
-            )
-    return given
-
-
-class _Part(NamedTuple):
-    """A class that a scenario names, what messages call it, and its own keys there."""
-
-    cls: Callable[..., Any]
-    what: str
-    given: Mapping[str, Any]
-    own: bool
-
-    def made(self, offers: Mapping[str, Any] = MappingProxyType({})) -> Any:
-        """Return an instance made of the keys and of those offers that it takes.
-
-        Raises:
-            ScenarioError: a key is unknown or missing, or the class refuses a value.
-        """
-        given = _checked(self.cls, self.what, {**_offered(self.cls, offers), **self.given})
-        with own_code(f"`{self.what}` cannot be made with these parameters"):
-            return self.cls(**given)
-
-
-def _part(
-    scenario: Scenario,
-    kind: type,
-    table: Mapping[str, registry.Entry],
-    name: str | None,
-    python: str | None,
-    given: Mapping[str, Any] = MappingProxyType({}),
-) -> _Part:
-    """Return what a scenario names: a member of a table, or a class in a file of the user's."""
-    if python is not None:
-        return _Part(own_class(scenario.folder, python, kind), python, given, own=True)
-    return _Part(resolve(table[str(name)]), str(name), given, own=False)
-
-
-def _law_part(
-    scenario: Scenario, table: Mapping[str, registry.Entry], law: str | OwnClass
-) -> _Part:
-    if isinstance(law, OwnClass):
-        return _part(scenario, Law, table, None, law.python, law.parameters)
-    return _part(scenario, Law, table, law, None)
-
-
 def _model(scenario: Scenario) -> ControlAffine:
     spec = scenario.model
-    part = _part(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
+    part = part_of(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
     extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
-    if extra and "allow_unphysical" not in _accepted(part.cls):
+    if extra and "allow_unphysical" not in accepted(part.cls):
         raise ModelError(
             f"`allow_unphysical` has no meaning for `{part.what}`, which has no such parameter."
         )
     given = spec.parameters or {}
     given = {"set": given} if isinstance(given, str) else dict(given)
-    if "set" in given and "set" not in _accepted(part.cls):
+    if "set" in given and "set" not in accepted(part.cls):
         return _named_set(part, given.pop("set"), {**given, **extra})
     return part._replace(given={**given, **extra}).made()
 
 
-def _named_set(part: _Part, name: object, changes: Mapping[str, Any]) -> ControlAffine:
+def _named_set(part: Part, name: object, changes: Mapping[str, Any]) -> ControlAffine:
     """Return a model with a named set of parameters, some of them changed."""
     named = getattr(part.cls, "named", None)
     if named is None:
@@ -296,7 +212,7 @@ def _named_set(part: _Part, name: object, changes: Mapping[str, Any]) -> Control
             f"`{part.what}` has no named parameter sets, and got `{name}`; give a mapping."
         )
     with own_code(f"`{part.what}` cannot be made with these parameters"):
-        return named(name, **_known(part.cls, part.what, changes))
+        return named(name, **known(part.cls, part.what, changes))
 
 
 def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
@@ -325,14 +241,16 @@ def _graph(scenario: Scenario) -> Graph:
         return Graph.from_edges(spec.edges, spec.leaders, spec.agents)
     make = getattr(Graph, str(spec.name))
     given = {key: value for key, value in spec.model_dump().items() if value is not None}
-    return make(**_offered(make, given))
+    return make(**offered(make, given))
 
 
 def _reference(scenario: Scenario) -> Any:
     spec = scenario.reference
     if spec is None:
         return None
-    part = _part(scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters)
+    part = part_of(
+        scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
+    )
     reference = part.made()
     check_reference(reference)
     return reference
@@ -343,13 +261,13 @@ def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Format
     if spec.name is None:
         return Formation.from_offsets(model, graph, spec.offsets or {})
     make = getattr(Formation, spec.name)
-    return make(model, graph, **_offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
+    return make(model, graph, **offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
 
 
 def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:
     if spec.file is not None:
         return load_gain(scenario.folder / spec.file, model, graph)
-    part = _part(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
+    part = part_of(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
     method = part.made()
     with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
         return synthesize(model, graph, method)
@@ -359,9 +277,9 @@ def _follower(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
 ) -> Law | None:
     spec = scenario.follower
-    part = _law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
+    part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
     offers: dict[str, Any] = {"feedforward": spec.feedforward, "trim": spec.trim}
-    if "gain" in _accepted(part.cls):
+    if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)
         if "gain" not in offers:
@@ -369,7 +287,7 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
-def _law(part: _Part, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
+def _law(part: Part, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
     """Return the law of a scenario, completed and checked."""
     law = part.made(offers)
     with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
@@ -385,14 +303,14 @@ def _leader(
     reaction: Gain | None,
 ) -> Law | None:
     spec = scenario.leader
-    part = _law_part(scenario, registry.LEADER_LAWS, spec.law)
-    if spec.reacts and "reaction" not in _accepted(part.cls):
+    part = law_part(scenario, registry.LEADER_LAWS, spec.law)
+    if spec.reacts and "reaction" not in accepted(part.cls):
         raise ScenarioError(
             f"`reacts` is true, and the law `{part.what}` cannot be told to react; use `tracking`."
         )
     if spec.reacts and reaction is None:
         raise ScenarioError("`reacts` needs a follower law with a gain, and this one has none.")
-    if reference is not None and "reference" not in _accepted(part.cls):
+    if reference is not None and "reference" not in accepted(part.cls):
         raise ScenarioError(f"there is a `reference`, and the law `{part.what}` takes none.")
     offers: dict[str, Any] = {
         "reference": reference,

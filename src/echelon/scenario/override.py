@@ -40,7 +40,8 @@ def _rivals(path: KeyPath, part: Any) -> list[Any]:
 
 
 def _make_absolute(data: Any, path: KeyPath) -> None:
-    for place, name, rest in named_files(_at(data, path), path):
+    found = _at(data, path)
+    for place, name, rest in named_files(found, path):
         _at(data, place[:-1])[place[-1]] = f"{Path(name).resolve()}{rest}"
 
 
@@ -58,5 +59,9 @@ def named_files(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, str, str]]
 
 def _at(data: Any, path: KeyPath) -> Any:
     for key in path:
-        data = data[key]
+        try:
+            data = data[key]
+        except (LookupError, TypeError):
+            # A path through a number or a text leads nowhere; the checks of the file say so.
+            return None
     return data

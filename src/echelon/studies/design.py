@@ -25,7 +25,8 @@ from echelon.models.model import ControlAffine
 from echelon.promises.promise import Promise, promise
 from echelon.promises.statement import Hypothesis
 from echelon.scenario import registry
-from echelon.scenario.build import Built, build, resolve
+from echelon.scenario.build import Built, build
+from echelon.scenario.part import resolve
 from echelon.scenario.scenario import Scenario
 from echelon.scenario.sections import GainSpec
 from echelon.scenario.yaml import Fault
