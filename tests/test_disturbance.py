@@ -219,6 +219,7 @@ def test_noise_enters_by_the_normalized_input_behind_the_limits():
     assert not run.states[..., 5].any(), "none on the torque"
 
 
+@pytest.mark.slow
 def test_the_integrator_keeps_its_order_in_wind():
     wind = Disturbance(constant={"rate": 1.0}, rms={"rate": 3.0}, hold=0.2)
 
@@ -394,6 +395,7 @@ def imperfect(**more):
     )
 
 
+@pytest.mark.slow
 def test_a_scenario_says_plant_and_disturbance_and_every_report_repeats_them():
     from echelon.scenario.build import run
 

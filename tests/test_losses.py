@@ -141,7 +141,11 @@ def wandering(**settings):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"store_every": 7}, {"store_every": 3000}, {"precision": "float32"}],
+    [
+        {"store_every": 7},
+        pytest.param({"store_every": 3000}, marks=pytest.mark.slow),
+        pytest.param({"precision": "float32"}, marks=pytest.mark.slow),
+    ],
     ids=["frames", "rare frames", "float32"],
 )
 def test_a_run_that_goes_on_ends_with_the_bits_of_one_that_never_ended(settings, monkeypatch):
@@ -288,6 +292,7 @@ def test_a_full_disk_shows_the_report_and_keeps_what_was_written(here, echelon, 
     assert_same(here / "o", here / "whole")
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_while_a_run_lasts_ends_it_and_it_goes_on_later(
     here, echelon, monkeypatch
 ):

@@ -125,6 +125,7 @@ def test_agents_renamed_fly_the_same():
     assert other.states[:, order] == pytest.approx(one.states, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_each_plans_after_those_before_it_with_the_plans_they_have_just_made(monkeypatch):
     asked, given = [], Horizon.solve
 

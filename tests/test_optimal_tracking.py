@@ -44,6 +44,7 @@ def test_it_errs_less_than_tracking_and_still_less_without_limits():
     assert rmse(free) < rmse(best) < 0.9 * rmse(usual)
 
 
+@pytest.mark.slow
 def test_undisturbed_it_flies_its_plan():
     result = led(LAW)
     assert result.states[:, 0] == pytest.approx(LAW.states, abs=1e-5)

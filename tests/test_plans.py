@@ -231,6 +231,7 @@ def test_followers_arrive_at_their_offsets_or_at_their_distances():
 # ---- the replay ----
 
 
+@pytest.mark.slow
 def test_the_replay_of_plans_is_the_plans():
     states = starts(a1=(-0.193, 0, 0))
     made = planned(states, limits=False)

@@ -401,6 +401,7 @@ def test_check_exits_by_what_is_promised(echelon):
     assert code == 1 and json.loads(out)["promise"]["promised"] is False
 
 
+@pytest.mark.slow
 def test_design_recommends_and_its_gain_runs(echelon):
     code, out, _ = echelon("design", "paper", "--out", "gain.json", "--json")
     told = json.loads(out)

@@ -15,6 +15,7 @@ def literal():
     return run("paper-literal")
 
 
+@pytest.mark.slow
 def test_the_table_stands_beside_the_papers():
     text = ech.report(run("paper", "simulation.horizon=6", "report.steady_window=1"))
     for printed in ("0.186", "9.289e-17", "7.692e-17", "5.207e-17", "0.0302", "0.018"):

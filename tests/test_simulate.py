@@ -115,6 +115,7 @@ def test_rk4_agrees_with_dop853_on_a_formation_of_quadrotors(flight):
     assert not run.saturated.any()
 
 
+@pytest.mark.slow
 def test_renaming_agents_permutes_the_run(flight):
     graph, _, start, fly = flight
     order = [2, 0, 3, 1]
