@@ -246,12 +246,21 @@ def test_a_centimetre_is_marked_where_errors_are_lengths(runs):
     assert ax.get_ylabel() == "formation error"
 
 
-def test_errors_of_zero_are_drawn_at_the_floor(runs):
+def test_errors_of_zero_leave_gaps_and_stretch_no_axis(runs):
     result = runs("unicycle")
-    states = np.broadcast_to(result.formation.offsets, result.states.shape)
-    lines = labelled(figures(dataclasses.replace(result, states=states))["formation_error"])
+    goals = np.broadcast_to(result.formation.offsets, result.states.shape)
+    (ax,), lines = drawn(dataclasses.replace(result, states=goals), "formation_error")
     for agent in result.graph.followers:
-        assert set(lines[f"follower {agent}"][:, 1]) == {1e-17}
+        assert np.isnan(lines[f"follower {agent} (always 0)"][:, 1]).all()
+    assert ax.get_ylim()[0] >= 1e-3
+    # At their goals from the middle on: the line ends there, and the axis at what it shows.
+    half = result.states.copy()
+    half[len(half) // 2 :] = goals[len(half) // 2 :]
+    (ax,), lines = drawn(dataclasses.replace(result, states=half), "formation_error")
+    for agent in result.graph.followers:
+        shown = lines[f"follower {agent}"][:, 1]
+        assert np.isnan(shown[len(half) // 2 :]).all() and (shown[: len(half) // 2] > 0).all()
+    assert ax.get_ylim()[0] >= 1e-6
 
 
 def test_v_and_its_derivative_are_drawn_as_given(runs):

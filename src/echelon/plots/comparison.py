@@ -87,7 +87,7 @@ def _count_alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
 
 
 def _over_time(flown: _Flown, lines: dict[int, Array], text: str) -> "Figure":
-    """Return errors on a logarithmic axis, no lower than the rounding of a metre."""
+    """Return errors on a logarithmic axis, with gaps where they are 0."""
     stands = _count_alike(flown, lines)
     # A run that ended early has fewer frames, and the axis is that of the others.
     longest = max((_result(row) for _, row in flown), key=lambda result: result.times[-1])
@@ -96,15 +96,15 @@ def _over_time(flown: _Flown, lines: dict[int, Array], text: str) -> "Figure":
     for k, row in flown:
         if k not in stands:
             continue
-        # Agents that agree to the bit have an error of zero, which a logarithm cannot show.
-        values = np.maximum(lines[k], draw.FLOOR)
+        values = draw.above_zero(lines[k])
         keep = draw.thin(len(values))
         name = row.label if stands[k] == 1 else f"{row.label}, and {stands[k] - 1} alike"
+        name = draw.say_zero(name, values)
         draw.plot(ax, _result(row).times[keep], values[keep], label=name, **_pen(k))
         shown.append(values)
     ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(text)
-    draw.logarithmic(ax, *shown)
+    draw.logarithmic(ax, *shown, np.array([SETTLED]))
     return draw.finish(figure)
 
 

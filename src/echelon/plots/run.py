@@ -26,8 +26,8 @@ def figures(result: Result, lyapunov: Sequence[Array] | None = None) -> "dict[st
     `leader_3d` is the first leader with its reference: in space or in the plane where the model has
     a position, else in the phase plane or over time. `trajectories` are all agents, with the graph
     drawn at a few times. `tracking_error` is each output of the leader minus the reference's, and
-    exists with a reference. `formation_error` is each follower's distance from its goal, drawn no
-    lower than 1e-17. `lyapunov` is V with its derivative, and exists where V is given.
+    exists with a reference. `formation_error` is each follower's distance from its goal, with
+    gaps where it is 0. `lyapunov` is V with its derivative, and exists where V is given.
 
     A run without a stored frame has no figures. Where agents run a million times farther off
     than their start and the reference reach, that is left out, and the figure says so.
@@ -221,18 +221,20 @@ def _tracking_error(result: Result) -> "Figure | None":
 def _formation_error(result: Result) -> "Figure":
     """Return each follower's distance from its goal, on a logarithmic axis."""
     followers, many = list(result.graph.followers), result.graph.agents > draw.NAMED
-    # Agents that agree to the bit have an error of zero, which a logarithm cannot show.
-    errors = np.maximum(formation_errors(result)[:, followers], draw.FLOOR)
+    errors = formation_errors(result)[:, followers]
     keep = draw.thin(len(errors), len(followers))
     times, errors, metric = result.times[keep], errors[keep], result.unit == "m"
     figure, (ax,) = _panels(result, 1, 3.2)
-    for agent, line in zip(followers, errors.T, strict=True):
-        draw.plot(ax, times, line, label=_name(result, agent, short=True), **_pen(result, agent))
+    for agent, line in zip(followers, draw.above_zero(errors).T, strict=True):
+        name = draw.say_zero(_name(result, agent, short=True), line)
+        draw.plot(ax, times, line, label=name, **_pen(result, agent))
     # Of a swarm no line can be followed; the worst and the median can.
     if many:
         for name, of, dash in (("worst", np.max, "-"), ("median", np.median, "--")):
             look = {"color": draw.LEADER, "linestyle": dash}
-            draw.plot(ax, times, of(errors, axis=1), label=f"{name} follower", **look)
+            draw.plot(
+                ax, times, draw.above_zero(of(errors, axis=1)), label=f"{name} follower", **look
+            )
     if metric:
         ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(draw.label("formation error", "m" if metric else ""))
@@ -242,13 +244,12 @@ def _formation_error(result: Result) -> "Figure":
 
 def _lyapunov(result: Result, value: Array, rate: Array) -> "Figure":
     """Return V, and how fast it falls or rises, on logarithmic axes."""
-    # V is a square, and so is its floor.
-    keep, floor = draw.thin(len(value)), draw.FLOOR**2
-    times, value, rate = result.times[keep], np.maximum(value[keep], floor), rate[keep]
-    # What is smaller is the rounding of V, which has both signs.
-    moves = np.abs(rate) > floor
+    keep = draw.thin(len(value))
+    times, value, rate = result.times[keep], draw.above_zero(value[keep]), rate[keep]
+    # V is a square, and what is smaller than that of a floor is its rounding, of both signs.
+    moves = np.abs(rate) > draw.FLOOR**2
     figure, panels = _panels(result, 2 if moves.any() else 1, 2.0)
-    draw.plot(panels[0], times, value, label="V", color=draw.LEADER)
+    draw.plot(panels[0], times, value, label=draw.say_zero("V", value), color=draw.LEADER)
     panels[0].set_ylabel("V")
     draw.logarithmic(panels[0], value)
     for ax in panels[1:]:

@@ -20,7 +20,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 LEADER, REFERENCE, EDGE = "black", "0.7", "0.3"
 
 FLOOR = 1e-17
-"""The least error that a logarithmic axis shows: below the rounding of a metre in float64."""
+"""Below the rounding of a metre in float64."""
 
 NAMED = 10
 """With more agents than this, followers look alike and the legend names none of them."""
@@ -227,6 +227,20 @@ def _box_on_paper(ax: Any) -> tuple[Array, Array]:
     pixels = ax.transData.transform(np.column_stack([x, y]) / scale[:, None]) - ax.bbox.p0
     inches = pixels / ax.figure.dpi
     return inches.min(axis=0), inches.max(axis=0)
+
+
+def above_zero(values: Array) -> Array:
+    """Return values with gaps where they are 0, as of agents that agree to the bit.
+
+    A logarithm cannot show a 0, and a number in its place would stretch the axis to nothing.
+    """
+    return np.where(values > 0.0, values, np.nan)
+
+
+def say_zero(name: str | None, values: Array) -> str | None:
+    """Return the name of a line, which says that there is nothing to see of one that is all 0."""
+    gone = name is not None and len(values) and np.isnan(values).all()
+    return f"{name} (always 0)" if gone else name
 
 
 def logarithmic(ax: Any, *values: Array) -> None:
