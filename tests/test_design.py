@@ -278,11 +278,11 @@ def test_both_pictures_are_written_and_both_radii_are_said(echelon, tmp_path):
     said = out.splitlines()[-1]
     gain = ech.synthesize(ech.models.Pendulum(), PATH, ech.gains.RobustLQR({"angle": 0.5}))
     assert f"certified {gain.certificate.region.radius:.3g}; observed" in said
-    code, _, err = echelon(*call, "--slice", "angle,rat")
+    code, _, err = echelon(*call, "--force", "--slice", "angle,rat")
     assert code == 2 and "did you mean `rate`?" in err and err.count("\n") == 1
     (tmp_path / "file").write_text("")
     code, _, err = echelon(*call[:-1], "file")
-    assert code == 2 and "cannot be written" in err and err.count("\n") == 1
+    assert code == 2 and "is a file, and the figures need a folder" in err and err.count("\n") == 1
 
 
 def test_where_nothing_is_certified_the_picture_says_so(tmp_path):
