@@ -496,6 +496,16 @@ def test_nothing_linear_is_promised_where_the_drift_bends_at_the_trim():
     assert "the rate of `x` bends or jumps with `x` at the trim" in promise.sentence()
 
 
+def test_slopes_of_both_sides_that_contract_are_promised_without_a_linearization():
+    model = of_one_state(lambda x: -2.0 * x + jnp.maximum(x, 0.0))
+    gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.5))
+    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
+    # The slower side, -1, and c times the smallest eigenvalue of the graph.
+    assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-6)
+    assert promise.domain == "x in [-0.001, 0.001]"
+
+
 def test_a_hull_of_both_sides_is_promised_across_a_bend():
     model = of_one_state(lambda x: -2.0 * x + jnp.maximum(x, 0.0))
     gain = ech.synthesize(model, PATH, ech.gains.Contraction({"x": 2.0}, coupling=1.0))

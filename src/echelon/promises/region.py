@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from echelon.certificates.certificate import RegionCertificate
+from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import jacobians
 from echelon.certificates.lmi import falls
 from echelon.certificates.region import contracting_region, drift_region, pairs_on
@@ -17,11 +18,13 @@ from echelon.core.errors import GainError
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
-from echelon.models.linearization import linearize
+from echelon.models.linearization import at_trim, linearize
 from echelon.promises.leaders import Leaders
 from echelon.promises.statement import Hypothesis, Statement
 
 _NAME = Hypothesis.REGION
+_NEAR = 1e-3
+"""How far about a trim the slopes of its sides are looked at, in units of each state."""
 
 
 class Region(NamedTuple):
@@ -41,6 +44,8 @@ class Region(NamedTuple):
 def region_of(parts: Parts, leaders: Leaders) -> Region:
     """Return what is promised on the domain that the gain of prepared parts was made for."""
     gain = parts.drive.gain
+    if gain is not None and gain.certificate.region is None and at_trim(parts.model).bends.any():
+        return _beside_bends(parts, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
         line = Statement(_NAME, Verdict.NOT_NEEDED, Kind.PROOF, shown="none", text=text)
@@ -59,6 +64,30 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
     return Region(found, found, _line(parts, found))
 
 
+def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
+    """Return what a metric promises about a trim at which the model bends.
+
+    It has no linearization there, but a hull holds the slopes of all its sides nearby.
+    """
+    text = "the slopes beside the trim, where the model bends, do not all contract in P"
+    none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, shown="none", text=text)
+    near = Domain.about(parts.model, dict.fromkeys(parts.model.state_names, _NEAR))
+    try:
+        found = _contraction(parts, gain, near, exact=False)
+    except GainError:
+        found = None
+    if found is None or found.kind is Kind.SAMPLES or _withheld(parts, leaders, gain, found)[0]:
+        return Region(None, None, none)
+    return Region(found, None, _line(parts, found))
+
+
+def _contraction(parts: Parts, gain: Gain, domain: Domain, exact: bool) -> RegionCertificate | None:
+    """Return what a gain's metric contracts on a domain at its coupling; None for nothing."""
+    pairs, B = pairs_on(parts.model, domain, gain.R), linearize(parts.model).B
+    spectrum = parts.graph.spectrum()
+    return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
+
+
 def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
     """Return what the metric promises on the claim's domain behind a relayed input."""
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
@@ -67,8 +96,7 @@ def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCerti
         if not falls(gain.P, found.matrices):
             return None
         return drift_region(model, claim.domain, found, gain.P, gain.coupling, spectrum)
-    pairs, B = pairs_on(model, claim.domain, gain.R), linearize(model).B
-    return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
+    return _contraction(parts, gain, claim.domain, exact)
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
