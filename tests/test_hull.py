@@ -384,6 +384,67 @@ def test_a_choice_that_the_box_does_not_decide_holds_both():
     assert scalar_hull(lambda x: 1.0 * (x > 0), -1.0, 1.0) == (0.0, 1.0)
 
 
+CONDITIONS = [lambda x: x > 0.0, lambda x: x > 5.0, lambda x: x > 1.5]
+"""On [1, 2]: true, false, and not decided."""
+
+
+@pytest.mark.parametrize("one", CONDITIONS)
+@pytest.mark.parametrize("other", CONDITIONS)
+@pytest.mark.parametrize("join", [operator.and_, operator.or_, operator.xor])
+def test_conditions_that_are_joined_choose_what_is_chosen_somewhere(one, other, join):
+    def chosen(x):
+        first, second = one(x), other(x)
+        # Exclusive or, of the other two.
+        same = join(first, second) if join is not operator.xor else (first | second) & ~(
+            first & second
+        )
+        return jnp.where(same, 100.0, x)
+
+    reached = np.asarray(jax.vmap(chosen)(jnp.linspace(1.0, 2.0, 101)))
+    lower, upper = scalar_hull(chosen, 1.0, 2.0)
+    assert lower <= reached.min() and upper >= reached.max()
+    if join is not operator.xor:
+        assert (upper == 100.0) is (reached.max() == 100.0)
+        assert (lower == 100.0) is (reached.min() == 100.0)
+
+
+def test_a_condition_is_joined_entry_by_entry():
+    def chosen(x):
+        # The first is decided and the second is not, so that neither is a constant of the trace.
+        low, high = jnp.stack([x > 0.0, x > 1.5]), jnp.stack([x > 5.0, x > 1.5])
+        return jnp.where(low & high, 100.0, x)[0]
+
+    assert scalar_hull(chosen, 1.0, 2.0) == (1.0, 2.0)
+
+
+def test_a_number_that_is_none_of_the_state_is_cut_as_it_is():
+    assert scalar_hull(lambda x: x * (x - x + 2.7).astype(int), 1.0, 2.0) == (2.0, 4.0)
+    assert scalar_hull(lambda x: x * (x - x - 2.7).astype(int), 1.0, 2.0) == (-4.0, -2.0)
+    assert scalar_hull(lambda x: x * (x - x + 2.7).astype(bool), 1.0, 2.0) == (1.0, 2.0)
+
+
+def test_a_choice_between_what_is_alike_is_no_choice():
+    def both(x):
+        return jnp.where(jnp.where(x > 1.5, x > 0.0, x > -1.0), x, 100.0)
+
+    assert scalar_hull(both, 1.0, 2.0) == (1.0, 2.0)
+    assert scalar_hull(lambda x: jnp.where(x > 1.5, x + 1.0, 1.0 + x), 1.0, 2.0) == (2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("function", "low", "high"),
+    [
+        (lambda x: jnp.abs(x) + x, -1.0, 0.0),
+        (lambda x: jnp.abs(x) - x, 0.0, 1.0),
+        (lambda x: jnp.maximum(x, 2.0 * x) - x, -1.0, 0.0),
+        (lambda x: jnp.maximum(x, 2.0 * x) - 2.0 * x, 0.0, 1.0),
+        (lambda x: jnp.minimum(x, 2.0 * x) - 2.0 * x, -1.0, 0.0),
+    ],
+)
+def test_a_side_is_known_up_to_its_edge(function, low, high):
+    assert scalar_hull(function, low, high) == (0.0, 0.0)
+
+
 @pytest.mark.parametrize("name", ["lt", "le", "gt", "ge", "eq", "ne"])
 @pytest.mark.parametrize("other", [-2.0, -1.0, 0.0, 1.0, 2.0])
 def test_a_comparison_is_decided_exactly_where_it_can_be(name, other):
