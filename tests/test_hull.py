@@ -395,8 +395,10 @@ def test_conditions_that_are_joined_choose_what_is_chosen_somewhere(one, other, 
     def chosen(x):
         first, second = one(x), other(x)
         # Exclusive or, of the other two.
-        same = join(first, second) if join is not operator.xor else (first | second) & ~(
-            first & second
+        same = (
+            join(first, second)
+            if join is not operator.xor
+            else (first | second) & ~(first & second)
         )
         return jnp.where(same, 100.0, x)
 

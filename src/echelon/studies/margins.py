@@ -20,12 +20,21 @@ from echelon.promises.statement import Hypothesis, Statement
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 
 
+_STIFF = 1e10
+"""Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
+
+
 def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
     if promise.hypotheses[Hypothesis.DECAYS].fails:
         text = "there is nothing to lose"
         yield Statement("margins", Verdict.NOT_NEEDED, _KIND, text=text)
+        return
+    stiffness = margins.stiffness(loop.closed)
+    if stiffness > _STIFF:
+        text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
+        yield Statement("margins", Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
         return
     low, high = margins.gain_margin(loop.closed)
     shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
