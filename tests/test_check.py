@@ -237,7 +237,7 @@ def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, u
     assert not found.hypotheses[Hypothesis.CLAIMS].fails
 
 
-@pytest.mark.parametrize("coupling", [1e15, 1e12])
+@pytest.mark.parametrize("coupling", [1e13, 1e11])
 def test_margins_are_not_asked_for_where_rounding_hides_the_slowest_mode(coupling):
     strong = {"gain": {"method": "riccati", "coupling": coupling}}
     lines, _ = checked(strong, model={"name": "double-integrator"})

@@ -739,10 +739,27 @@ def test_each_function_has_the_derivative_that_jax_knows(name):
         (lambda x: jnp.minimum(x, 2.0), (1.0, 1.0)),
         (lambda x: jnp.sign(x + 2.0) * x, (1.0, 1.0)),
         (lambda x: -x + 5 * jax.lax.stop_gradient(x), (4.0, 4.0)),
+        (lambda x: jnp.where((x > 2.0) | (x < -0.5), x + 0.5, 0.0), (0.0, 1.0)),
+        # Up to the ends of [-1, 1], one side alone.
+        (lambda x: jnp.abs(x - 1.0), (-1.0, -1.0)),
+        (lambda x: jnp.abs(x - 2.0), (-1.0, -1.0)),
+        (lambda x: jnp.abs(x + 1.0), (1.0, 1.0)),
+        (lambda x: jnp.maximum(x - 1.0, 0.0), (0.0, 0.0)),
+        (lambda x: jnp.maximum(x + 1.0, 0.0), (1.0, 1.0)),
+        (lambda x: jnp.where(x >= -1.0, 2 * x, 9.0), (2.0, 2.0)),
+        (lambda x: jnp.where(x <= 1.0, 2 * x, 9.0), (2.0, 2.0)),
+        (lambda x: jnp.where(x < -1.0, 9.0, 2 * x), (2.0, 2.0)),
+        (lambda x: jnp.where(x > 1.0, 9.0, 2 * x), (2.0, 2.0)),
     ],
 )
 def test_what_bends_has_the_slopes_of_both_sides(function, wanted):
     np.testing.assert_allclose(slopes(function), wanted, atol=1e-15)
+
+
+def test_two_borders_of_one_condition_leave_both_slopes():
+    low, high = slopes(lambda x: jnp.where((x > 0.5) | (x < -0.5), x * x, 0.25))
+    # Each border is an unknown of its own, and the hull is of their product.
+    assert -4.0 <= low <= -2.0 and 2.0 <= high <= 4.0
 
 
 def test_two_bends_are_two_unknowns():
@@ -774,6 +791,13 @@ def test_a_derivative_written_by_hand_is_not_believed():
         lambda x: jnp.where(x == 0, 1.0, x),
         lambda x: x * (x.astype(int) + 1),
         lambda x: jnp.where(jnp.sin(x) > 0.5, jnp.sin(x), 0.0),
+        # The ends belong to the domain.
+        lambda x: jnp.where(x < 1.0, 0.0, 9.0),
+        lambda x: jnp.where(x > -1.0, 0.0, 9.0),
+        lambda x: jnp.where(x >= 1.0, 9.0, 0.0),
+        lambda x: jnp.where(x <= -1.0, 9.0, 0.0),
+        lambda x: jnp.sign(x - 1.0),
+        lambda x: jnp.sign(x + 1.0),
     ],
 )
 def test_a_jump_has_no_slopes(function):
