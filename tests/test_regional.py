@@ -10,7 +10,11 @@ import pytest
 
 import echelon as ech
 from echelon.certificates import Domain
-from echelon.certificates.jacobians import has_constant_input_map, jacobians
+from echelon.certificates.jacobians import (
+    has_constant_input_map,
+    jacobians,
+    offsets_are_symmetries,
+)
 from echelon.certificates.lmi import robust_lqr
 from echelon.certificates.region import contracting_region, pairs_on, radius
 from echelon.core.numerics import precision
@@ -431,3 +435,60 @@ def test_a_missing_solver_is_exit_code_four(echelon, monkeypatch):
         )
     code, _, err = echelon("run", "mine.yaml")
     assert code == 4 and "pip install" in err and "certify" in err
+
+
+# ---- offsets, and jumps ----
+
+
+class Fenced(ech.ControlAffine):
+    """A mass that a soft fence pushes back beyond 7.5 m, on the side of its sign."""
+
+    side: float = 1.0
+    state_names = ("x", "v")
+    input_names = ("u",)
+
+    def drift(self, x):
+        push = 2.0 * jnp.maximum(self.side * x[0] - 7.5, 0.0)
+        return jnp.stack([x[1], -self.side * push])
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]], x.dtype)
+
+
+@pytest.mark.parametrize(
+    ("side", "offsets", "wanted"),
+    [
+        # Agents reach 6 m, and their places without an offset so much less.
+        (1.0, (0.0, -1.0), True),
+        (1.0, (0.0, -2.0), False),
+        (1.0, (0.0, 9.0), True),
+        (1.0, (0.0, 9.0, -2.0), False),
+        (-1.0, (0.0, 1.0), True),
+        (-1.0, (0.0, 2.0), False),
+        (-1.0, (0.0, -9.0), True),
+        (-1.0, (0.0, -9.0, 2.0), False),
+        (-1.0, (5.0, 6.0, 4.0), True),
+        (-1.0, (5.0, 7.0), False),
+    ],
+)
+def test_offsets_are_proved_as_far_as_places_lie_without_them(side, offsets, wanted):
+    model = Fenced(side=side)
+    domain = Domain.about(model, {"x": 6.0, "v": 2.0})
+    some = np.stack([offsets, np.zeros(len(offsets))], axis=1)
+    assert offsets_are_symmetries(model, domain, some) is wanted
+    # What all share moves nobody against another, and a velocity moves the place.
+    assert offsets_are_symmetries(model, domain, some + [0.0, 3.0]) is wanted
+    some[1, 1] = 0.5
+    assert not offsets_are_symmetries(model, domain, some)
+
+
+def test_a_model_that_jumps_has_no_jacobians():
+    class Kicked(Fenced):
+        def drift(self, x):
+            return jnp.stack([x[1], -1.0 * (x[0] > 1.0)])
+
+    model = Kicked()
+    told = sentence(lambda: jacobians(model, Domain.about(model, {"x": 6.0, "v": 2.0})))
+    assert "may jump with `x` inside the domain" in told
+    near = Domain.about(model, {"x": 0.5, "v": 2.0})
+    assert jacobians(model, near).matrices.tolist() == [[[0.0, 1.0], [0.0, 0.0]]]
