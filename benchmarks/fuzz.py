@@ -1,14 +1,14 @@
 """Feed the command line nonsense: no crash, no hang, no silence; `python3 dev.py fuzz [SECONDS]`.
 
 Scenario files, `--set`, gain files, folders of runs, whole command lines and experiments far too
-large are drawn by a seeded grammar: sound ones with a few things spoiled. What must hold of each: it
-ends within its time, with an exit code that the help lists, without a traceback or a library's
+large are drawn by a seeded grammar: sound ones with a few things spoiled. What must hold of each:
+it ends within its time, with an exit code that the help lists, without a traceback or a library's
 warning, and if it refuses, then in whole sentences.
 
-A process forks after the libraries are imported and before JAX begins, and runs a few hundred cases
-one after another, so that what is refused costs milliseconds and what is compiled is compiled once.
-A hang, a crash or a hunger for memory ends it, and the next one goes on behind that case. What looks
-faulty is repeated in a process of its own, as all cases are with `--alone`.
+A process forks after the libraries are imported and before JAX begins, and runs a few hundred
+cases one after another, so that what is refused costs milliseconds and what is compiled is compiled
+once. A hang, a crash or a hunger for memory ends it, and the next one goes on behind that case.
+What looks faulty is repeated in a process of its own, as all cases are with `--alone`.
 """
 
 import argparse
@@ -21,7 +21,6 @@ import multiprocessing
 import os
 import random
 import resource
-import shutil
 import signal
 import sys
 import tempfile

@@ -17,6 +17,7 @@ from echelon.certificates.jacobians import (
 )
 from echelon.certificates.lmi import robust_lqr
 from echelon.certificates.region import contracting_region, pairs_on, radius
+from echelon.certificates.sampling import sample_jacobians
 from echelon.core.numerics import precision
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.models.linearization import linearize
@@ -492,3 +493,59 @@ def test_a_model_that_jumps_has_no_jacobians():
     assert "may jump with `x` inside the domain" in told
     near = Domain.about(model, {"x": 0.5, "v": 2.0})
     assert jacobians(model, near).matrices.tolist() == [[[0.0, 1.0], [0.0, 0.0]]]
+
+
+# ---- samples ----
+
+
+def squares(x, v):
+    """A velocity whose Jacobian tells where it was taken: diag(x)."""
+    return 0.5 * x**2
+
+
+@pytest.mark.parametrize("size", [2, 7, 9])
+def test_samples_lie_in_the_domain_and_at_its_corners(size):
+    model = ech.models.Linear(-np.eye(size), np.ones((size, 1)))
+    domain = Domain.about(model, dict.fromkeys(model.state_names, (-1.0, 2.0)))
+    with precision("float64"):
+        found = sample_jacobians(model, domain, squares, None)
+    places = np.einsum("kii->ki", found)
+    corners = places[len(places) // 2 :]
+    assert ((places >= -1.0) & (places <= 2.0)).all() and set(corners.ravel()) == {-1.0, 2.0}
+    # Every one where they are few, and of many about as often one side as the other.
+    if size <= 7:
+        assert len({tuple(row) for row in corners}) == 2**size
+    else:
+        assert len({tuple(row) for row in corners}) > 100
+        assert (np.abs((corners > 0.0).mean(axis=0) - 0.5) < 0.1).all()
+
+
+class Sampled(ech.ControlAffine):
+    """A spring without an enclosure, beside a state that may do something far off."""
+
+    bend: object = staticmethod(jnp.zeros_like)
+    state_names = ("place", "far")
+    input_names = ("force",)
+
+    def drift(self, x):
+        return jnp.stack([-jax.scipy.special.erf(x[0]) + self.bend(x[1]), -x[1]])
+
+    def input_map(self, x):
+        return jnp.array([[1.0], [0.0]], x.dtype)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("edge", [2.0, 20.0, 800.0])
+def test_samples_look_far_along_a_state_without_bounds(side, edge):
+    calm = Sampled()
+    domain = Domain.about(calm, {"place": 0.5})
+    assert jacobians(calm, domain).kind is Kind.SAMPLES
+    model = Sampled(bend=lambda z: jnp.maximum(side * z - edge, 0.0))
+    assert "leaves `far` unbounded" in sentence(lambda: jacobians(model, domain))
+
+
+def test_a_jacobian_of_which_one_entry_is_no_number_is_refused():
+    model = Sampled(bend=lambda z: jnp.sqrt(0.9 - z))
+    domain = Domain.about(model, {"place": 0.5, "far": 1.0})
+    told = sentence(lambda: jacobians(model, domain))
+    assert "the Jacobian of `Sampled` is not finite inside the domain" in told
