@@ -182,6 +182,31 @@ def test_the_error_is_the_distance_to_the_exact_vertices():
     assert 0 < max(found) <= Fraction(hull.error[0, 0]) <= max(found) * (1 + Fraction(1, 2**50))
 
 
+def test_the_error_is_no_less_than_what_was_rounded_away():
+    factors = np.random.default_rng(0).uniform(0.1, 1.0, (3, 40))
+
+    def products(x, v):
+        # Of three, so that what is rounded away has more digits than a float itself.
+        return (x * factors[0] * factors[1] * factors[2])[None]
+
+    hull = value_hull(products, Box([1.0], [1.0]), NO_INPUTS)
+    exact = [math.prod(map(Fraction, some)) for some in factors.T.tolist()]
+    [[values]], [errors] = hull.vertices.tolist(), hull.error.tolist()
+    for value, error, number in zip(values, errors, exact, strict=True):
+        lost = abs(Fraction(value) - number)
+        assert Fraction(math.nextafter(error, 0.0)) < lost <= Fraction(error) or lost == error == 0
+
+
+def test_what_is_not_known_of_a_number_is_part_of_the_error():
+    angles = np.random.default_rng(1).uniform(0.1, 1.5, 20)
+    hull = value_hull(lambda x, v: jnp.cos(x)[None], Box(angles, angles), NO_INPUTS)
+    [[values]], [errors] = hull.vertices.tolist(), hull.error.tolist()
+    for angle, value, error in zip(angles.tolist(), values, errors, strict=True):
+        cosine = circle(Fraction(angle))[0]
+        assert cosine.lo < cosine.hi
+        assert all(abs(Fraction(value) - end) <= Fraction(error) for end in (cosine.lo, cosine.hi))
+
+
 def test_numbers_that_are_not_rational_leave_a_slack():
     atoms, angles = Atoms(), (Fraction(3, 10), Fraction(4, 7))
     (c, _), (_, s) = (atoms.circle(constant(angle)) for angle in angles)

@@ -483,6 +483,18 @@ def test_offsets_are_proved_as_far_as_places_lie_without_them(side, offsets, wan
     assert not offsets_are_symmetries(model, domain, some)
 
 
+@pytest.mark.parametrize("slope", [2.0**-70, -(2.0**-300)])
+def test_an_input_map_is_constant_or_is_not_however_little_it_varies(slope):
+    class Uneven(Fenced):
+        def input_map(self, x):
+            return jnp.stack([0.0, 1.0 + slope * x[1]])[:, None]
+
+    # Floats cannot tell them apart, and what is proved of one is not proved of the other.
+    for model, wanted in ((Uneven(), False), (Fenced(), True)):
+        domain = Domain.about(model, {"x": 6.0, "v": 2.0})
+        assert has_constant_input_map(model, domain) is wanted
+
+
 def test_a_model_that_jumps_has_no_jacobians():
     class Kicked(Fenced):
         def drift(self, x):
