@@ -1,5 +1,7 @@
 """Gains and what their certificates say, against closed forms and eigenvalues."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from echelon.core import numerics
 from echelon.core.errors import GainError
-from echelon.core.linear import observability_rank
+from echelon.core.linear import observability_rank, uncontrollable_modes
 from echelon.core.words import Kind
 from echelon.gains import Feedback, FixedGain, Method, Riccati
 from echelon.gains.gain import synthesize
@@ -201,6 +203,21 @@ def test_the_mode_of_a_unicycle_that_no_input_moves_is_named():
     )
     with pytest.raises(GainError, match="no input moves the mode"):
         synthesize(UnicyclePoint(), LINE, Riccati())
+
+
+@pytest.mark.parametrize(("reach", "seen"), [(1e-7, True), (1e-5, True), (1e-11, False)])
+def test_a_mode_that_an_input_moves_little_is_moved(reach, seen):
+    A, B = np.diag([1.0, 2.0]), np.array([[1.0], [reach]])
+    found = uncontrollable_modes(A, B)
+    assert [s for s, _ in found] == ([] if seen else [2.0])
+    for _, direction in found:
+        assert np.abs(direction) == pytest.approx([0.0, 1.0], abs=1e-9)
+
+
+def test_a_certificate_is_stable_below_zero_however_little():
+    certificate = synthesize(SingleIntegrator(1), Graph.path(2), FixedGain()).certificate
+    for abscissa, stable in ((-1e-12, True), (0.0, False), (1e-12, False)):
+        assert dataclasses.replace(certificate, abscissa=abscissa).stable is stable
 
 
 def test_an_uncontrollable_mode_that_decays_by_itself_is_no_obstacle():
