@@ -345,6 +345,8 @@ class Carried(SingleIntegrator):
         ({"push": lambda x: 1e6 + x}, False),
         ({"push": lambda x: 1e8 * (jnp.sin(x) ** 2 + jnp.cos(x) ** 2)}, True),
         ({"push": lambda x: 1e8 * (jnp.sin(x) ** 2 + 1.0001 * jnp.cos(x) ** 2)}, False),
+        # A ripple too low to be seen by its height.
+        ({"wind": lambda x: 1e-10 * jnp.sin(1e4 * x)}, False),
         # Of a wave of the offset's length nothing changes, and of half of it the sign alone.
         ({"wind": lambda x: jnp.sin(2.0 * jnp.pi * x)}, True),
         ({"wind": lambda x: jnp.sin(jnp.pi * x)}, False),

@@ -1,7 +1,8 @@
 """The report: its table, and the sentences that say what happened and why."""
 
+import numpy as np
 import pytest
-from runs import simulate
+from runs import made_up, simulate
 
 import echelon as ech
 
@@ -108,3 +109,16 @@ def test_a_swarm_shows_best_median_and_worst():
 def test_the_unicycles_relay_is_told_to_the_reader():
     text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
     assert "Each follower is told: neighbours' states, the leader's input of the same step." in text
+
+
+@pytest.mark.parametrize("followers", [13, 14])
+def test_of_many_followers_the_best_the_worst_and_one_in_the_middle_are_shown(followers):
+    model, graph = ech.models.SingleIntegrator(1), ech.Graph.star(followers + 1)
+    order = np.random.default_rng(0).permutation(followers) + 1
+    errors = np.zeros((followers + 1, 1))
+    errors[order, 0] = 0.01 * np.arange(1, followers + 1)
+    states = np.broadcast_to(errors, (4, followers + 1, 1))
+    text = " ".join(ech.report(made_up(states, model, graph, window=2.0)).split())
+    middle = {order[(followers - 1) // 2], order[followers // 2]}
+    assert f"best (follower {order[0]})" in text and f"worst (follower {order[-1]})" in text
+    assert any(f"median (follower {k})" in text for k in middle)
