@@ -363,3 +363,14 @@ def test_a_whole_turn_is_a_symmetry_of_a_pendulum():
     # f(x + d) = f(x) for all x, which is all that the theorem needs.
     formation = Formation.from_offsets(Pendulum(), TREE, {2: (2.0 * np.pi, 0.0)})
     assert formation.is_invariant(Pendulum())
+
+
+@pytest.mark.parametrize("shape", ["line", "triangle", "wedge", "grid", "circle"])
+def test_drawn_neighbours_are_one_metre_apart_unless_said_otherwise(shape):
+    draw = getattr(Formation, shape)
+    for words, wanted in (({}, 1.0), ({"spacing": 2.5}, 2.5)):
+        places = draw(PLANE, Graph.path(6), **words).offsets[:, :2]
+        if shape == "circle":
+            places = places[1:]  # the leader stands in the middle
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)[~np.eye(len(places), dtype=bool)]
+        assert gaps.min() == pytest.approx(wanted)
