@@ -33,9 +33,11 @@ ROOT = Path(__file__).resolve().parents[1]
 TESTS = {
     "core": ["jaxpr", "linearization", "lyapunov", "bad_input"],
     "enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
-    "network": ["graph", "formation", "recommend"],
+    "network": ["graph", "formation", "recommend", "limits"],
     "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
     "certificates/exact.py": ["exact"],
+    "certificates/jacobians.py": ["regional", "exact"],
+    "certificates/sampling.py": ["regional", "exact"],
     "enclosure/curves.py": ["interval", "hull"],
     "enclosure/interval.py": ["interval", "hull"],
     "verifier": ["verify", "false_claims"],
