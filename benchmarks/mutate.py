@@ -42,7 +42,7 @@ TESTS = {
     "enclosure/interval.py": ["interval", "hull"],
     "verifier": ["verify", "false_claims"],
     "gains": ["gains", "inner_loop", "regional", "paper"],
-    "laws": ["laws", "feedforward", "paper", "attack"],
+    "laws": ["laws", "feedforward", "inner_loop", "bad_input", "paper", "attack"],
     "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans"],
 }
 LIMIT = 4.0, 30.0
