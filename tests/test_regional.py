@@ -561,3 +561,28 @@ def test_a_jacobian_of_which_one_entry_is_no_number_is_refused():
     domain = Domain.about(model, {"place": 0.5, "far": 1.0})
     told = sentence(lambda: jacobians(model, domain))
     assert "the Jacobian of `Sampled` is not finite inside the domain" in told
+
+
+@pytest.mark.parametrize("name", ["lambda_min", "abscissa", "modes", "observable", "edge"])
+@pytest.mark.parametrize("wrong", [{"x": 1}, "1", [1.0], True, -(10**400), float("nan")])
+def test_a_gain_file_whose_numbers_are_none_is_refused(tmp_path, name, wrong):
+    model, file = ech.models.DoubleIntegrator(1), tmp_path / "gain.json"
+    ech.save_gain(ech.synthesize(model, LINE, ech.gains.Riccati()), model, LINE, file)
+    told = json.loads(file.read_text())
+    told["certificate"][name] = wrong
+    file.write_text(json.dumps(told))
+    assert "is no gain that echelon wrote" in sentence(lambda: ech.load_gain(file, model, LINE))
+
+
+@pytest.mark.parametrize("name", ["rate", "radius", "strength"])
+def test_a_region_whose_numbers_are_none_is_refused(tmp_path, name):
+    model, file = ech.models.Pendulum(), tmp_path / "gain.json"
+    ech.save_gain(
+        ech.synthesize(model, LINE, ech.gains.Monotone({"angle": 0.5})), model, LINE, file
+    )
+    told = json.loads(file.read_text())
+    told["certificate"]["region"][name] = {"x": 1}
+    file.write_text(json.dumps(told))
+    assert f"`{name}` is {{'x': 1}}, and must be a finite number." in sentence(
+        lambda: ech.load_gain(file, model, LINE)
+    )
