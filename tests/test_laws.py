@@ -21,6 +21,8 @@ from echelon.models import (
     Linear,
     PlanarQuadrotor,
     Quadrotor,
+    QuadrotorEuler,
+    QuadrotorThrust,
     SingleIntegrator,
     Unicycle,
     UnicyclePoint,
@@ -194,6 +196,23 @@ def test_a_leader_on_its_reference_flies_the_feedforward_alone():
         x, u = map(np.asarray, law.target(QUAD, jnp.asarray(2.0)))
     assert input_of(law, QUAD, x=x, t=2.0) == pytest.approx(u, abs=1e-15)
     assert u[0] > 0.0
+
+
+@pytest.mark.parametrize("model", [QuadrotorEuler(), QuadrotorThrust()])
+def test_under_computed_torque_a_leader_stays_on_its_circle_but_for_held_inputs(model):
+    law, formation = (
+        Tracking(Circle(radius=1.5, rate=0.8)),
+        Formation(np.zeros((2, len(model.trim[0])))),
+    )
+
+    def largest(dt):
+        run = {"leader": law, "follower": TrimInput(), "horizon": 2.0, "dt": dt, "store_every": 10}
+        result = simulate(model, Graph.path(2), formation, **run)
+        return np.abs(result.states[:, 0] - result.reference)[:, :3].max()
+
+    # An input that is held over a step is half a step late on the whole: half the step, half of it.
+    late, less = largest(0.02), largest(0.01)
+    assert late < 5e-5 and late == pytest.approx(2.0 * less, rel=0.05)
 
 
 def test_a_tracking_gain_is_the_model_s_riccati_gain_unless_given():
