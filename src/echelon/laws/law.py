@@ -78,6 +78,10 @@ class Law(eqx.Module):
         """Return the states (T, n) that the law follows, or None where it follows nothing."""
         return None
 
+    def own_mode(self, model: ControlAffine) -> float | None:
+        """Return the slowest mode (1/s) of a leader about what it follows; None if not known."""
+        return None
+
     def metric(self, model: ControlAffine) -> Array | None:
         """Return P (n, n) of the paper's Lyapunov function for this law; None if it has none."""
         return None

@@ -16,7 +16,7 @@ from echelon.scenario.yaml import Document, KeyPath, are, shown
 Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
-_TRACKS = ("tracking", "optimal-tracking")
+_TRACKS = ("tracking", "lqr", "optimal-tracking")
 """The leader laws that follow a reference."""
 
 # Of these two keys a section has one at most; True where it must have one.

@@ -130,6 +130,9 @@ class ReferenceSpec(BaseModel):
     """Name of a reference."""
     python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
+    file: str | None = None
+    """CSV file of the reference `states`, relative to the scenario file: its first line names `t`,
+    the states and the inputs."""
 
     @property
     def parameters(self) -> Mapping[str, Any]:
