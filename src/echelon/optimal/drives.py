@@ -19,7 +19,8 @@ from echelon.network.graph import Graph, shares
 from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import follow_at, reference_targets, reference_warnings
+from echelon.references.demand import reference_warnings
+from echelon.references.flatness import follow_at, reference_targets
 from echelon.references.guide import Guide
 from echelon.references.reference import check_kind_of
 
@@ -48,10 +49,10 @@ class _Optimized(Drive):
         return Information(() if self.reference is None else ("the reference",), (self.sent,))
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
-        """Tell how much faster the reference is than the actuators allow, where limits hold."""
-        if self.reference is None or not settings.limits:
+        """Tell what of the reference the agents cannot do."""
+        if self.reference is None:
             return ()
-        return reference_warnings(model, self.reference, settings.horizon)
+        return reference_warnings(model, self.reference, settings.horizon, settings.limits)
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero, or the trim."""

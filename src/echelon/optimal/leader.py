@@ -22,7 +22,8 @@ from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import follow_at, reference_targets, reference_warnings
+from echelon.references.demand import reference_warnings
+from echelon.references.flatness import follow_at, reference_targets
 from echelon.references.guide import Guide
 
 _STEP = 0.005
@@ -100,8 +101,8 @@ class OptimalTracking(Law):
         )
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
-        """Tell how much faster the reference is than the actuators allow, where limits hold."""
-        return reference_warnings(model, self.reference, self.horizon) if self.limits else ()
+        """Tell what of the reference the leader cannot do."""
+        return reference_warnings(model, self.reference, self.horizon, self.limits)
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_p, u_p) at time t, or the reference's (x_r, u_r) after the plan.

@@ -1,4 +1,4 @@
-"""The states and inputs of a model that follow a reference, and what they ask of its actuators."""
+"""The states and inputs of a model that follow a reference."""
 
 from typing import NamedTuple
 
@@ -21,60 +21,6 @@ def follow_at(
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
     return jax.vmap(lambda t: reference.follow(model, t))(times)
-
-
-def reference_warnings(
-    model: ControlAffine, reference: Guide, horizon: float, samples: int = 1000
-) -> tuple[str, ...]:
-    """Return a sentence with the ratio if a reference needs more than the actuators can deliver.
-
-    Args:
-        model: the agent; it must have a flatness map.
-        reference: to be followed exactly.
-        horizon: how long, s.
-        samples: how many times are looked at.
-    """
-    times = np.linspace(0.0, horizon, samples)
-    inputs = flat_inputs(model, reference, times)
-    ratios = demand(model, inputs)
-    worst = int(np.argmax(ratios))
-    if not ratios[worst] > 1.0:
-        return ()
-    needed = ", ".join(
-        f"{name} {value:.3g} {unit}".rstrip()
-        for name, value, unit in zip(
-            model.input_names, inputs[worst], model.input_units, strict=True
-        )
-    )
-    return (
-        f"the reference `{type(reference).__name__}` is too fast for `{type(model).__name__}`: at "
-        f"t = {times[worst]:.3g} s it needs {ratios[worst]:.3g} times what the actuators leave "
-        f"beyond the trim ({needed}); make it slower or smaller.",
-    )
-
-
-def flat_inputs(model: ControlAffine, reference: Guide, times: Array) -> Array:
-    """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
-    # Up to four nested derivatives of a path leave float32 too few digits to judge limits by.
-    with precision("float64"):
-        return np.asarray(follow_at(model, reference, jnp.asarray(times))[1])
-
-
-def demand(model: ControlAffine, inputs: Array) -> Array:
-    """Return for each input (T, m) how much of the actuators' room about the trim it takes, (T,).
-
-    One is the limit; 0.5 leaves as much again. Without limits it is zero.
-    """
-    if model.input_limits is None:
-        return np.zeros(len(inputs))
-    G, low, high = (np.asarray(part, float) for part in model.input_limits)
-    # What the trim takes is not free: at hover only the thrust beyond m g is room.
-    held = G @ np.asarray(model.trim[1], float)
-    moved = (inputs - np.asarray(model.trim[1], float)) @ G.T
-    room = np.where(moved > 0.0, high - held, held - low)
-    # No room at all makes the demand infinite, and 0 / 0 is no demand.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(moved == 0.0, 0.0, np.abs(moved) / np.maximum(room, 0.0)).max(axis=1)
 
 
 class Targets(NamedTuple):

@@ -11,9 +11,13 @@ from echelon.certificates.modes import obstacle
 from echelon.core.linear import in_words
 from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.laws.law import reference_of
+from echelon.models.model import ControlAffine
 from echelon.promises.hypotheses import goal_drifts
 from echelon.promises.promise import Promise
 from echelon.promises.statement import Hypothesis, Statement
+from echelon.references.demand import Asked, asked, infeasible, too_fast
 from echelon.studies.finite_condition import finite_condition
 
 ZERO = 1e-9
@@ -41,9 +45,13 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     yield Statement("Lemma 3, sum over edges", Verdict.FAILS, _PROOF, rows, shown, text)
 
 
-def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
+def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
     """Yield what the paper asks of leader and drift: Assumptions 4, 5, Lemma 4, conditions on P."""
     yield _leader_line(promise)
+    reference = reference_of(getattr(parts.drive, "leader", parts.drive))
+    if reference is not None:
+        found = asked(parts.model, reference, settings.horizon)
+        yield _reference_line(parts.model, found, settings)
     monotone = _monotone_line(parts, promise)
     yield monotone
     both = not (promise.hypotheses[Hypothesis.SYMMETRY].fails or monotone.fails)
@@ -67,6 +75,25 @@ def _leader_line(promise: Promise) -> Statement:
         remedy += "method"
     verdict, shown = Verdict.of(slow < -ZERO), f"{slow:.3g} 1/s"
     return Statement(name, verdict, Kind.LINEARIZATION, slow, shown, text, remedy)
+
+
+def _reference_line(model: ControlAffine, found: Asked, settings: Settings) -> Statement:
+    """Say what a leader must do to follow; no model here limits a speed but by its inputs."""
+    name, remedy = "reference, what it asks", ""
+    limited = settings.limits and model.input_limits is not None
+    sizes = ((found.speed, "m/s"), (found.acceleration, "m/s^2"))
+    # Below a micrometre and the like are the differences' rounding.
+    shown = [f"{round(x, 5):.3g} {unit}" for x, unit in sizes if x is not None]
+    shown += [f"{100.0 * found.share:.3g} % of the limits' room"] if limited else []
+    text = f"at most, over {settings.horizon:g} s; the limits alone bound what it may ask"
+    text = text if limited else f"at most, over {settings.horizon:g} s; nothing here bounds it"
+    fast = limited and found.share > 1.0
+    if fast:
+        text, remedy = too_fast(model, found), "make it slower or smaller"
+    if not found.feasible:
+        text, remedy = infeasible(model, found), "give knots that the model can move along"
+    verdict = Verdict.of(found.feasible and not fast)
+    return Statement(name, verdict, Kind.SAMPLES, found.share, ", ".join(shown), text, remedy)
 
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
