@@ -14,6 +14,7 @@ from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.laws.law import reference_of
 from echelon.models.model import ControlAffine
+from echelon.network.hearing import who_hears_whom
 from echelon.promises.hypotheses import goal_drifts
 from echelon.promises.promise import Promise
 from echelon.promises.statement import Hypothesis, Statement
@@ -34,6 +35,10 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     text = "connected and static" + ("" if unit else "; weights need not be 1")
     shown = f"{shown}, {len(graph.edges)} edges"
     yield Statement("Assumption 2, graph", _HOLDS, _PROOF, len(graph.edges), shown, text)
+    followers, leaders = len(graph.followers), len(graph.leaders)
+    shown = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
+    text = who_hears_whom(graph)
+    yield Statement("who follows whom", _HOLDS, _PROOF, leaders, shown, text)
     shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
     yield Statement("Assumption 6, M L = I", _HOLDS, _PROOF, low, shown, text)
     yield Statement("Lemma 1, L > 0", _HOLDS, _PROOF, low, f"{low:.6g}", "grounded Laplacian")
