@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import Feedforward
+from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -222,7 +222,7 @@ class FollowerSpec(BaseModel, **STRICT):
     """Name of a law, or one of one's own, `{python: file.py:Class}` with its own keys."""
     gain: GainSpec = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
-    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = "relay"
+    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = str(DEFAULT_FEEDFORWARD)
     """What every follower is sent of the same step: `relay`, the leader's input; `relay-velocity`,
     the velocity that it makes; `parent`, the input of the neighbour nearer to the leader, on a
     tree."""
