@@ -31,6 +31,7 @@ from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Lemniscate, Line
 from echelon.results.lyapunov import lyapunov
+from echelon.scenario.sections import FollowerSpec
 
 LINE = Graph.path(4)
 QUAD = Quadrotor()
@@ -145,17 +146,22 @@ def test_the_trim_and_what_the_leader_says_are_added(model):
 def test_a_law_says_what_it_needs_from_others():
     gain = synthesize(QUAD, LINE, FixedGain())
     others, leader = "neighbours' states", "the leader's input of the same step"
-    assert Consensus(gain).information == (others,)
+    assert Consensus(gain, "none").information == (others,)
     assert Consensus(gain, feedforward="relay").information == (others, leader)
     assert Agreement().information == (others,) and TrimInput().information == ()
     assert Tracking(Hover()).information == ("the reference",)
     assert Tracking(Hover(), reaction=gain).information == ("the reference", others)
     asked = [
-        Consensus(gain).feedforward,
+        Consensus(gain, "none").feedforward,
         Consensus(gain, "relay").feedforward,
         TrimInput().feedforward,
     ]
     assert [str(each) for each in asked] == ["none", "relay", "none"]
+
+
+def test_a_scenario_and_a_program_have_the_same_default_feedforward():
+    gain = synthesize(QUAD, LINE, FixedGain())
+    assert FollowerSpec().feedforward == str(Consensus(gain).feedforward) == "relay"
 
 
 def test_laws_carry_the_metric_of_their_lyapunov_function():
