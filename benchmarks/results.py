@@ -187,7 +187,10 @@ def chain_lag() -> Row:
                 ech.laws.Tracking(
                     ech.references.Line(start=(0.0, 0.0, 0.0), velocity=(1.0, 0.0, 0.0))
                 ),
-                ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.FixedGain("identity"))),
+                ech.laws.Consensus(
+                    ech.synthesize(model, graph, ech.gains.FixedGain("identity")),
+                    feedforward="none",
+                ),
             ),
         ),
         ech.Settings(horizon=200.0, dt=0.01, store_every=100),

@@ -8,6 +8,21 @@ import echelon as ech
 from echelon.core.numerics import precision
 from echelon.engine.sums import Meter, on_host
 
+OWN_PENDULUM = """
+import jax.numpy as jnp
+import echelon as ech
+
+class Pendulum(ech.ControlAffine):
+    damping: float = 0.5
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
+    def drift(self, x):
+        return jnp.stack([x[1], -9.81 * jnp.sin(x[0]) - self.damping * x[1]])
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]])
+"""
+"""A user's file with a model of their own, a pendulum."""
+
 
 def run(model, graph, formation, drive, **more):
     """Simulate under a drive; settings, starts and world stand among the keywords."""

@@ -566,8 +566,9 @@ LAWS = {
     ),
     "tracking without a flat map": (
         lambda: run(Pendulum(), leader=Tracking(Hover())),
-        "the law `tracking` cannot lead `Pendulum`, which defines no `flat` map; use `passive`, "
-        "or add `flat_outputs`, `flat_order` and `flat` to the model.",
+        "`Pendulum` cannot be led along a reference, since it defines no `flat` map; add "
+        "`flat_outputs`, `flat_order` and `flat` to it, give its states and inputs over time "
+        "(`states`), or use the law `passive`.",
     ),
 }
 

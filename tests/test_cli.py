@@ -6,24 +6,12 @@ import time
 import numpy as np
 import pytest
 import xarray as xr
-from runs import simulate
+from runs import OWN_PENDULUM, simulate
 
 import echelon as ech
 
 QUICK = ["--set", "simulation.horizon=0.5", "--no-figures"]
-PENDULUM = """
-import jax.numpy as jnp
-import echelon as ech
-
-class Pendulum(ech.ControlAffine):
-    damping: float = 0.5
-    state_names = ("angle", "rate")
-    input_names = ("torque",)
-    def drift(self, x):
-        return jnp.stack([x[1], -9.81 * jnp.sin(x[0]) - self.damping * x[1]])
-    def input_map(self, x):
-        return jnp.array([[0.0], [1.0]])
-
+FILE = """
 class Wrong(Pendulum):
     def drift(self, x):
         return x[:1]
@@ -44,7 +32,7 @@ simulation: {horizon: 1.0, dt: 0.01}
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "pendulum.py").write_text(PENDULUM)
+    (tmp_path / "pendulum.py").write_text(OWN_PENDULUM + FILE)
     (tmp_path / "mine.yaml").write_text(SCENARIO)
     return tmp_path
 

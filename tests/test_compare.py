@@ -74,7 +74,7 @@ def test_the_paragraph_names_the_row_with_the_least_number(planar):
 def row_of(label, settles, effort, computing):
     """A method of one follower, with the numbers that the paragraph reads."""
     follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
-    numbers = Metrics(LeaderMetrics(None, None, {}), (follower,), (), None, 0.0, 1.0)
+    numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
     return Row(label, types.SimpleNamespace(computing=computing), numbers)
 
 

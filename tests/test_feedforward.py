@@ -348,7 +348,7 @@ def test_the_law_says_what_it_needs_and_by_how_much_a_branch_amplifies():
     ) in run.warnings
     weak = Consensus(synthesize(model, graph, FixedGain(P=[1.0, 1.0])), feedforward="parent")
     assert "too weak: a mode of the formation does not decay." in weak.warnings(model, graph)[0]
-    assert Consensus(law.gain).warnings(model, graph) == ()
+    assert Consensus(law.gain, "none").warnings(model, graph) == ()
 
 
 def test_the_report_promises_the_modes_that_parents_leave():

@@ -21,6 +21,8 @@ from echelon.models import (
     Linear,
     PlanarQuadrotor,
     Quadrotor,
+    QuadrotorEuler,
+    QuadrotorThrust,
     SingleIntegrator,
     Unicycle,
     UnicyclePoint,
@@ -29,6 +31,7 @@ from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Lemniscate, Line
 from echelon.results.lyapunov import lyapunov
+from echelon.scenario.sections import FollowerSpec
 
 LINE = Graph.path(4)
 QUAD = Quadrotor()
@@ -88,7 +91,7 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
     n, m = len(model.state_names), len(model.input_names)
     x, xi = rng.uniform(-1.0, 1.0, (2, agents, n))
     P, R, c = spd(rng, n), spd(rng, m), rng.uniform(0.5, 3.0)
-    law = Consensus(synthesize(model, graph, FixedGain(P=P, R=R, coupling=c)))
+    law = Consensus(synthesize(model, graph, FixedGain(P=P, R=R, coupling=c)), "none")
 
     # The block form over followers: u = -c (I kron R^-1) G^T (I kron P) (e + d), in normalized
     # inputs, with e from the follower rows of the Laplacian and d from the displacements.
@@ -112,14 +115,14 @@ def test_one_agent_s_law_is_its_row_of_the_block_law(model, parts, seed):
 def test_at_unit_coupling_and_weight_it_is_the_printed_law():
     model, rng = Linear(np.eye(2), [[1.0, 0.5], [0.0, 2.0]]), np.random.default_rng(0)
     P = spd(rng, 2)
-    law = Consensus(synthesize(model, LINE, FixedGain(P=P)))
+    law = Consensus(synthesize(model, LINE, FixedGain(P=P)), "none")
     z = rng.normal(size=2)
     wanted = -np.array([[1.0, 0.0], [0.5, 2.0]]) @ P @ z
     assert input_of(law, model, x=np.ones(2), z=z) == pytest.approx(wanted)
 
 
 def test_on_a_quadrotor_the_printed_law_is_weighted_by_the_squares_of_its_scale():
-    law = Consensus(synthesize(QUAD, LINE, FixedGain()), trim=False)
+    law = Consensus(synthesize(QUAD, LINE, FixedGain()), "none", trim=False)
     x, z = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 12))
     S = np.diag([QUAD.mass, *QUAD.inertia])
     wanted = -S @ S @ quadrotor_input_map(x, QUAD.mass, QUAD.inertia).T @ z
@@ -133,32 +136,39 @@ def test_the_trim_and_what_the_leader_says_are_added(model):
     n, m = len(model.state_names), len(model.input_names)
     x, z, said = rng.uniform(-1, 1, n), rng.uniform(-1, 1, n), rng.uniform(-1, 1, m)
     S, trim = np.array(model.input_scale), np.array(model.trim[1])
-    bare = input_of(Consensus(gain, trim=False), model, x=x, z=z)
-    assert input_of(Consensus(gain), model, x=x, z=z) == pytest.approx(bare + trim, rel=1e-12)
+    bare = input_of(Consensus(gain, "none", trim=False), model, x=x, z=z)
+    assert input_of(Consensus(gain, "none"), model, x=x, z=z) == pytest.approx(
+        bare + trim, rel=1e-12
+    )
     told = input_of(Consensus(gain, feedforward="relay"), model, x=x, z=z, said=said)
     assert told == pytest.approx(bare + trim + S @ said, rel=1e-12)
-    assert input_of(Consensus(gain), model, x=x) == pytest.approx(trim, abs=1e-15)
+    assert input_of(Consensus(gain, "none"), model, x=x) == pytest.approx(trim, abs=1e-15)
 
 
 def test_a_law_says_what_it_needs_from_others():
     gain = synthesize(QUAD, LINE, FixedGain())
     others, leader = "neighbours' states", "the leader's input of the same step"
-    assert Consensus(gain).information == (others,)
+    assert Consensus(gain, "none").information == (others,)
     assert Consensus(gain, feedforward="relay").information == (others, leader)
     assert Agreement().information == (others,) and TrimInput().information == ()
     assert Tracking(Hover()).information == ("the reference",)
     assert Tracking(Hover(), reaction=gain).information == ("the reference", others)
     asked = [
-        Consensus(gain).feedforward,
+        Consensus(gain, "none").feedforward,
         Consensus(gain, "relay").feedforward,
         TrimInput().feedforward,
     ]
     assert [str(each) for each in asked] == ["none", "relay", "none"]
 
 
+def test_a_scenario_and_a_program_have_the_same_default_feedforward():
+    gain = synthesize(QUAD, LINE, FixedGain())
+    assert FollowerSpec().feedforward == str(Consensus(gain).feedforward) == "relay"
+
+
 def test_laws_carry_the_metric_of_their_lyapunov_function():
     gain = synthesize(QUAD, LINE, Riccati())
-    assert np.array_equal(Consensus(gain).metric(QUAD), gain.P)
+    assert np.array_equal(Consensus(gain, "none").metric(QUAD), gain.P)
     assert np.array_equal(Agreement().metric(SingleIntegrator(2)), np.eye(2))
     assert TrimInput().metric(QUAD) is None and Tracking(Hover()).metric(QUAD) is None
 
@@ -194,6 +204,23 @@ def test_a_leader_on_its_reference_flies_the_feedforward_alone():
         x, u = map(np.asarray, law.target(QUAD, jnp.asarray(2.0)))
     assert input_of(law, QUAD, x=x, t=2.0) == pytest.approx(u, abs=1e-15)
     assert u[0] > 0.0
+
+
+@pytest.mark.parametrize("model", [QuadrotorEuler(), QuadrotorThrust()])
+def test_under_computed_torque_a_leader_stays_on_its_circle_but_for_held_inputs(model):
+    law, formation = (
+        Tracking(Circle(radius=1.5, rate=0.8)),
+        Formation(np.zeros((2, len(model.trim[0])))),
+    )
+
+    def largest(dt):
+        run = {"leader": law, "follower": TrimInput(), "horizon": 2.0, "dt": dt, "store_every": 10}
+        result = simulate(model, Graph.path(2), formation, **run)
+        return np.abs(result.states[:, 0] - result.reference)[:, :3].max()
+
+    # An input that is held over a step is half a step late on the whole: half the step, half of it.
+    late, less = largest(0.02), largest(0.01)
+    assert late < 5e-5 and late == pytest.approx(2.0 * less, rel=0.05)
 
 
 def test_a_tracking_gain_is_the_model_s_riccati_gain_unless_given():
@@ -309,7 +336,7 @@ def test_an_agent_that_begins_a_whole_turn_off_moves_as_one_that_does_not(model,
                 graph,
                 Formation(np.zeros((2, n))),
                 leader=TrimInput(),
-                follower=Consensus(gain),
+                follower=Consensus(gain, "none"),
                 initial=start,
                 horizon=1.0,
                 dt=0.01,
@@ -467,7 +494,7 @@ def test_a_sound_law_with_a_memory_of_whole_numbers_flies():
 def test_a_law_that_is_called_by_hand_computes_in_double_or_not_at_all():
     model = SingleIntegrator(1)
     gain = synthesize(model, LINE, Riccati(coupling=0.3))
-    law = Consensus(gain)
+    law = Consensus(gain, "none")
 
     def known():
         zero = jnp.zeros(1)

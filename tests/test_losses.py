@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from runs import OWN_PENDULUM
 
 import echelon as ech
 from echelon.archive.chunks import Chunks
@@ -26,23 +27,10 @@ from echelon.engine.grid import Grid
 from echelon.engine.simulate import reassemble
 from echelon.laws.law import Law
 
-PENDULUM = """
-import jax.numpy as jnp
-import echelon as ech
-
-class Swing(ech.ControlAffine):
-    damping: float = 0.5
-    state_names = ("angle", "rate")
-    input_names = ("torque",)
-    def drift(self, x):
-        return jnp.stack([x[1], -9.81 * jnp.sin(x[0]) - self.damping * x[1]])
-    def input_map(self, x):
-        return jnp.array([[0.0], [1.0]])
-"""
 SCENARIO = """
 name: mine
 # A comment of the user's.
-model: {python: "models/swing.py:Swing"}
+model: {python: "models/swing.py:Pendulum"}
 graph: {name: path, agents: 4, leaders: [0]}
 leader: {law: passive}
 initial: {spread: {angle: 0.5}}
@@ -66,7 +54,7 @@ main()
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "swing.py").write_text(PENDULUM)
+    (tmp_path / "models" / "swing.py").write_text(OWN_PENDULUM)
     (tmp_path / "mine.yaml").write_text(SCENARIO)
     return tmp_path
 
@@ -375,10 +363,10 @@ def test_a_changed_scenario_does_not_go_on(here, echelon):
         patch.setattr(Chunks, "remove", lambda self: None)
         assert echelon("run", "mine.yaml", "--no-figures", "--out", "o")[0] == 0
     swing = here / "o" / "inputs" / "swing.py"
-    swing.write_text(PENDULUM.replace("9.81", "1.62"))
+    swing.write_text(OWN_PENDULUM.replace("9.81", "1.62"))
     code, _, err = echelon("run", "--resume", "o")
     assert code == 2 and "was changed since the run began" in err
-    swing.write_text(PENDULUM)
+    swing.write_text(OWN_PENDULUM)
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
     for name in ("nowhere", "models"):
         code, _, err = echelon("run", "--resume", name)

@@ -82,7 +82,7 @@ def monotone(**changes):
         graph,
         ech.Formation.from_offsets(model, graph, {}),
         leader=ech.laws.TrimInput(),
-        follower=ech.laws.Consensus(gain),
+        follower=ech.laws.Consensus(gain, "none"),
         **{**settings, **changes},
     )
 

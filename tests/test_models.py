@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from oracles import newton_euler, quadrotor_input_map, rotation
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 import echelon.models
 from echelon.core import numerics
@@ -60,6 +61,8 @@ FAMILY = {
     "thrust": QuadrotorThrust(),
 }
 FLAT = {name: model for name, model in FAMILY.items() if model.flat_outputs}
+
+SPACE = ["crazyflie", "big"]
 
 every_model = pytest.mark.parametrize("model", FAMILY.values(), ids=FAMILY)
 every_flat_model = pytest.mark.parametrize("model", FLAT.values(), ids=FLAT)
@@ -394,7 +397,7 @@ def test_the_flat_state_contains_the_path_and_its_speed(model):
             assert x[model.state_names.index(f"v{name}")] == pytest.approx(float(rows[1, k]))
 
 
-@pytest.mark.parametrize("name", ["planar", "planar crazyflie", "crazyflie", "big"])
+@pytest.mark.parametrize("name", [*SPACE, "planar", "planar crazyflie", "euler", "thrust"])
 def test_standing_still_is_flown_by_the_trim(name):
     model = FAMILY[name]
     rows = np.zeros((model.flat_order + 1, len(model.flat_outputs)))
@@ -405,6 +408,45 @@ def test_standing_still_is_flown_by_the_trim(name):
     wanted[[model.state_names.index(name) for name in model.flat_outputs]] = rows[0]
     assert x == pytest.approx(wanted, abs=1e-15)
     assert u == pytest.approx(np.array(model.trim[1]), abs=1e-15)
+
+
+def attitude_by_rotations(path, gravity, t):
+    """ZYX angles, rates and accelerations on a path by SciPy and central differences of 1 ms."""
+
+    def angles(t):
+        rows = np.asarray(path.derivatives(t, 2))
+        z = rows[2, :3] + np.array([0.0, 0.0, gravity])
+        z /= np.linalg.norm(z)
+        # The body x axis has no part to the left of the heading.
+        x = np.cross([-np.sin(rows[0, 3]), np.cos(rows[0, 3]), 0.0], z)
+        x /= np.linalg.norm(x)
+        yaw, pitch, roll = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], 1)).as_euler("ZYX")
+        return np.array([roll, pitch, yaw])
+
+    h, around = 1e-3, [angles(t + k * 1e-3) for k in range(-2, 3)]
+    rate = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / (12.0 * h) @ around
+    bend = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / (12.0 * h**2) @ around
+    return around[2], rate, bend
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_under_computed_torque_quadrotors_fly_what_rotations_and_differences_say(seed):
+    euler, thrust, t = FAMILY["euler"], QuadrotorThrust(gravity=3.7), 0.4
+    # A yaw that keeps below half a turn, where a rotation has one name.
+    path = Smooth(4, seed, drift=0.3)
+    with precision("float64"):
+        rows = path.derivatives(t, 4)
+        lift = [
+            np.linalg.norm(np.asarray(path.derivatives(t + d, 2))[2, :3] + [0.0, 0.0, 3.7])
+            for d in (-1e-5, 0.0, 1e-5)
+        ]
+        zeta, rate, bend = attitude_by_rotations(path, 3.7, t)
+        rows = jnp.asarray(rows)
+        (x, u), (y, v) = (map(np.asarray, model.flat(rows)) for model in (euler, thrust))
+    assert x[6:9] == pytest.approx(zeta, abs=1e-12) and x[9:12] == pytest.approx(rate, abs=1e-8)
+    assert u[1:] == pytest.approx(bend, abs=1e-6) and u[0] == pytest.approx(lift[1] - 3.7, abs=1e-9)
+    assert (y[:12] == x).all() and y[12] == u[0] and (v[1:] == u[1:]).all()
+    assert v[0] == pytest.approx((lift[2] - lift[0]) / 2e-5, abs=1e-6)
 
 
 # ---- physics ----

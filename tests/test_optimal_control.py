@@ -15,7 +15,7 @@ import echelon as ech
 from echelon.core.errors import MissingExtraError, ModelError, PlanError
 from echelon.core.numerics import precision
 from echelon.models import Limits
-from echelon.references.flatness import demand, flat_inputs, reference_warnings
+from echelon.references.demand import asked, demand, flat_inputs, reference_warnings
 
 CART = ech.models.DoubleIntegrator(1)
 PUSH = Limits(((1.0,),), (-1.0,), (1.0,))
@@ -463,3 +463,23 @@ def test_a_reference_beyond_the_limits_is_warned_of_with_the_ratio():
     )
     assert reference_warnings(model, ech.references.FigureEight(rate=0.3), 10.0) == ()
     assert reference_warnings(ech.models.DoubleIntegrator(3), FIGURE, 10.0) == ()
+
+
+def test_a_circle_asks_for_its_speed_and_its_centripetal_acceleration():
+    circle = ech.references.Circle(radius=2.0, rate=1.5)
+    for model in (ech.models.Quadrotor.crazyflie(), ech.models.Unicycle()):
+        found = asked(model, circle, 5.0)
+        assert found.speed == pytest.approx(3.0, rel=1e-5)
+        assert found.acceleration == pytest.approx(4.5, rel=1e-5)
+        assert found.defect < 1e-5 and found.feasible
+    # Nothing of a motion without a position is metres.
+    path = ech.references.StatePath([0.0, 1.0], [[0.0, 0.0]] * 2, [[0.0]] * 2)
+    assert asked(ech.models.Pendulum(), path, 1.0)[:3] == (None, None, 0.0)
+
+
+def test_a_leader_beyond_its_limits_is_warned_of_before_it_flies():
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.Tracking(FIGURE), ech.laws.TrimInput())
+    flown = ech.Settings(4.0, 0.01)
+    assert reference_warnings(model, FIGURE, 4.0) == drive.warnings(model, graph, flown)
+    assert drive.warnings(model, graph, flown._replace(limits=False)) == ()

@@ -53,7 +53,9 @@ def test_a_broken_symmetry_warns_and_names_the_agent():
         graph,
         ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
         leader=ech.laws.TrimInput(),
-        follower=ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.FixedGain("identity"))),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.FixedGain("identity")), "none"
+        ),
         horizon=20.0,
         dt=0.01,
     )

@@ -35,6 +35,11 @@ class Feedforward(Word):
     PARENT = "its parent's input of the same step"
 
 
+DEFAULT_FEEDFORWARD = Feedforward.RELAY
+"""Of the law `consensus`, in scenarios and in Python: without it followers lag behind a leader that
+moves, which is seldom what is meant; the paper's own network is `none`."""
+
+
 class Kind(Word):
     """The kind of an argument, and how a promise that rests on it begins; the strongest first."""
 

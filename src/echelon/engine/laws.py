@@ -12,7 +12,7 @@ from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
 from echelon.engine.loop import Loop, Moment, advance, assemble, begin
 from echelon.engine.settings import Settings
 from echelon.engine.sums import on_host
-from echelon.laws.check import prepare_law
+from echelon.laws.check import leader_warnings, prepare_law
 from echelon.laws.law import Law, gain_of
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -75,8 +75,9 @@ class Laws(Drive):
         return self if same else Laws(leader, follower)
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
-        """Return the warnings of both laws."""
-        return self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+        """Return the warnings of both laws, and what of the reference the leaders cannot do."""
+        told = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+        return told + leader_warnings(self.leader, model, settings.horizon, settings.limits)
 
     def start(self, model: ControlAffine) -> State:
         """Return where the leaders' law begins."""

@@ -49,6 +49,7 @@ class Motion(eqx.Module):
 
         The delivered inputs (N, m) are held over it, and so is the disturbance of this step.
         """
+
         # Integrated with the input held, as a digital controller holds it: the order of the method
         # stays, since u and the wind are constant within a step.
         def one(x: State, u: Input, agent: jax.Array) -> State:

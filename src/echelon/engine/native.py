@@ -15,8 +15,19 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin
-from echelon.engine.sums import SETTLED, Sums, on_host, output_error
-from echelon.kernels import SLOTS, Body, Code, Graph, Plan, Unsupported, aligned, lower, nodes
+from echelon.engine.sums import SETTLED, Sums, output_error
+from echelon.kernels import (
+    SLOTS,
+    Body,
+    Code,
+    Graph,
+    Plan,
+    Unsupported,
+    aligned,
+    lower,
+    nodes,
+    stride,
+)
 from echelon.kernels import program as write
 from echelon.laws.law import Law, LocalView
 
@@ -169,9 +180,7 @@ def _body(
     memory = law.init()
     size = sum(np.size(leaf) for leaf in jax.tree.leaves(memory))
     x, offset = (_leaves(graph, "row", r) for r in (rows.state, rows.offset))
-    push, noise = (
-        _leaves(graph, "row", r) if len(r) else None for r in (rows.push, rows.noise)
-    )
+    push, noise = (_leaves(graph, "row", r) if len(r) else None for r in (rows.push, rows.noise))
     wanted = _leaves(graph, "table", range(n), True) if follows else np.zeros(n)
     sent = np.zeros(told) if leads else _leaves(graph, "told", range(told))
     own_y = x - offset
@@ -192,9 +201,13 @@ def _body(
     tree = jax.tree.structure(_Acted(*[0] * 2, memory, *[0] * 8)._replace(mirror=(0, 0)))
     acted: _Acted = jax.tree.unflatten(tree, [nodes(graph, a) for a in found])
     stores = dict(zip(rows.state, acted.state, strict=True))
-    stores |= dict(zip(rows.tell, acted.tell, strict=True))
-    stores |= dict(zip(rows.input, acted.input, strict=True))
-    kept = [e for leaf in jax.tree.leaves(acted.memory, is_leaf=lambda a: isinstance(a, list)) for e in leaf]
+    if leads or loop.levels is not None:
+        stores |= dict(zip(rows.tell, acted.tell, strict=True))
+    kept = [
+        e
+        for leaf in jax.tree.leaves(acted.memory, is_leaf=lambda a: isinstance(a, list))
+        for e in leaf
+    ]
     stores |= dict(zip(rows.memory[:size], kept, strict=True))
     sums = dict(zip(rows.errors, acted.errors, strict=True))
     sums |= {rows.effort: acted.effort[0], rows.limited: acted.limited[0]}
@@ -207,6 +220,7 @@ def _body(
         stores=stores,
         sums=sums,
         latest={rows.unsettled: acted.unsettled[0]},
+        shown=dict(zip(rows.input, acted.input, strict=True)),
         now=[graph.make("apart", a, b) for a, b in zip(x, offset, strict=True)],
         mirror=[graph.make("apart", a, b) for a, b in zip(acted.state, offset, strict=True)],
         difference=nodes(graph, difference),
@@ -226,9 +240,11 @@ class Places:
     """Where agents stand: positions in blocks of `lanes`, which their level fills with copies."""
 
     def __init__(self, loop: Loop, lanes: int) -> None:
-        levels = [loop.followers] if loop.levels is None else [
-            loop.followers[np.unique(row)] for row in loop.levels
-        ]
+        levels = (
+            [loop.followers]
+            if loop.levels is None
+            else [loop.followers[np.unique(row)] for row in loop.levels]
+        )
         filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
         self.lanes, self.agents = lanes, np.concatenate(filled)
         self.segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
@@ -308,7 +324,8 @@ class NativeStepper(Stepper):
         loop, places, plan = self.loop, self.places, self.plan
         n, lanes, of = plan.width, plan.lanes, places.of
         self.block_rows = aligned((places.blocks, plan.rows, lanes), self.dtype)
-        self.mirrors = [aligned((len(places.agents), n), self.dtype) for _ in range(2)]
+        self.stride = far = stride(n, lanes)
+        self.mirrors = [aligned((len(places.agents), far), self.dtype) for _ in range(2)]
         nearest = np.asarray(loop.meter.nearest)[places.agents]
         sender = nearest if loop.parents is None else np.asarray(loop.parents)[places.agents]
         # A leader is sent nothing, and its own place does as well as any.
@@ -317,19 +334,19 @@ class NativeStepper(Stepper):
         self.fixed = {
             "segments": places.segments,
             "neighbour_starts": starts,
-            "neighbours": np.ascontiguousarray(self.positions * n, np.int32),
+            "neighbours": np.ascontiguousarray(self.positions * far, np.int32),
             "weights": _as_aligned(weights, self.dtype),
             "sources": ((from_ // lanes) * plan.rows * lanes + from_ % lanes).astype(np.int32),
-            "leaders": (of[nearest] * n).astype(np.int32),
+            "leaders": (of[nearest] * far).astype(np.int32),
         }
         self._edges()
 
     def _edges(self) -> None:
         """Make the blocks of edges: differences of goals, distances, sums."""
-        meter, lanes, n = self.loop.meter, self.plan.lanes, self.plan.width
+        meter, lanes = self.loop.meter, self.plan.lanes
         count = len(meter.edges)
         blocks = -(-count // lanes)
-        ends = np.resize(self.places.of[np.asarray(meter.edges)] * n, (blocks * lanes, 2))
+        ends = np.resize(self.places.of[np.asarray(meter.edges)] * self.stride, (blocks * lanes, 2))
         goals = np.asarray(meter.offsets)[:, list(meter.measured)]
         i, j = np.asarray(meter.edges).T
         apart = np.resize(goals[i] - goals[j], (blocks * lanes, len(meter.measured)))
@@ -376,7 +393,7 @@ class NativeStepper(Stepper):
         for k, count in enumerate(counts.tolist()):
             states[k] = self._column(self.rows.state)[self.places.of]
             if count:
-                self._run(step, 1, first, table)
+                self._run(step, 1, first, table, shown=True)
                 inputs[k] = self._column(self.rows.input)[self.places.of]
                 self._run(step + 1, count - 1, first, table)
                 step, asked = step + count, None
@@ -389,7 +406,7 @@ class NativeStepper(Stepper):
     def _probe(self, step: int, first: int, table: Array | None) -> Array:
         """Return the inputs of a step that is not taken."""
         kept = [a.copy() for a in (self.block_rows, self.edge_rows, *self.mirrors)]
-        self._run(step, 1, first, table)
+        self._run(step, 1, first, table, shown=True)
         found = self._column(self.rows.input)[self.places.of]
         if self.flipped:
             self.mirrors.reverse()
@@ -399,8 +416,10 @@ class NativeStepper(Stepper):
 
     flipped = False
 
-    def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps; each ends with the two mirrors exchanged."""
+    def _run(
+        self, step: int, steps: int, first: int, table: Array | None, shown: bool = False
+    ) -> None:
+        """Take steps; each ends with the two mirrors exchanged. `shown` leaves the inputs behind."""
         self.flipped = bool(steps % 2)
         if not steps:
             return
@@ -416,10 +435,11 @@ class NativeStepper(Stepper):
         numbers |= {
             "edge_blocks": len(self.edge_rows),
             "first_steady": int(self.loop.meter.first_steady),
+            "shown": int(shown),
         }
         for name, value in numbers.items():
             slots[SLOTS.index(name)] = value
-        self.code.call(slots.ctypes.data)
+        self.code.call(slots)
         if self.flipped:
             self.mirrors.reverse()
 
@@ -431,7 +451,7 @@ class NativeStepper(Stepper):
         x, offsets = np.asarray(now.states, self.dtype), np.asarray(loop.offsets, self.dtype)
         self._put(self.rows.state, x[agents])
         self._put(self.rows.offset, offsets[agents])
-        self.mirrors[0][:] = (x - offsets)[agents]
+        self.mirrors[0][:, : self.plan.width] = (x - offsets)[agents]
         memory = np.zeros((len(agents), len(self.rows.memory)), self.dtype)
         for who, tree in ((loop.leaders, now.leader_memory), (loop.followers, now.follower_memory)):
             flat = _flat_memory(tree, len(who))

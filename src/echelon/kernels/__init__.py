@@ -1,6 +1,6 @@
-"""Code for this machine: from a trace to scalars, from scalars to vectors, from vectors to loops."""
+"""Code for this machine: from a trace to scalars, to vectors, to the loops about them."""
 
-from echelon.kernels.drivers import Body, Plan, SLOTS, program
+from echelon.kernels.drivers import SLOTS, Body, Plan, program, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
 from echelon.kernels.native import Code, aligned, is_installed
 from echelon.kernels.scalar import Graph, Node
@@ -18,4 +18,5 @@ __all__ = [
     "lower",
     "nodes",
     "program",
+    "stride",
 ]

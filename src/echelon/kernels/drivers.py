@@ -24,6 +24,7 @@ class Body(NamedTuple):
         stores: row -> what it becomes.
         sums: row -> what is added to it.
         latest: row -> a value; it becomes the step where the value is true.
+        shown: row -> what it becomes where `shown` is asked for, since every store costs time.
         now: what neighbours read at the step, entry by entry.
         mirror: what they read after it.
         difference: of what stands in the leaves `own` and `their`, entry by entry; z_k is the
@@ -33,14 +34,15 @@ class Body(NamedTuple):
     stores: dict[int, Node]
     sums: dict[int, Node]
     latest: dict[int, Node]
+    shown: dict[int, Node]
     now: Sequence[Node]
     mirror: Sequence[Node]
     difference: Sequence[Node]
 
     def results(self) -> list[Node]:
         """Return all that is written."""
-        written = [*self.stores.values(), *self.sums.values(), *self.latest.values()]
-        return [*written, *self.mirror]
+        rows = (self.stores, self.sums, self.latest, self.shown)
+        return [*(node for row in rows for node in row.values()), *self.mirror]
 
 
 class Plan(NamedTuple):
@@ -50,7 +52,7 @@ class Plan(NamedTuple):
         bits: 64 or 32.
         lanes: of a vector.
         rows: of a block.
-        width: numbers that neighbours read of an agent.
+        width: numbers that neighbours read of an agent; they stand in whole vectors.
         first: the body of those that act first.
         others: the body of all others, level by level.
         tell: the first row of what an agent tells others.
@@ -58,7 +60,7 @@ class Plan(NamedTuple):
         one_source: whether one agent tells all others, so that none needs to be looked up.
         one_leader: whether all have the same leader.
         weighted: whether edges differ in weight from 1.
-        edges: which of the numbers that neighbours read make a distance; none are measured if empty.
+        edges: which of the numbers that neighbours read make a distance; none for none.
         table: numbers that each step has in the table.
         dt: s.
     """
@@ -97,9 +99,15 @@ SLOTS = (
     "levels",
     "edge_blocks",
     "first_steady",
+    "shown",
 )
-"""What a kernel is called with: 12 addresses and 5 whole numbers of 64 bits."""
+"""What a kernel is called with: 12 addresses and 6 whole numbers of 64 bits."""
 _ADDRESSES = 12
+
+
+def stride(width: int, lanes: int) -> int:
+    """Return how many numbers lie between two agents for their neighbours."""
+    return -(-width // lanes) * lanes
 
 
 class _Context(NamedTuple):
@@ -176,6 +184,18 @@ def _loop(
 
 
 @contextlib.contextmanager
+def _if(w: Writer, wanted: str) -> Iterator[None]:
+    """Write what is done only where a whole number is not 0."""
+    some = w.put(f"icmp ne i64 {wanted}, 0")
+    then, after = w.fresh("then"), w.fresh("done")
+    w.do(f"br i1 {some}, label %{then}, label %{after}")
+    w.label(then)
+    yield
+    w.do(f"br label %{after}")
+    w.label(after)
+
+
+@contextlib.contextmanager
 def _blocks(w: Writer, around: _Context, level: str) -> Iterator[str]:
     """Write the loop over the blocks of a level."""
     at = w.put(f"getelementptr i64, ptr {around.slots['segments']}, i64 {level}")
@@ -223,13 +243,14 @@ def _act(w: Writer, around: _Context, body: Body, block: str) -> None:
     _write_mirror(w, around, [emitter.value(node) for node in body.mirror], first)
 
 
-def _write_rows(
-    w: Writer, around: _Context, body: Body, emitter: Emitter, base: str
-) -> None:
+def _write_rows(w: Writer, around: _Context, body: Body, emitter: Emitter, base: str) -> None:
     """Write what a body leaves in the rows of its block."""
     lanes = around.plan.lanes
     for row, node in body.stores.items():
         _store_row(w, base, row, lanes, emitter.value(node))
+    with _if(w, around.slots["shown"]):
+        for row, node in body.shown.items():
+            _store_row(w, base, row, lanes, emitter.value(node))
     for row, node in body.sums.items():
         old = _load_row(w, base, row, lanes)
         total = w.put(f"fadd {w.vector} {old}, {emitter.value(node)}")
@@ -323,19 +344,21 @@ def _exchange(
     after = w.put(f"getelementptr i64, ptr {at}, i64 1")
     start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
     wanted = [body.difference[k] for k in heard]
+    if all(_is_plain(node) for node in wanted):
+        return _subtract(w, around, (start, end), first, heard)
     leaves = [n for n in needed(wanted) if n.op == "leaf"]
     own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
     mine = Emitter(w, load_row)
     mine.emit(list(own.values()))
     zero = [(w.vector, "zeroinitializer")] * len(heard)
+    pieces = sorted({n.value[1] // w.lanes for n in leaves if n.value[0] == "their"})
     with _loop(w, start, end, zero) as (slot, totals, on):
         place = w.put(f"mul i64 {slot}, {plan.lanes}")
-        places = _load_places(w, slots["neighbours"], place)
+        theirs = _columns(w, around, "neighbours", place, pieces)
 
         def load(leaf: Node) -> str:
-            if leaf in own:
-                return mine.value(own[leaf])
-            return _gather(w, around.mirror, places, leaf.value[1])
+            kind, entry = leaf.value
+            return mine.value(own[leaf]) if kind == "own" else theirs[entry]
 
         emitter = Emitter(w, load)
         emitter.emit(wanted)
@@ -351,25 +374,85 @@ def _exchange(
     return dict(zip(heard, totals, strict=True))
 
 
+def _columns(
+    w: Writer, around: _Context, which: str, place: str, pieces: Sequence[int]
+) -> dict[int, str]:
+    """Write the load of what some agents show, whose places stand in a list: entry -> a vector."""
+    at = w.put(f"getelementptr i32, ptr {around.slots[which]}, i64 {place}")
+    others = [_their(w, around.mirror, at, lane) for lane in range(w.lanes)]
+    found = dict[int, str]()
+    for piece in pieces:
+        # A gather of one number a lane would cost more than turning whole rows about.
+        rows = [_load_at(w, other, piece * w.lanes) for other in others]
+        found |= enumerate(_transposed(w, rows), piece * w.lanes)
+    return found
+
+
+def _is_plain(node: Node) -> bool:
+    """Tell whether an entry of the difference is that of two numbers, and winds no angle."""
+    leaves = [a.value[0] for a in node.args if a.op == "leaf"]
+    return node.op == "sub" and leaves == ["own", "their"]
+
+
+def _subtract(
+    w: Writer, around: _Context, slots: tuple[str, str], first: str, heard: Sequence[int]
+) -> dict[int, str]:
+    """Write the sums of plain differences, agent by agent: their numbers lie in whole vectors."""
+    plan, lanes = around.plan, w.lanes
+    pieces = sorted({k // lanes for k in heard})
+    far = stride(plan.width, lanes)
+    begin = w.put(f"mul i64 {first}, {far}")
+    start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
+    places = [(lane, piece) for lane in range(lanes) for piece in pieces]
+    zero = [(w.vector, "zeroinitializer")] * len(places)
+    with _loop(w, *slots, zero) as (slot, totals, on):
+        place = w.put(f"mul i64 {slot}, {lanes}")
+        at = w.put(f"getelementptr i32, ptr {around.slots['neighbours']}, i64 {place}")
+        heavy = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
+        other, weight = "", ""
+        for k, (lane, piece) in enumerate(places):
+            if piece == pieces[0]:
+                other = _their(w, around.mirror, at, lane)
+                weight = _weight(w, heavy, lane) if plan.weighted else ""
+            own = _load_at(w, start, lane * far + piece * lanes)
+            away = w.operation("sub", [own, _load_at(w, other, piece * lanes)], False, False)
+            away = w.operation("mul", [away, weight], False, False) if weight else away
+            on[k] = w.operation("add", [totals[k], away], False, False)
+    found = dict[int, str]()
+    for piece in pieces:
+        rows = [totals[k] for k, (_, p) in enumerate(places) if p == piece]
+        found |= enumerate(_transposed(w, rows), piece * lanes)
+    return found
+
+
+def _their(w: Writer, mirror: str, places: str, lane: int) -> str:
+    """Write the address of what a lane's neighbour shows."""
+    at = w.put(f"getelementptr i32, ptr {places}, i64 {lane}")
+    place = w.put(f"load i32, ptr {at}, align 4")
+    far = w.put(f"sext i32 {place} to i64")
+    return w.put(f"getelementptr {w.scalar}, ptr {mirror}, i64 {far}")
+
+
+def _weight(w: Writer, weights: str, lane: int) -> str:
+    at = w.put(f"getelementptr {w.scalar}, ptr {weights}, i64 {lane}")
+    return w.splat(w.put(f"load {w.scalar}, ptr {at}"))
+
+
+def _load_at(w: Writer, start: str, place: int) -> str:
+    at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {place}")
+    return w.put(f"load {w.vector}, ptr {at}, align {w.lanes * _bytes(w)}")
+
+
 def _write_mirror(w: Writer, around: _Context, values: Sequence[str], first: str) -> None:
     """Write what neighbours will read, one agent after the other."""
-    lanes, width = w.lanes, around.plan.width
-    begin = w.put(f"mul i64 {first}, {width}")
+    lanes, far = w.lanes, stride(len(values), w.lanes)
+    begin = w.put(f"mul i64 {first}, {far}")
     start = w.put(f"getelementptr {w.scalar}, ptr {around.following}, i64 {begin}")
-    for block in range(0, width, lanes):
-        rows = [values[k] if k < len(values) else "zeroinitializer" for k in range(block, block + lanes)]
-        columns = _transposed(w, rows)
-        piece = min(lanes, width - block)
-        for lane, column in enumerate(columns):
-            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * width + block}")
-            kept, kind = column, w.vector
-            if piece < lanes:
-                kind = f"<{piece} x {w.scalar}>"
-                order = ", ".join(f"i32 {k}" for k in range(piece))
-                kept = w.put(
-                    f"shufflevector {w.vector} {column}, {w.vector} poison, <{piece} x i32> <{order}>"
-                )
-            w.do(f"store {kind} {kept}, ptr {at}, align {_bytes(w)}")
+    padded = [*values, *["zeroinitializer"] * (far - len(values))]
+    for block in range(0, far, lanes):
+        for lane, column in enumerate(_transposed(w, padded[block : block + lanes])):
+            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + block}")
+            w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * _bytes(w)}")
 
 
 def _transposed(w: Writer, rows: Sequence[str]) -> list[str]:
@@ -393,9 +476,7 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
     places = ", ".join(f"i32 {k}" for k in order)
     if a == b == "zeroinitializer":
         return a
-    return w.put(
-        f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>"
-    )
+    return w.put(f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>")
 
 
 def _measure_edges(w: Writer, around: _Context) -> None:
@@ -412,11 +493,11 @@ def _measure_edges(w: Writer, around: _Context) -> None:
         base = w.put(f"getelementptr {w.scalar}, ptr {slots['edges']}, i64 {begin}")
         first = w.put(f"mul i64 {block}, {2 * plan.lanes}")
         second = w.put(f"add i64 {first}, {plan.lanes}")
-        ends = [_load_places(w, slots["edge_ends"], place) for place in (first, second)]
+        pieces = sorted({axis // w.lanes for axis in axes})
+        ends = [_columns(w, around, "edge_ends", place, pieces) for place in (first, second)]
         squares = "zeroinitializer"
         for k, axis in enumerate(axes):
-            one, other = (_gather(w, around.mirror, places, axis) for places in ends)
-            apart = w.operation("sub", [one, other], False, False)
+            apart = w.operation("sub", [end[axis] for end in ends], False, False)
             apart = w.operation("add", [apart, _load_row(w, base, k, plan.lanes)], False, False)
             square = w.operation("mul", [apart, apart], False, False)
             squares = w.operation("add", [squares, square], False, False)

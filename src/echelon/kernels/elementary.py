@@ -16,7 +16,7 @@ import numpy as np
 from echelon.kernels.scalar import Node
 
 _EPS = {64: 2.0**-53, 32: 2.0**-24}
-_PARTS = {64: (33, 33, 53), 32: (11, 11, 24)}
+_PARTS = {64: (33, 53), 32: (11, 11, 24)}
 """Bits of the parts of pi/2 and ln 2: products with whole numbers of 20 or 13 bits are exact."""
 
 
@@ -92,20 +92,26 @@ def _reduce(x: Node, k: Node, period: Fraction) -> Node:
     return x
 
 
+# Taylor's coefficients of s^k, s the square of the argument, of what is left of a function when its
+# first terms are taken off.
 def _sine_series(k: int) -> Fraction:
-    return Fraction((-1) ** k, math.factorial(2 * k + 1))
+    return Fraction((-1) ** (k + 1), math.factorial(2 * k + 3))
 
 
 def _cosine_series(k: int) -> Fraction:
-    return Fraction((-1) ** k, math.factorial(2 * k))
+    return Fraction((-1) ** k, math.factorial(2 * k + 4))
 
 
-def _tail_series(k: int) -> Fraction:
-    return Fraction(1, math.factorial(k + 2))
+def _even_series(k: int) -> Fraction:
+    return Fraction(1, math.factorial(2 * k + 2))
+
+
+def _odd_series(k: int) -> Fraction:
+    return Fraction(1, math.factorial(2 * k + 3))
 
 
 def _arctangent_series(k: int) -> Fraction:
-    return Fraction((-1) ** k, 2 * k + 1)
+    return Fraction((-1) ** (k + 1), 2 * k + 3)
 
 
 def _logarithm_series(k: int) -> Fraction:
@@ -140,18 +146,18 @@ def signed(x: Node, like: Node) -> Node:
 def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
     """Return both; the graph keeps what they share once."""
     g, eps = x.graph, _EPS[x.graph.bits]
-    k = g.make("rint", x * (2.0 / math.pi))
-    r = _reduce(x, k, _PI / 2)
+    # Adding 1.5 2^52 leaves the whole number nearest to x / (pi / 2) in the last bits.
+    magic = 1.5 * 2.0 ** (52 if g.bits == 64 else 23)
+    shifted = x * (2.0 / math.pi) + magic
+    r = _reduce(x, g.make("apart", shifted, magic), _PI / 2)
     s, width = r * r, 0.62  # (pi / 4)^2 is 0.617
-    sine = r + r * s * polynomial(s, _economized(lambda k: _sine_series(k + 1), width, eps))
-    cosine = polynomial(s, _economized(lambda k: _cosine_series(k + 2), width, eps))
+    sine = r + r * s * polynomial(s, _economized(_sine_series, width, eps))
+    cosine = polynomial(s, _economized(_cosine_series, width, eps))
     cosine = (1.0 - 0.5 * s) + s * s * cosine
-    # The quarter of the circle, 0 to 3.
-    quarter = k - 4.0 * g.make("floor", 0.25 * k)
-    odd = g.make("ne", quarter - 2.0 * g.make("floor", 0.5 * quarter), 0.0)
-    first, second = choose(odd, cosine, sine), choose(odd, sine, cosine)
-    lower = g.make("le", 2.0, quarter)
+    # The quarter of the circle, 0 to 3, in two bits.
+    odd, lower = g.make("bit0", shifted), g.make("bit1", shifted)
     left = g.make("xor", odd, lower)
+    first, second = choose(odd, cosine, sine), choose(odd, sine, cosine)
     return choose(lower, -first, first), choose(left, -second, second)
 
 
@@ -186,8 +192,8 @@ def _scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
 def _both_signs(r: Node, eps: float) -> Node:
     """Return (e^r - 1 - r) / r^2 for |r| <= 0.35, even and odd powers apart."""
     s = r * r
-    even = polynomial(s, _economized(lambda k: _tail_series(2 * k), 0.123, eps))
-    odd = polynomial(s, _economized(lambda k: _tail_series(2 * k + 1), 0.123, eps))
+    even = polynomial(s, _economized(_even_series, 0.123, eps))
+    odd = polynomial(s, _economized(_odd_series, 0.123, eps))
     return even + r * odd
 
 
@@ -298,7 +304,7 @@ def atan2(y: Node, x: Node) -> Node:
     t = choose(far, (ratio - 1.0) / (ratio + 1.0), ratio)
     s = t * t
     width = math.tan(math.pi / 8) ** 2
-    series = _economized(lambda k: _arctangent_series(k + 1), width, _EPS[g.bits])
+    series = _economized(_arctangent_series, width, _EPS[g.bits])
     angle = t + t * s * polynomial(s, series)
     angle = choose(far, math.pi / 4 + angle, angle)
     rest = float(_PI / 2 - Fraction(math.pi / 2))
@@ -324,12 +330,15 @@ def acos(x: Node) -> Node:
 
 def cbrt(x: Node) -> Node:
     """Return the cube root of x."""
-    a = size(x)
+    # What is too small to have all its digits is made larger by a cube first.
+    low = _less(size(x), x.graph.constant(2.0**-900 if x.graph.bits == 64 else 2.0**-96))
+    a = choose(low, size(x) * 2.0**90, size(x))
     root = exp(log(a) / 3.0)
     # One step of Newton's doubles the digits.
     better = root - (root * root * root - a) / (3.0 * root * root)
     usual = x.graph.make("and", _less(0.0, a), _less(a, x.graph.constant(math.inf)))
-    return signed(choose(usual, better, a), x)
+    result = choose(usual, better, a)
+    return signed(choose(low, result * 2.0**-30, result), x)
 
 
 def integer_power(x: Node, exponent: int) -> Node:

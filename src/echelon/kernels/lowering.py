@@ -4,9 +4,10 @@ JAX traces the function of one agent, and each equation of the trace is evaluate
 cannot be is told with the primitive, and the file and line where the user wrote it.
 """
 
+import contextlib
 import functools
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn, final
 
 import jax
@@ -35,13 +36,16 @@ class _Missing:
     def __init__(self, primitive: str, where: str) -> None:
         self.primitive, self.where = primitive, where
 
-    def __getattr__(self, name: str) -> NoReturn:
+    __array_ufunc__ = None
+
+    def _read(self, *_: object) -> NoReturn:
         raise Unsupported(f"`{self.primitive}`{self.where}")
 
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _read
+    __truediv__ = __rtruediv__ = __neg__ = __float__ = __bool__ = _read
 
-def lower(
-    function: Callable[..., Any], graph: Graph, arguments: Sequence[Any]
-) -> list[np.ndarray]:
+
+def lower(function: Callable[..., Any], graph: Graph, arguments: Sequence[Any]) -> list[np.ndarray]:
     """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
 
     Args:
@@ -90,6 +94,17 @@ def _where(equation: Any) -> str:
     return "" if frame is None else f" in {frame.file_name}, line {frame.start_line}"
 
 
+@contextlib.contextmanager
+def _within(equation: Any) -> Iterator[None]:
+    """Say where a call stands if what it calls was traced once for all, far from its caller."""
+    try:
+        yield
+    except Unsupported as error:
+        if ", line " in str(error):
+            raise
+        raise Unsupported(f"{error}{_where(equation)}") from None
+
+
 def _algebra(graph: Graph) -> Algebra:
     def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
         name = equation.primitive.name
@@ -97,10 +112,17 @@ def _algebra(graph: Graph) -> Algebra:
             return _STRUCTURED[name](graph, equation, operands)
         if name in _DETOURS:
             missing = _Missing(name, _where(equation))
-            return [np.full(v.aval.shape, missing, object) for v in equation.outvars]
+            return [_filled(v.aval.shape, missing) for v in equation.outvars]
         raise Unsupported(f"`{name}`{_where(equation)}")
 
-    return Algebra(_rules(graph), float, lambda n: n, lambda: float("nan"), unknown)
+    return Algebra(_rules(graph), float, lambda n: n, lambda: float("nan"), unknown, _within)
+
+
+def _filled(shape: tuple[int, ...], entry: object) -> np.ndarray:
+    made = np.empty(shape, object)
+    for place in np.ndindex(*shape):
+        made[place] = entry
+    return made
 
 
 def _rules(graph: Graph) -> dict[str, Rule]:
@@ -243,9 +265,7 @@ def _while(graph: Graph, equation: Any, operands: list[np.ndarray]) -> list[np.n
         if not more:
             return carry
         carry = walk(body.jaxpr, body.consts, [*used, *carry], _algebra(graph))
-    raise Unsupported(
-        f"a `while` loop whose end depends on the agent, or is far{_where(equation)}"
-    )
+    raise Unsupported(f"a `while` loop whose end depends on the agent, or is far{_where(equation)}")
 
 
 def _solve(graph: Graph, equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
@@ -289,16 +309,18 @@ def _eliminate(graph: Graph, matrix: np.ndarray, right: np.ndarray) -> np.ndarra
     A, b, n = matrix.copy(), right.copy(), len(matrix)
     for k in range(n):
         for i in range(k + 1, n):
-            larger = graph.make(
-                "lt", graph.make("abs", A[k, k]), graph.make("abs", A[i, k])
-            )
+            larger = graph.make("lt", graph.make("abs", A[k, k]), graph.make("abs", A[i, k]))
             for one in (A, b[:, None]):
-                up = [graph.make("select", larger, q, p) for p, q in zip(one[k], one[i])]
-                one[i] = [graph.make("select", larger, p, q) for p, q in zip(one[k], one[i])]
+                up = [
+                    graph.make("select", larger, q, p) for p, q in zip(one[k], one[i], strict=True)
+                ]
+                one[i] = [
+                    graph.make("select", larger, p, q) for p, q in zip(one[k], one[i], strict=True)
+                ]
                 one[k] = up
         for i in range(k + 1, n):
             factor = A[i, k] / A[k, k]
-            A[i, k:] = A[i, k:] - factor * A[k, k:]
+            A[i, k:] = [p - factor * q for p, q in zip(A[i, k:], A[k, k:], strict=True)]
             b[i] = b[i] - factor * b[k]
     for k in reversed(range(n)):
         rest = b[k]

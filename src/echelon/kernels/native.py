@@ -1,5 +1,6 @@
 """Code for this machine from text for LLVM, kept between processes, and called by address."""
 
+import contextlib
 import ctypes
 import hashlib
 import os
@@ -57,7 +58,11 @@ class Code:
         binding = llvm()
         target = binding.Target.from_default_triple()
         self._machine = target.create_target_machine(
-            cpu=binding.get_host_cpu_name(), features=features(), opt=3, codemodel="jitdefault"
+            cpu=binding.get_host_cpu_name(),
+            features=features(),
+            opt=3,
+            reloc="pic",
+            codemodel="small",
         )
         stored = _stored(text, binding, cache_folder)
         made = None if stored is None else _read(stored)
@@ -69,7 +74,11 @@ class Code:
         name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
         builder = binding.JITLibraryBuilder().add_object_img(made).export_symbol("run")
         self._library = builder.link(self._jit, name)
-        self.call = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._library["run"])
+        self._run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._library["run"])
+
+    def call(self, slots: np.ndarray) -> None:
+        """Run the kernel on what 64-bit slots hold: addresses and whole numbers, as in `SLOTS`."""
+        self._run(slots.ctypes.data)
 
     def _compile(self, binding: Any, text: str) -> bytes:
         module = binding.parse_assembly(text)
@@ -110,7 +119,8 @@ def _keep(file: Path, made: bytes) -> None:
         beside.write_bytes(hashlib.sha256(made).digest() + made)
         beside.replace(file)
     except OSError:
-        beside.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            beside.unlink()
 
 
 def aligned(shape: tuple[int, ...], dtype: np.dtype[Any] | type) -> np.ndarray:

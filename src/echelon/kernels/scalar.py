@@ -46,12 +46,15 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "select": lambda which, a, b: a if which else b,
     # 2^k, and the parts of |x| = m 2^e with m in [sqrt(1/2), sqrt(2)): by the bits of a number.
     "pow2": lambda k: float(np.ldexp(1.0, int(k))),
+    # The last two bits of a number to which 1.5 2^52 was added (2^23 in single precision).
+    "bit0": lambda x: int(x) % 2 == 1,
+    "bit1": lambda x: int(x) // 2 % 2 == 1,
     "exponent": lambda x: float(np.round(np.log2(x))),
     "mantissa": lambda x: x / 2.0 ** float(np.round(np.log2(x))),
 }
-TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not"}
+TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1"}
 _COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
-_NEVER_FOLDED = {"exponent", "mantissa"}
+_NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1"}
 
 
 @final
@@ -146,9 +149,7 @@ class Graph:
         key = (op, *(a.number for a in args))
         return self._once(key, op, args, None, all(a.uniform for a in args))
 
-    def _once(
-        self, key: Any, op: str, args: tuple[Node, ...], value: Any, uniform: bool
-    ) -> Node:
+    def _once(self, key: Any, op: str, args: tuple[Node, ...], value: Any, uniform: bool) -> Node:
         if key not in self._known:
             self._known[key] = Node(self, op, args, value, uniform)
         return self._known[key]
@@ -250,6 +251,8 @@ _SIMPLER: dict[str, Callable[..., Node | None]] = {
     "div": _quotient,
     "neg": _negation,
     "abs": lambda a: a if a.op == "abs" else None,
+    "eq": lambda a, b: a.graph.make("not", a.graph.make("xor", a, b)) if a.truth else None,
+    "ne": lambda a, b: a.graph.make("xor", a, b) if a.truth else None,
     "not": lambda a: a.args[0] if a.op == "not" else None,
     "select": _choice,
     "and": _both,

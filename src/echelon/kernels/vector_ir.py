@@ -183,10 +183,24 @@ def _mantissa(w: Writer, x: str, uniform: bool) -> str:
     return w.put(f"bitcast {w._integers(uniform)} {m} to {w.kind(False, uniform)}")
 
 
+def _bit(place: int) -> Callable[[Writer, str, bool], str]:
+    """Return what writes whether a bit of a number is set."""
+
+    def write(w: Writer, x: str, uniform: bool) -> str:
+        real, whole = w.kind(False, uniform), w._integers(uniform)
+        as_bits = w.put(f"bitcast {real} {x} to {whole}")
+        kept = w.put(f"and {whole} {as_bits}, {w.integer(1 << place, uniform)}")
+        return w.put(f"icmp ne {whole} {kept}, {w.integer(0, uniform)}")
+
+    return write
+
+
 _BITS: dict[str, Callable[[Writer, str, bool], str]] = {
     "pow2": _pow2,
     "exponent": _exponent,
     "mantissa": _mantissa,
+    "bit0": _bit(0),
+    "bit1": _bit(1),
 }
 
 

@@ -10,9 +10,11 @@ from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.trace import check_array, traced
 from echelon.core.words import Feedforward
-from echelon.laws.law import Law, LocalView
+from echelon.laws.law import Law, LocalView, reference_of
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+from echelon.references.demand import reference_warnings
+from echelon.references.reference import Reference
 
 _ADVICE = "it must be written with `jax.numpy` and take what one agent knows"
 
@@ -32,6 +34,18 @@ def prepare_law(law: Law, model: ControlAffine, graph: Graph) -> Law:
             )
         _check_law(ready, model)
     return ready
+
+
+def leader_warnings(
+    law: Law, model: ControlAffine, horizon: float, limits: bool
+) -> tuple[str, ...]:
+    """Return what of its reference a leader cannot do over a horizon (s), a sentence each."""
+    reference = reference_of(law)
+    # By flatness it is an exact motion, and without limits there is nothing to look for.
+    exact = isinstance(reference, Reference) and not (limits and model.input_limits)
+    if reference is None or exact:
+        return ()
+    return reference_warnings(model, reference, horizon, limits)
 
 
 @kept

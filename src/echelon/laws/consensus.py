@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from echelon.core.errors import LawError, did_you_mean, listing
 from echelon.core.types import Array, Input, State
-from echelon.core.words import Feedforward
+from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward
 from echelon.gains.gain import Gain
 from echelon.gains.strings import string_growth
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
@@ -33,11 +33,11 @@ class Consensus(Law):
 
     Args:
         gain: P, R and c.
-        feedforward: `none`, or what is sent of others' inputs of the same step, after their limits:
-            `relay`, the leader's normalized input; `relay-velocity`, the velocity g S v that it
-            makes, of which each follower takes the input nearest in P; `parent`, on a tree, the
-            normalized input of the neighbour nearer to the leader. The paper's network gives none
-            of this.
+        feedforward: what is sent of others' inputs of the same step, after their limits, `relay`
+            unless given: `none`; `relay`, the leader's normalized input; `relay-velocity`, the
+            velocity g S v that it makes, of which each follower takes the input nearest in P;
+            `parent`, on a tree, the normalized input of the neighbour nearer to the leader. The
+            paper's network gives none of this.
         trim: whether the trim input u* is applied; the paper's printed law has none (literal:
             False).
     """
@@ -45,7 +45,7 @@ class Consensus(Law):
     gain: Gain
     # Static: what is sent decides the structure of a step, so each choice is compiled for itself.
     feedforward: Feedforward = eqx.field(
-        default=Feedforward.NONE, static=True, converter=_feedforward
+        default=DEFAULT_FEEDFORWARD, static=True, converter=_feedforward
     )
     trim: bool = eqx.field(default=True, static=True)
 

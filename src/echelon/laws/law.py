@@ -16,6 +16,7 @@ from echelon.core.words import Feedforward
 from echelon.gains.gain import Gain
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+from echelon.references.guide import Guide
 
 Memory: TypeAlias = Any
 
@@ -76,6 +77,10 @@ class Law(eqx.Module):
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
         """Return the states (T, n) that the law follows, or None where it follows nothing."""
+        return None
+
+    def own_mode(self, model: ControlAffine) -> float | None:
+        """Return the slowest mode (1/s) of a leader about what it follows; None if not known."""
         return None
 
     def metric(self, model: ControlAffine) -> Array | None:
@@ -139,6 +144,12 @@ def gain_of(law: Law) -> Gain | None:
     # By name, since a law may be a user's own, and need not have one.
     gain = getattr(law, "gain", None)
     return gain if isinstance(gain, Gain) else None
+
+
+def reference_of(law: object) -> Guide | None:
+    """Return what a law follows, where it keeps it as echelon's own do, as its `reference`."""
+    reference = getattr(law, "reference", None)
+    return reference if isinstance(reference, Guide) else None
 
 
 def without_certificates(law: Law) -> Law:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import LawError, ReferenceError, check_kind
+from echelon.core.errors import LawError, ReferenceError
 from echelon.core.types import Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
@@ -16,15 +16,17 @@ from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-from echelon.references.flatness import check_flat, follow, follow_at
-from echelon.references.reference import Reference, check_reference
+from echelon.references.flatness import follow_at
+from echelon.references.guide import Guide
+from echelon.references.reference import check_kind_of, check_reference
 
 
 class Tracking(Law):
     """u_L = u_r(t) - S R^-1 (g S)'P (x - x_r(t)) [- S c R^-1 (g S)'P (e_L + d_L)].
 
-    (x_r, u_r) comes from the model's flatness map. The last term is the paper's reaction of the
-    leader to its neighbours (its leader law), present when `reaction` is given.
+    (x_r, u_r) is the reference's, by the model's flatness map or as given. The last term is the
+    paper's reaction of the leader to its neighbours (its leader law), present when `reaction` is
+    given.
 
     Args:
         reference: the path to follow.
@@ -32,13 +34,13 @@ class Tracking(Law):
         reaction: the followers' gain, when the leader reacts to them.
     """
 
-    reference: Reference
+    reference: Guide
     gain: Gain | None = None
     reaction: Gain | None = None
 
     def __check_init__(self) -> None:
         """Refuse what is no reference."""
-        check_kind("reference", self.reference, Reference, ReferenceError)
+        check_kind_of(self.reference)
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -47,8 +49,8 @@ class Tracking(Law):
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Tracking":
         """Complete the gain where it is not, and check that the model can follow a reference."""
-        check_flat(model)
         check_reference(self.reference)
+        self.reference.fit(model)
         if self.reaction is not None:
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
         gain = tracking_gain(self, model, graph, self.gain)
@@ -64,7 +66,7 @@ class Tracking(Law):
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
-        return follow(model, self.reference, t)
+        return self.reference.follow(model, t)
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""

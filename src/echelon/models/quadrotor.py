@@ -16,13 +16,13 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
 from echelon.models.model import ControlAffine, Limits, Rows, check_positive, diagonal, wound
 from echelon.models.rigid_body import (
+    attitude_along,
     body_rates,
     check_inertia,
     check_moments,
     euler_rates,
     free_spin,
     thrust_axis,
-    tilt_towards,
 )
 from echelon.models.rotors import attitude_priority, fits
 
@@ -204,15 +204,9 @@ class Quadrotor(ControlAffine):
 
         The path is given with its first four derivatives, (5, 4).
         """
-        position, velocity, acceleration, jerk, snap = derivatives[:, :3]
-        yaw = derivatives[:3, 3]
+        position, velocity, acceleration = derivatives[:3, :3]
         up = jnp.array([0.0, 0.0, self.gravity], derivatives.dtype)
-
-        def attitude(s: jax.Array) -> State:
-            # Taylor's polynomials: the attitude is needed to its second derivative at s = 0, and no
-            # further.
-            lift = acceleration + up + s * jerk + 0.5 * s**2 * snap
-            return tilt_towards(lift, yaw[0] + s * yaw[1] + 0.5 * s**2 * yaw[2])
+        attitude = attitude_along(derivatives, self.gravity)
 
         def rate(s: jax.Array) -> State:
             return body_rates(*_with_rate(attitude, s))

@@ -6,11 +6,13 @@ input. Gains made for these agents say what formation laws can promise above suc
 
 import math
 
+import jax
 import jax.numpy as jnp
 
-from echelon.core.types import InputMap, Output, State
+from echelon.core.numerics import derivatives as derivatives_of
+from echelon.core.types import Input, InputMap, Output, Scalar, State
 from echelon.models.model import ControlAffine, check_positive
-from echelon.models.rigid_body import thrust_axis
+from echelon.models.rigid_body import attitude_along, lift_along, thrust_axis
 
 _GROUPS = {
     "position": ("x", "y", "z"),
@@ -20,7 +22,21 @@ _GROUPS = {
 }
 _NAMES = tuple(name for group in _GROUPS.values() for name in group)
 _UNITS = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
+# One over the square of what counts as much, as for the quadrotor under torques.
 _WEIGHTS = (1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3
+
+
+def _flown(path: jax.Array, gravity: float) -> tuple[State, jax.Array, jax.Array]:
+    """Return the 12 states that fly a path (5, 4), the thrust with its rate (2,), and zetaddot."""
+    lift, now = lift_along(path, gravity), jnp.zeros((), path.dtype)
+
+    def thrust(s: Scalar) -> Scalar:
+        return jnp.linalg.norm(lift(s)) - gravity
+
+    # Euler angles and their rates are states here, so that no body rate comes between.
+    zeta, rate, bend = derivatives_of(attitude_along(path, gravity), now, 2)
+    x = jnp.concatenate([path[0, :3], path[1, :3], zeta, rate])
+    return x, derivatives_of(thrust, now, 1), bend
 
 
 class QuadrotorEuler(ControlAffine):
@@ -41,6 +57,9 @@ class QuadrotorEuler(ControlAffine):
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
     chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    flat_outputs = ("x", "y", "z", "yaw")
+    # The path's second derivative sets the attitude, whose second derivative is the input.
+    flat_order = 4
     weights = (_WEIGHTS, (1 / 25,) + (1 / 400,) * 3)
 
     def __check_init__(self) -> None:
@@ -64,6 +83,14 @@ class QuadrotorEuler(ControlAffine):
         """Return position and yaw."""
         return jnp.concatenate([x[:3], x[8:9]])
 
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return the state and input that fly a path (x, y, z, yaw).
+
+        The path is given with its first four derivatives, (5, 4).
+        """
+        x, thrust, bend = _flown(derivatives, self.gravity)
+        return x, jnp.append(thrust[0], bend)
+
 
 class QuadrotorThrust(ControlAffine):
     """The same agent with its thrust as a 13th state, so that g is constant.
@@ -82,6 +109,9 @@ class QuadrotorThrust(ControlAffine):
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
     chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    flat_outputs = ("x", "y", "z", "yaw")
+    # The path's second derivative sets the attitude, whose second derivative is the input.
+    flat_order = 4
     weights = ((*_WEIGHTS, 0.04), (1 / 25,) + (1 / 400,) * 3)
 
     def __check_init__(self) -> None:
@@ -104,3 +134,11 @@ class QuadrotorThrust(ControlAffine):
     def output(self, x: State) -> Output:
         """Return position and yaw."""
         return jnp.concatenate([x[:3], x[8:9]])
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return the state and input that fly a path (x, y, z, yaw).
+
+        The path is given with its first four derivatives, (5, 4).
+        """
+        x, thrust, bend = _flown(derivatives, self.gravity)
+        return jnp.append(x, thrust[0]), jnp.append(thrust[1], bend)

@@ -3,6 +3,7 @@
 Body to world is Rz(yaw) Ry(pitch) Rx(roll).
 """
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 import jax
@@ -91,3 +92,25 @@ def tilt_towards(direction: Vector, yaw: Scalar) -> Vector:
     # atan2 of the two legs keeps the derivative finite where an arcsine of a unit length would not.
     roll = jnp.arctan2(-left, jnp.hypot(forward, direction[2]))
     return jnp.stack([roll, jnp.arctan2(forward, direction[2]), yaw])
+
+
+def lift_along(path: jax.Array, gravity: float) -> Callable[[Scalar], Vector]:
+    """Return the thrust over mass (m/s^2), as a function of time from now, that flies a path.
+
+    The path (x, y, z, ...) is given with its first four derivatives, (5, k); what is returned is
+    right at 0 with its first two derivatives.
+    """
+    acceleration, jerk, snap = path[2:5, :3]
+    up = jnp.array([0.0, 0.0, gravity], path.dtype)
+    # Taylor's polynomial: the attitude is needed to its second derivative at 0, and no further.
+    return lambda s: acceleration + up + s * jerk + 0.5 * s**2 * snap
+
+
+def attitude_along(path: jax.Array, gravity: float) -> Callable[[Scalar], Vector]:
+    """Return the angles zeta, as a function of time from now, that fly a path (x, y, z, yaw).
+
+    The path is given with its first four derivatives, (5, 4); what is returned is right at 0 with
+    its first two derivatives.
+    """
+    lift, yaw = lift_along(path, gravity), path[:3, 3]
+    return lambda s: tilt_towards(lift(s), yaw[0] + s * yaw[1] + 0.5 * s**2 * yaw[2])

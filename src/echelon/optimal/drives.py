@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import check_kind
 from echelon.core.types import Array, State
 from echelon.engine.drive import Drive, Information, Problem, Stepper, Stopped
 from echelon.engine.host import HostStepper
@@ -20,8 +19,10 @@ from echelon.network.graph import Graph, shares
 from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import follow_at, reference_targets, reference_warnings
-from echelon.references.reference import Reference
+from echelon.references.demand import reference_warnings
+from echelon.references.flatness import follow_at, reference_targets
+from echelon.references.guide import Guide
+from echelon.references.reference import check_kind_of
 
 _SETTLING = 20
 """Most quadratic programs of an agent's first plan, which no plan precedes."""
@@ -30,12 +31,12 @@ _SETTLING = 20
 class _Optimized(Drive):
     """A drive whose leaders follow a reference, or keep their trim."""
 
-    reference: eqx.AbstractVar[Reference | None]
+    reference: eqx.AbstractVar[Guide | None]
 
     def __check_init__(self) -> None:
         """Refuse what is no reference."""
         if self.reference is not None:
-            check_kind("reference", self.reference, Reference)
+            check_kind_of(self.reference)
 
     @property
     @abc.abstractmethod
@@ -48,10 +49,10 @@ class _Optimized(Drive):
         return Information(() if self.reference is None else ("the reference",), (self.sent,))
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
-        """Tell how much faster the reference is than the actuators allow, where limits hold."""
-        if self.reference is None or not settings.limits:
+        """Tell what of the reference the agents cannot do."""
+        if self.reference is None:
             return ()
-        return reference_warnings(model, self.reference, settings.horizon)
+        return reference_warnings(model, self.reference, settings.horizon, settings.limits)
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero, or the trim."""
@@ -75,7 +76,7 @@ class Plans(_Optimized):
         options: how the plans are posed.
     """
 
-    reference: Reference | None = None
+    reference: Guide | None = None
     options: TrackingOptions = eqx.field(default_factory=TrackingOptions, static=True)
 
     @property
@@ -124,7 +125,7 @@ class RecedingHorizon(_Optimized):
         mpc: the receding horizon.
     """
 
-    reference: Reference | None = None
+    reference: Guide | None = None
     mpc: MPC = eqx.field(default_factory=MPC, static=True)
 
     @property
@@ -148,7 +149,7 @@ class RecedingHorizon(_Optimized):
 class _Pilots:
     """All agents over a receding horizon: called with the measured states, return the inputs."""
 
-    def __init__(self, problem: Problem, reference: Reference | None, mpc: MPC, hold: int) -> None:
+    def __init__(self, problem: Problem, reference: Guide | None, mpc: MPC, hold: int) -> None:
         began = time.perf_counter()
         settings, graph = problem.settings, problem.graph
         dt = hold * settings.dt

@@ -15,7 +15,7 @@ from echelon.optimal.objectives import Grid, TrackingOptions, coarse, spacing, t
 from echelon.optimal.problem import OptimalControl
 from echelon.optimal.solver import Solver, Trajectory
 from echelon.references.flatness import Targets, mean_targets, reference_targets, shifted_targets
-from echelon.references.reference import Reference
+from echelon.references.guide import Guide
 
 _EASIER = (1e2, 1e4)
 """Factors on the input weight of the problems that lead to one that its solver fails on."""
@@ -62,7 +62,7 @@ def plan_formation(
     states: Array,
     grid: Grid,
     *,
-    reference: Reference | None,
+    reference: Guide | None,
     planning: TrackingOptions,
     limits: bool,
 ) -> FormationPlan:

@@ -22,8 +22,9 @@ from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import TrackingOptions, grid
-from echelon.references.flatness import follow, follow_at, reference_targets, reference_warnings
-from echelon.references.reference import Reference
+from echelon.references.demand import reference_warnings
+from echelon.references.flatness import follow_at, reference_targets
+from echelon.references.guide import Guide
 
 _STEP = 0.005
 """Runge-Kutta step of the plan, s."""
@@ -35,7 +36,7 @@ class OptimalTracking(Law):
     """u_L = u_p(t) - S R^-1 (g S)'P (x - x_p(t)), with (x_p, u_p) a plan of least tracking error.
 
     The plan minimizes the integral of the squared error of the outputs, plus a little of the
-    squared input. After its horizon the law follows the reference by the model's flatness map.
+    squared input. After its horizon the law follows the reference.
 
     Args:
         reference: the path to follow.
@@ -47,7 +48,7 @@ class OptimalTracking(Law):
         gain: of the feedback, used with coupling 1; the model's Riccati gain when left out.
     """
 
-    reference: Reference
+    reference: Guide
     gain: Gain | None
     states: Array | None
     inputs: Array | None
@@ -58,7 +59,7 @@ class OptimalTracking(Law):
 
     def __init__(
         self,
-        reference: Reference,
+        reference: Guide,
         horizon: float = 10.0,
         start_error: Mapping[str, float] | None = None,
         limits: bool = True,
@@ -100,8 +101,8 @@ class OptimalTracking(Law):
         )
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
-        """Tell how much faster the reference is than the actuators allow, where limits hold."""
-        return reference_warnings(model, self.reference, self.horizon) if self.limits else ()
+        """Tell what of the reference the leader cannot do."""
+        return reference_warnings(model, self.reference, self.horizon, self.limits)
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_p, u_p) at time t, or the reference's (x_r, u_r) after the plan.
@@ -113,7 +114,7 @@ class OptimalTracking(Law):
             raise LawError(
                 "`OptimalTracking` has no plan yet; call `prepared(model, graph)` first."
             )
-        x_r, u_r = follow(model, self.reference, t)
+        x_r, u_r = self.reference.follow(model, t)
         dtype, count = x_r.dtype, len(self.inputs)
         span = grid(self.horizon, _STEP, self.planning.interval).interval
         # A time that rounding has left just before an interval belongs to it.

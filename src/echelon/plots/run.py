@@ -23,8 +23,8 @@ _PANELS = 12  # what fits above each other on a page
 def figures(result: Result, lyapunov: Sequence[Array] | None = None) -> "dict[str, Figure]":
     """Return the figures that make sense for a run, by name.
 
-    `leader_3d` is the first leader with its reference: in space or in the plane where the model has
-    a position, else in the phase plane or over time. `trajectories` are all agents, with the graph
+    `leader_3d` is the leaders with their references: in space or in the plane where the model has a
+    position, else in the phase plane or over time. `trajectories` are all agents, with the graph
     drawn at a few times. `tracking_error` is each output of the leader minus the reference's, and
     exists with a reference. `formation_error` is each follower's distance from its goal, with
     gaps where it is 0. `lyapunov` is V with its derivative, and exists where V is given.
@@ -70,22 +70,25 @@ def save_figures(
 
 
 def _leader(result: Result) -> "Figure":
-    """Return the first leader with its reference."""
-    agent = result.graph.leaders[0]
-    path, wanted = result.states[:, agent], _reference(result, agent)
-    axes = _space(result)
+    """Return the leaders, each with its reference."""
+    axes, leaders = _space(result), list(result.graph.leaders)
     if not axes:
-        return _states_over_time(result, [agent])
-    keep = draw.thin(len(path))
-    path, wanted = path[keep][:, axes], None if wanted is None else wanted[keep][:, axes]
-    path, cut = draw.drop_runaways(path, path[:1], *([] if wanted is None else [wanted]))
+        return _states_over_time(result, leaders)
+    keep = draw.thin(len(result.times), 2 * len(leaders))
+    paths = result.states[keep][:, leaders][..., axes].swapaxes(0, 1)
+    wanted = [_reference(result, agent) for agent in leaders]
+    known = [states[keep][:, axes] for states in wanted if states is not None]
+    paths, cut = draw.drop_runaways(paths, paths[:, :1], *known)
     figure, ax = _canvas(result, axes)
-    if wanted is not None:
-        draw.plot(ax, wanted, label="reference", **_REFERENCE)
-    draw.plot(ax, path, label=_name(result, agent), **_pen(result, agent))
-    draw.plot(ax, path[:1], label="start", **draw.dots("o", draw.LEADER, hollow=True))
-    draw.plot(ax, path[-1:], label="end", **draw.dots("s", draw.LEADER))
-    shown = path if wanted is None else np.concatenate([path, wanted])
+    for name, path in zip(["reference", *[None] * len(known)], known):
+        draw.plot(ax, path, label=name, **_REFERENCE)
+    for agent, path in zip(leaders, paths, strict=True):
+        draw.plot(ax, path, label=_name(result, agent, short=True), **_pen(result, agent))
+    for path, named in zip(paths, [True, *[False] * len(leaders)]):
+        for name, place, shape in (("start", path[:1], "o"), ("end", path[-1:], "s")):
+            look = draw.dots(shape, draw.LEADER, hollow=name == "start")
+            draw.plot(ax, place, label=name if named else None, **look)
+    shown = np.concatenate([*paths, *known])
     draw.frame(ax, shown, alike=bool(result.model.position))
     return draw.finish(figure, cut)
 
@@ -179,14 +182,17 @@ def _states_over_time(result: Result, agents: Iterable[int]) -> "Figure":
     """Return a panel for each state, twelve at most, with a line for each of the agents."""
     agents = list(_leaders_first(result, agents))
     keep, cut = draw.thin(len(result.times), len(agents)), False
-    times, wanted = result.times[keep], _reference(result, agents[0])
+    times, wanted = result.times[keep], [_reference(result, agent) for agent in agents]
+    # Behind followers too it would hide their lines.
+    guides = wanted if set(agents) <= {*result.graph.leaders} else []
     figure, panels = _panels(result, min(len(result.model.state_names), _PANELS), 1.4)
     for k, ax in enumerate(panels):
         paths = result.states[:, agents, k, None]
-        known = [] if wanted is None else [wanted[:, k, None]]
+        known = [wanted[0][:, k, None]] if wanted[0] is not None else []
         values, over = draw.drop_runaways(paths, paths[0], *known)
-        if wanted is not None and len(agents) == 1:
-            draw.plot(ax, times, wanted[keep, k], label="reference", **_REFERENCE)
+        for name, guide in zip(["reference", *[None] * len(guides)], guides):
+            if guide is not None:
+                draw.plot(ax, times, guide[keep, k], label=name, **_REFERENCE)
         for agent, line in zip(agents, values[keep].swapaxes(0, 1), strict=True):
             draw.plot(
                 ax, times, line, label=_name(result, agent, short=True), **_pen(result, agent)
@@ -197,21 +203,27 @@ def _states_over_time(result: Result, agents: Iterable[int]) -> "Figure":
 
 
 def _tracking_error(result: Result) -> "Figure | None":
-    """Return the leader's output minus its reference's, a panel for each unit."""
-    errors = output_errors(result)
-    if errors is None:
+    """Return the leaders' outputs minus their references', a panel for each unit."""
+    if result.reference is None:
         return None
-    model, keep, cut = result.model, draw.thin(len(errors)), False
+    leaders, model = result.graph.leaders, result.model
+    # More leaders than have names would be lines that nobody can tell apart.
+    shown = leaders if len(leaders) <= draw.NAMED else leaders[:1]
     units = dict(zip(model.state_names, model.state_units, strict=True))
     # Metres and radians share no axis; a dictionary keeps their order.
     kinds = list(dict.fromkeys(units.get(name, "") for name in model.output_names))
     figure, panels = _panels(result, len(kinds), 1.7)
-    for k, name in enumerate(model.output_names):
-        ax = panels[kinds.index(units.get(name, ""))]
-        values, over = draw.drop_runaways(errors[keep, k, None], errors[:1, k, None])
-        colour = draw.COLOURS[k % len(draw.COLOURS)]
-        draw.plot(ax, result.times[keep], values, label=name.replace("_", " "), color=colour)
-        cut |= over
+    keep, cut = draw.thin(len(result.times), len(shown)), False
+    for place, leader in enumerate(shown):
+        errors, look = output_errors(result, leader), draw.leader_pen(place, result.graph.agents)
+        assert errors is not None  # as there is a reference
+        for k, name in enumerate(model.output_names):
+            values, over = draw.drop_runaways(errors[keep, k, None], errors[:1, k, None])
+            own = {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": look["linestyle"]}
+            label = name.replace("_", " ") + (f", leader {leader}" if len(leaders) > 1 else "")
+            ax = panels[kinds.index(units.get(name, ""))]
+            draw.plot(ax, result.times[keep], values, label=label, **own)
+            cut |= over
     for ax, unit in zip(panels, kinds, strict=True):
         ax.set_ylabel(draw.label("tracking error", unit))
         ax.axhline(0.0, color="0.75", linewidth=0.6, zorder=1)
@@ -275,16 +287,19 @@ _REFERENCE = {"color": draw.REFERENCE, "linestyle": (0, (1.6, 0.9)), "linewidth"
 
 
 def _name(result: Result, agent: int, short: bool = False) -> str | None:
-    """Return an agent's name; where `short`, None for the many followers of a swarm."""
-    if agent in result.graph.leaders:
-        return f"leader {agent}" if not short or agent == result.graph.leaders[0] else None
-    return None if short and result.graph.agents > draw.NAMED else f"follower {agent}"
+    """Return an agent's name; where `short`, None for the many of a swarm but its first leader."""
+    leaders, few = result.graph.leaders, result.graph.agents <= draw.NAMED
+    if agent in leaders:
+        if not short or few or len(leaders) <= draw.NAMED:
+            return f"leader {agent}"
+        return f"{len(leaders)} leaders" if agent == leaders[0] else None
+    return f"follower {agent}" if few or not short else None
 
 
 def _pen(result: Result, agent: int) -> dict[str, Any]:
     leads = agent in result.graph.leaders
-    place = None if leads else bisect.bisect_left(result.graph.followers, agent)
-    return draw.pen(place, result.graph.agents)
+    place = bisect.bisect_left(result.graph.leaders if leads else result.graph.followers, agent)
+    return (draw.leader_pen if leads else draw.pen)(place, result.graph.agents)
 
 
 def _leaders_first(result: Result, agents: Iterable[int]) -> list[int]:

@@ -71,11 +71,20 @@ def crowding(agents: int) -> float:
     return min(1.0, NAMED / agents)
 
 
-def pen(place: int | None, agents: int) -> dict[str, Any]:
-    """Return the look of an agent's line: a leader's for None, else that of a follower's place."""
+# Leaders share their colour, so that nobody takes one for a follower.
+_DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)))
+
+
+def leader_pen(place: int, agents: int) -> dict[str, Any]:
+    """Return the look of the line of a leader of some place among the leaders."""
+    order = 2.5 if crowding(agents) == 1.0 else 5.0
+    dash = _DASHES[place % len(_DASHES)]
+    return {"color": LEADER, "linewidth": 1.4, "zorder": order, "linestyle": dash}
+
+
+def pen(place: int, agents: int) -> dict[str, Any]:
+    """Return the look of the line of a follower of some place among the followers."""
     crowd = crowding(agents)
-    if place is None:
-        return {"color": LEADER, "linewidth": 1.4, "zorder": 2.5 if crowd == 1.0 else 5.0}
     if crowd < 1.0:
         thinner = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
         return {"color": COLOURS[0]} | thinner

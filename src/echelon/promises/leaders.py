@@ -86,7 +86,7 @@ def _slowest(model: ControlAffine, law: object) -> float | None:
     if isinstance(gain, Gain):
         A = A - gain.coupling * B @ np.linalg.solve(gain.R, B.T @ gain.P)
     elif not isinstance(law, TrimInput):
-        return None
+        return law.own_mode(model) if isinstance(law, Law) else None
     return float(np.linalg.eigvals(A).real.max())
 
 

@@ -25,6 +25,32 @@ class Hypothesis(Word):
     CLAIMS = "claims of the gain"
 
 
+class Line(Word):
+    """What else a check says; the value is what tables call it."""
+
+    AUTONOMOUS = "Assumption 1, autonomous"
+    GRAPH = "Assumption 2, graph"
+    FOLLOWS = "who follows whom"
+    GROUNDED = "Assumption 6, M L = I"
+    POSITIVE = "Lemma 1, L > 0"
+    SCHUR = "Lemma 2, Schur complement"
+    EDGES = "Lemma 3, sum over edges"
+    TRACKS = "Assumption 4, leader tracks"
+    ASKED = "reference, what it asks"
+    MONOTONE = "Assumption 5, P-monotone drift"
+    ALONG = "Lemma 4, drift along z"
+    PRINTED = "LMI as printed"
+    FINITE = "finite condition on P"
+    KILLING = "Killing residual of g"
+    MARGINS = "margins"
+    GAIN = "gain margin"
+    DELAY = "delay margin"
+    SCALING = "input scaling"
+    PUSHED = "disturbance, network"
+    PUSHED_MODE = "disturbance, one mode"
+    STRING = "string gain"
+
+
 class Statement(NamedTuple):
     """A hypothesis of a promise, or another line of a check.
 
@@ -39,7 +65,7 @@ class Statement(NamedTuple):
         reason: what the failure says against any promise; empty where it leaves one.
     """
 
-    statement: Hypothesis | str
+    statement: Hypothesis | Line
     verdict: Verdict
     kind: Kind
     number: float | None = None
@@ -51,7 +77,7 @@ class Statement(NamedTuple):
     @property
     def name(self) -> str:
         """What tables call it."""
-        return self.statement.value if isinstance(self.statement, Hypothesis) else self.statement
+        return self.statement.value
 
     @property
     def fails(self) -> bool:

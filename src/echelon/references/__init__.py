@@ -2,7 +2,17 @@
 
 from echelon.references.periodic import Circle, FigureEight, Lemniscate
 from echelon.references.reference import Reference
+from echelon.references.state_path import StatePath
 from echelon.references.straight import Hover, Line
 from echelon.references.waypoints import Waypoints
 
-__all__ = ["Circle", "FigureEight", "Hover", "Lemniscate", "Line", "Reference", "Waypoints"]
+__all__ = [
+    "Circle",
+    "FigureEight",
+    "Hover",
+    "Lemniscate",
+    "Line",
+    "Reference",
+    "StatePath",
+    "Waypoints",
+]

@@ -3,20 +3,21 @@
 import abc
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import ReferenceError, check_kind
+from echelon.core.errors import LawError, ReferenceError, check_kind, listing
 from echelon.core.numerics import derivatives, precision
-from echelon.core.trace import check_function
-from echelon.core.types import Array, Scalar
+from echelon.core.trace import check_array, check_function, traced
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.models.model import ControlAffine
+from echelon.references.guide import Guide
 
 COORDINATES = ("x", "y", "z", "yaw")
 
 
-class Reference(eqx.Module):
+class Reference(Guide):
     """A path t -> (x, y, z, yaw), in metres and radians; t in seconds."""
 
     @abc.abstractmethod
@@ -31,6 +32,55 @@ class Reference(eqx.Module):
         # Before differentiating, so that what the model ignores costs no derivatives.
         picked = np.array([COORDINATES.index(name) for name in coordinates])
         return derivatives(lambda s: self(s)[picked], t, order)
+
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return the state (n,) and the input (m,) by the model's flatness map."""
+        return model.flat(self.derivatives(t, model.flat_order, model.flat_outputs))
+
+    def check(self) -> None:
+        """Check that (x, y, z, yaw) is returned."""
+        with precision("float64"):
+            check_function(
+                ReferenceError,
+                f"the point of `{type(self).__name__}`",
+                self,
+                jnp.zeros(()),
+                shape=(len(COORDINATES),),
+                advice="it must be written with `jax.numpy` and take one time",
+            )
+
+    def fit(self, model: ControlAffine) -> None:
+        """Check that the model has a flatness map, of outputs that a reference gives."""
+        name, unknown = type(model).__name__, set(model.flat_outputs) - set(COORDINATES)
+        if not model.flat_outputs:
+            raise LawError(
+                f"`{name}` cannot be led along a reference, since it defines no `flat` map; add "
+                "`flat_outputs`, `flat_order` and `flat` to it, give its states and inputs over "
+                "time (`states`), or use the law `passive`."
+            )
+        if unknown:
+            raise LawError(
+                f"`flat_outputs` of `{name}` names {listing(sorted(unknown))}, and a reference "
+                f"gives {listing(COORDINATES)}."
+            )
+        _check_map(model)
+
+
+def _check_map(model: ControlAffine) -> None:
+    """Trace the flatness map, and check the state and the input that it returns."""
+    name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
+    with precision("float64"):
+        found = traced(
+            LawError,
+            f"`flat` of `{name}`",
+            model.flat,
+            jnp.zeros((model.flat_order + 1, len(model.flat_outputs))),
+            advice="it must be written with `jax.numpy` and take the outputs' derivatives",
+        ).result
+    if not isinstance(found, tuple | list) or len(found) != 2:
+        raise LawError(f"`flat` of `{name}` must return two things, a state and an input.")
+    for what, value, size in zip(("state", "input"), found, shapes, strict=True):
+        check_array(LawError, f"the {what} that `flat` of `{name}` makes", value, (size,))
 
 
 def check_finite(owner: Reference, **values: object) -> None:
@@ -62,22 +112,25 @@ def numbers_of(value: object) -> Array:
     return array.astype(np.float64) if array.dtype.kind in "iuf" else np.array([np.nan])
 
 
-def check_reference(reference: Reference) -> None:
-    """Check that a reference is one, and that it returns (x, y, z, yaw).
+def check_kind_of(reference: object) -> None:
+    """Check that a reference is one.
 
     Raises:
-        ReferenceError: it is none, or returns something else.
+        ReferenceError: it is none.
     """
-    check_kind("reference", reference, Reference, ReferenceError)
-    with precision("float64"):
-        check_function(
-            ReferenceError,
-            f"the point of `{type(reference).__name__}`",
-            reference,
-            jnp.zeros(()),
-            shape=(len(COORDINATES),),
-            advice="it must be written with `jax.numpy` and take one time",
-        )
+    # A path of states is one too, though no `Reference`, which is the name that users know.
+    kind = Guide if isinstance(reference, Guide) else Reference
+    check_kind("reference", reference, kind, ReferenceError)
+
+
+def check_reference(reference: Guide) -> None:
+    """Check that a reference is one, and what it returns.
+
+    Raises:
+        ReferenceError: it is none, or returns something else than the interface says.
+    """
+    check_kind_of(reference)
+    reference.check()
 
 
 def in_space(point: jax.Array, yaw: float) -> jax.Array:

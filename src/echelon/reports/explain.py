@@ -6,6 +6,7 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.engine.result import Result
+from echelon.network.hearing import who_hears_whom
 from echelon.promises.covering import coverage
 from echelon.promises.promise import Promise, promise
 from echelon.promises.statement import Hypothesis
@@ -116,6 +117,8 @@ def _promises(result: Result, found: Promise) -> Iterator[str]:
             f"{found.loop.closed.coupling:.4g}{edge}."
         )
     yield from coverage(result, found)
+    if len(result.graph.leaders) > 1:
+        yield f"Who follows whom: {who_hears_whom(result.graph)}; goals are the nearest leader's."
     needs = ", ".join(result.drive.information.follower) or "nothing from others"
     yield f"Each follower is told: {needs}."
 

@@ -4,8 +4,8 @@ A table like the paper's Table II, and what it shows, in sentences.
 """
 
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 from echelon.core.errors import Outcome
 from echelon.engine.result import Result
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-# Above this many followers the table shows the best, the median and the worst instead of all.
+# Above this many of a role the table shows the best, the median and the worst instead of all.
 _MANY = 12
 
 
@@ -82,33 +82,43 @@ def _title(result: Result) -> str:
 
 
 def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
-    leaders, followers = result.graph.leaders, numbers.followers
-    limited = float(result.saturated[leaders[0]])
-    rows = [_leader_row(numbers.leader, limited)]
-    chosen = followers if len(followers) <= _MANY else _representatives(followers)
-    labels = [f"follower {each.agent}" for each in chosen]
-    if len(followers) > _MANY:
-        labels = [
-            f"{kind} ({label})"
-            for kind, label in zip(("best", "median", "worst"), labels, strict=True)
-        ]
-    rows += [_follower_row(label, each) for label, each in zip(labels, chosen, strict=True)]
+    leaders, followers = numbers.leaders, numbers.followers
+    # One leader needs no number, and has its name from the paper's table.
+    alone = ["leader"] if len(leaders) == 1 else None
+    rows = [_leader_row(label, each) for label, each in _labelled("leader", leaders, alone)]
+    rows += [_follower_row(label, each) for label, each in _labelled("follower", followers)]
     if printed:
         for k, row in enumerate(rows):
             row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
     return rows
 
 
-def _representatives(followers: Sequence[FollowerMetrics]) -> list[FollowerMetrics]:
-    def key(each: FollowerMetrics) -> float:
+_Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)
+
+
+def _labelled(
+    role: str, each: Sequence[_Row], labels: list[str] | None = None
+) -> Iterator[tuple[str, _Row]]:
+    """Yield all of a role, or of many the best, the median and the worst, each with its label."""
+    kinds, chosen = [""] * len(each), each
+    if len(each) > _MANY:
+        kinds, chosen = ["best ", "median ", "worst "], _representatives(each)
+    names = labels or [f"{role} {one.agent}" for one in chosen]
+    for kind, name, one in zip(kinds, names, chosen, strict=True):
+        yield (f"{kind}({name})" if kind else name), one
+
+
+def _representatives(all_: Sequence[_Row]) -> list[_Row]:
+    def key(each: _Row) -> float:
         return float("inf") if each.steady_rmse is None else each.steady_rmse
 
-    ordered = sorted(followers, key=key)
+    ordered = sorted(all_, key=key)
     return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
 
 
-def _leader_row(leader: LeaderMetrics, limited: float) -> list[str]:
-    return ["leader", _number(leader.rmse), _number(leader.steady_rmse), "", "", _percent(limited)]
+def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:
+    errors = [_number(leader.rmse), _number(leader.steady_rmse)]
+    return [label, *errors, "", "", _percent(leader.saturated)]
 
 
 def _follower_row(label: str, each: FollowerMetrics) -> list[str]:

@@ -116,6 +116,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         "seed": result.settings.seed,
         **result.world.describe(result.model),
         "leader": numbers.leader._asdict(),
+        "leaders": [each._asdict() for each in numbers.leaders],
         "followers": [_follower(each._asdict()) for each in numbers.followers],
         "edges": [
             {"edge": list(each.edge), "distance_rmse": each.distance_rmse} for each in numbers.edges

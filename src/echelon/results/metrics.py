@@ -16,11 +16,16 @@ from echelon.models.model import ControlAffine
 
 
 class LeaderMetrics(NamedTuple):
-    """Root-mean-square deviation of the leader from its reference; None without a reference."""
+    """Root-mean-square deviation of a leader from its reference; None without a reference.
+
+    `saturated` is the fraction of steps in which a limit acted.
+    """
 
     rmse: float | None
     steady_rmse: float | None
     rmse_by_output: dict[str, float | None]
+    agent: int = 0
+    saturated: float = 0.0
 
 
 class FollowerMetrics(NamedTuple):
@@ -53,12 +58,17 @@ class Metrics(NamedTuple):
     diverged has no errors. The least distance is over the stored frames.
     """
 
-    leader: LeaderMetrics
+    leaders: tuple[LeaderMetrics, ...]
     followers: tuple[FollowerMetrics, ...]
     edges: tuple[EdgeMetrics, ...]
     minimum_distance: float | None
     saturation_fraction: float
     steady_window: float
+
+    @property
+    def leader(self) -> LeaderMetrics:
+        """The numbers of the first leader."""
+        return self.leaders[0]
 
     @property
     def worst_steady(self) -> float | None:
@@ -72,7 +82,7 @@ def metrics(result: Result) -> Metrics:
     exists = result.outcome is not Outcome.DIVERGED and bool(result.sums.steps[0] > 0)
     with np.errstate(over="ignore", invalid="ignore"):
         return Metrics(
-            leader=_leader(result, exists),
+            leaders=_leaders(result, exists),
             followers=_followers(result, exists),
             edges=_edges(result, exists),
             minimum_distance=_minimum_distance(result),
@@ -88,11 +98,14 @@ def formation_errors(result: Result) -> Array:
         return np.linalg.norm(result.errors[:, :, list(result.measured)], axis=2)
 
 
-def output_errors(result: Result) -> Array | None:
-    """Return the first leader's output minus the reference's, (T, q); None without a reference."""
+def output_errors(result: Result, leader: int | None = None) -> Array | None:
+    """Return a leader's output minus the reference's, (T, q); None without a reference.
+
+    It is the first leader's unless one is given.
+    """
     if result.reference is None or not len(result.times):
         return None
-    leader = result.graph.leaders[0]
+    leader = result.graph.leaders[0] if leader is None else leader
     wanted = result.reference + result.formation.offsets[leader]
     with precision("float64"):
         return np.asarray(
@@ -110,17 +123,24 @@ def _root_mean(total: Any, steps: Any) -> float | None:
     return finite_or_none(np.sqrt(total / steps)) if steps > 0 else None
 
 
-def _leader(result: Result, exists: bool) -> LeaderMetrics:
-    """Return the numbers of the first leader."""
+def _leaders(result: Result, exists: bool) -> tuple[LeaderMetrics, ...]:
     names, sums = result.model.output_names, result.sums
-    if not exists or result.reference is None:
-        return LeaderMetrics(None, None, dict.fromkeys(names))
-    whole, steady = (_root_mean(*pair) for pair in zip(sums.tracking[:, 0], sums.steps))
-    by_output = {
-        name: _root_mean(total, sums.steps[0])
-        for name, total in zip(names, sums.outputs[0], strict=True)
-    }
-    return LeaderMetrics(whole, steady, by_output)
+    known, (steps, steady) = exists and result.reference is not None, sums.steps
+
+    def one(k: int, agent: int) -> LeaderMetrics:
+        saturated = float(result.saturated[agent])
+        if not known:
+            return LeaderMetrics(None, None, dict.fromkeys(names), agent, saturated)
+        outputs = (_root_mean(total, steps) for total in sums.outputs[k])
+        return LeaderMetrics(
+            _root_mean(sums.tracking[0, k], steps),
+            _root_mean(sums.tracking[1, k], steady),
+            dict(zip(names, outputs, strict=True)),
+            agent,
+            saturated,
+        )
+
+    return tuple(one(k, agent) for k, agent in enumerate(result.graph.leaders))
 
 
 def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:

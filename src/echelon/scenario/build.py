@@ -5,6 +5,7 @@ Names are looked up in the registry alone.
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from echelon.core.errors import (
@@ -12,6 +13,7 @@ from echelon.core.errors import (
     MissingExtraError,
     ModelError,
     ScenarioError,
+    listing,
 )
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
@@ -31,6 +33,7 @@ from echelon.models.check import check_model
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
+from echelon.references.guide import Guide
 from echelon.references.reference import Reference, check_reference
 from echelon.scenario import registry
 from echelon.scenario.own import own_code
@@ -92,7 +95,7 @@ def build(scenario: Scenario) -> Built:
             graph = _graph(scenario)
         reference = None
         with faults.at("reference"):
-            reference = _reference(scenario)
+            reference = _reference(scenario, model)
         faults.settle()
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
@@ -244,16 +247,29 @@ def _graph(scenario: Scenario) -> Graph:
     return make(**offered(make, given))
 
 
-def _reference(scenario: Scenario) -> Any:
+def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
     spec = scenario.reference
-    if spec is None:
+    # What is read from a file needs the model's names, and a model that fails is told of itself.
+    if spec is None or model is None:
         return None
     part = part_of(
         scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
     )
-    reference = part.made()
+    reference = (
+        part.made() if spec.file is None else _read(part, scenario.folder / spec.file, model)
+    )
     check_reference(reference)
     return reference
+
+
+def _read(part: Part, file: Path, model: ControlAffine) -> Guide:
+    """Return a reference from its file."""
+    read = getattr(part.cls, "read", None)
+    if read is None:
+        raise ScenarioError(f"`{part.what}` is made of its keys, and is read from no `file`.")
+    if part.given:
+        raise ScenarioError(f"got `file` and {listing(part.given)}, allowed is one of them.")
+    return read(file, model)
 
 
 def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:

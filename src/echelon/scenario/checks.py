@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from echelon.core.errors import did_you_mean
+from echelon.core.errors import did_you_mean, listing
 from echelon.core.limits import horizon_fault
 from echelon.scenario import registry
 from echelon.scenario.yaml import Document, KeyPath, are, shown
@@ -16,7 +16,7 @@ from echelon.scenario.yaml import Document, KeyPath, are, shown
 Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
-_TRACKS = ("tracking", "optimal-tracking")
+_TRACKS = ("tracking", "lqr", "optimal-tracking")
 """The leader laws that follow a reference."""
 
 # Of these two keys a section has one at most; True where it must have one.
@@ -233,8 +233,7 @@ def _following(data: Part) -> Iterator[Finding]:
         )
     if given and isinstance(law, str) and law in registry.LEADER_LAWS and law not in _TRACKS:
         said = f"got a reference for a leader whose law is `{law}`"
-        allowed = " or ".join(f"`{name}`" for name in _TRACKS)
-        yield ("reference",), f"{said}, allowed is one only with the law {allowed}."
+        yield ("reference",), f"{said}, allowed is one only with a law of {listing(_TRACKS)}."
 
 
 def _changed(data: Part) -> Iterator[Finding]:

@@ -60,6 +60,9 @@ REFERENCES = {
     "hover": Entry("echelon.references:Hover", "one fixed point"),
     "line": Entry("echelon.references:Line", "straight line at constant velocity"),
     "waypoints": Entry("echelon.references:Waypoints", "smooth polynomials through timed points"),
+    "states": Entry(
+        "echelon.references:StatePath", "states and inputs over time, from a CSV file, of any model"
+    ),
 }
 
 # The keys are the arguments of the class; they stand here too since the class needs JAX.
@@ -116,6 +119,7 @@ LEADER_LAWS = {
     "tracking": Entry(
         "echelon.laws:Tracking", "flatness feed-forward and Riccati feedback on the reference"
     ),
+    "lqr": Entry("echelon.laws:PathLQR", "time-varying LQR along the reference, of any model"),
     "optimal-tracking": Entry(
         "echelon.optimal.leader:OptimalTracking",
         "a plan of least tracking error, and feedback about it",

@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import Feedforward
+from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -26,6 +26,7 @@ from echelon.scenario.values import (
     Parameters,
     Positive,
     Seed,
+    Unit,
 )
 
 STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docstrings=True)
@@ -56,9 +57,9 @@ class ModelSpec(BaseModel, **_either("name", "python")):
 class PlantSpec(BaseModel, **STRICT):
     """The agents as they are, where they differ from the model that laws and gains know."""
 
-    parameters: dict[str, Numeric] = {}
+    parameters: Annotated[dict[str, Numeric], Unit("the parameters'")] = {}
     """Parameters that differ, in the model's units."""
-    scale: dict[str, Positive] = {}
+    scale: Annotated[dict[str, Positive], Unit("1")] = {}
     """Factors on the model's parameters, without unit; on each number of a list."""
 
 
@@ -76,7 +77,7 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
     """Rows of the generator `grid`."""
     columns: Count | None = None
     """Columns of the generator `grid`."""
-    radius: Positive | None = None
+    radius: Annotated[Positive | None, Unit("sides of the square")] = None
     """Reach in the generator `geometric`, in sides of its unit square."""
     seed: Seed = 0
     """Seed of the generator `geometric`."""
@@ -88,11 +89,11 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
 class FormationSpec(BaseModel, **STRICT):
     """Each agent's goal relative to the leader's: offsets or a named shape; none means zero."""
 
-    offsets: dict[int, Numbers] | None = None
+    offsets: Annotated[dict[int, Numbers] | None, Unit("the position's, mostly m")] = None
     """Offset of an agent, in the model's units of position, usually m."""
     name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
     """Name of a shape."""
-    spacing: Positive = 1.0
+    spacing: Annotated[Positive, Unit("m")] = 1.0
     """Distance between neighbours in the shape, m."""
     columns: Count | None = None
     """Columns of the shape `grid`."""
@@ -130,6 +131,9 @@ class ReferenceSpec(BaseModel):
     """Name of a reference."""
     python: ClassInFile | None = None
     """`file.py:Class`, the file relative to the scenario file."""
+    file: str | None = None
+    """CSV file of the reference `states`, relative to the scenario file: its first line names `t`,
+    the states and the inputs."""
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -157,21 +161,21 @@ class GainSpec(BaseModel):
 
     method: Annotated[str, OneOf(registry.METHODS)] = registry.DEFAULT_METHOD
     """Name of a method."""
-    Q: Array | None = None
+    Q: Annotated[Array | None, Unit("1 over the states' squared")] = None
     """Weight of the states: its diagonal or rows; default the model's."""
-    R: Array | None = None
+    R: Annotated[Array | None, Unit("1 over the inputs' squared")] = None
     """Weight of the normalised inputs: its diagonal or rows; default the model's."""
-    P: MatrixOrIdentity | None = None
+    P: Annotated[MatrixOrIdentity | None, Unit("1 over the states' squared")] = None
     """The gain of the method `given`: `identity`, its diagonal or rows."""
-    coupling: Positive | None = None
+    coupling: Annotated[Positive | None, Unit("1")] = None
     """Coupling strength, without unit; default what the method finds."""
-    domain: dict[str, Numeric] | None = None
+    domain: Annotated[dict[str, Numeric] | None, Unit("the states'")] = None
     """Half-width, or `[lower, upper]`, by state, group or normalised input."""
-    rate: Positive | None = None
+    rate: Annotated[Positive | None, Unit("1/s")] = None
     """Rate that the method `contraction` is asked for, 1/s."""
     exact: bool | None = None
     """Whether a rate is proved in exact arithmetic where it can be."""
-    symmetry_weight: Numeric | None = None
+    symmetry_weight: Annotated[Numeric | None, Unit("1 over the states' squared")] = None
     """Weight of the symmetric states in the P of `inner-loop`."""
     python: ClassInFile | None = None
     """A method of one's own, `file.py:Class`, the file relative to the scenario file; its own keys
@@ -204,7 +208,7 @@ class LeaderSpec(BaseModel, **STRICT):
     `tracking` with a reference, `passive` without."""
     reacts: bool = False
     """Whether the leader answers to its neighbours."""
-    start_error: dict[str, float] = {}
+    start_error: Annotated[dict[str, float], Unit("the states'")] = {}
     """Error of the start, by state or group of states, in the states' units."""
     gain: GainSpec | None = None
     """Gain of the leader's own tracking."""
@@ -218,7 +222,7 @@ class FollowerSpec(BaseModel, **STRICT):
     """Name of a law, or one of one's own, `{python: file.py:Class}` with its own keys."""
     gain: GainSpec = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
-    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = "relay"
+    feedforward: Annotated[str, OneOf(map(str, Feedforward))] = str(DEFAULT_FEEDFORWARD)
     """What every follower is sent of the same step: `relay`, the leader's input; `relay-velocity`,
     the velocity that it makes; `parent`, the input of the neighbour nearer to the leader, on a
     tree."""
@@ -230,9 +234,9 @@ class FollowerSpec(BaseModel, **STRICT):
 class InitialSpec(BaseModel, **STRICT):
     """Where the followers start: a random spread about their goals, save those of given states."""
 
-    spread: dict[str, NotNegative] | None = None
+    spread: Annotated[dict[str, NotNegative] | None, Unit("the states'")] = None
     """Half-width of the spread, by state or group, in the states' units."""
-    states: dict[int, Numbers] | None = None
+    states: Annotated[dict[int, Numbers] | None, Unit("the states'")] = None
     """All states of an agent, in the states' units; the others start by the spread."""
 
 
@@ -240,14 +244,14 @@ class InitialSpec(BaseModel, **STRICT):
 class DisturbanceSpec(BaseModel, **STRICT):
     """Wind and noise that act on all agents."""
 
-    constant: dict[str, float] = {}
+    constant: Annotated[dict[str, float], Unit("the states', per s")] = {}
     """Lasting wind by state or group, in the states' units per second: m/s^2 for a velocity."""
-    rms: dict[str, NotNegative] = {}
+    rms: Annotated[dict[str, NotNegative], Unit("the states', per s")] = {}
     """Root mean square of the random wind by state or group, for each state, in the states' units
     per second."""
-    input_rms: dict[str, NotNegative] = {}
+    input_rms: Annotated[dict[str, NotNegative], Unit("normalized inputs'")] = {}
     """Root mean square of the noise by input, in normalised inputs; no limit touches it."""
-    hold: Positive = 0.5
+    hold: Annotated[Positive, Unit("s")] = 0.5
     """How long a random draw lasts, s."""
     common: bool = False
     """Whether all agents feel the same random wind."""
@@ -259,15 +263,15 @@ class DisturbanceSpec(BaseModel, **STRICT):
 class SimulationSpec(BaseModel, **STRICT):
     """How the run is computed."""
 
-    horizon: Positive
+    horizon: Annotated[Positive, Unit("s")]
     """Length of the run, s."""
-    dt: Positive
+    dt: Annotated[Positive, Unit("s")]
     """Length of a step, s; at most the horizon."""
     integrator: Annotated[str, OneOf(registry.INTEGRATORS)] = "rk4"
     """Name of the method."""
     limits: bool = True
     """Whether the actuators' limits hold."""
-    store_every: Count = 1
+    store_every: Annotated[Count, Unit("steps")] = 1
     """Steps from one stored sample to the next."""
     precision: Annotated[str, OneOf(("float64", "float32"))] = "float64"
     """Arithmetic used."""
@@ -277,6 +281,6 @@ class SimulationSpec(BaseModel, **STRICT):
 class ReportSpec(BaseModel, **STRICT):
     """What the report looks at."""
 
-    steady_window: Positive = Field(default_factory=lambda: 1.0)
+    steady_window: Annotated[Positive, Unit("s")] = Field(default_factory=lambda: 1.0)
     """The end of the run that counts as steady, s; a fifth of the horizon by default, and where it
     would not be shorter than the run."""

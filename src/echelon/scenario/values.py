@@ -43,6 +43,11 @@ class Allowed:
         )
 
 
+def Unit(text: str) -> Any:
+    """Mark a number with its SI unit, `1` where it has none; the schema and its page tell it."""
+    return Field(json_schema_extra={"unit": text})
+
+
 def OneOf(names: Iterable[str]) -> Allowed:
     """Mark text that must be one of the names of a registry table."""
     listed = list(names)

@@ -11,9 +11,14 @@ from echelon.certificates.modes import obstacle
 from echelon.core.linear import in_words
 from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.laws.law import reference_of
+from echelon.models.model import ControlAffine
+from echelon.network.hearing import who_hears_whom
 from echelon.promises.hypotheses import goal_drifts
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Hypothesis, Statement
+from echelon.promises.statement import Hypothesis, Line, Statement
+from echelon.references.demand import Asked, asked, infeasible, too_fast
 from echelon.studies.finite_condition import finite_condition
 
 ZERO = 1e-9
@@ -25,40 +30,48 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     graph = parts.graph
     low, high = graph.spectrum().low, graph.spectrum().high
     text = "f and g depend on x alone"
-    yield Statement("Assumption 1, autonomous", _HOLDS, _PROOF, text=text)
+    yield Statement(Line.AUTONOMOUS, _HOLDS, _PROOF, text=text)
     unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
     text = "connected and static" + ("" if unit else "; weights need not be 1")
     shown = f"{shown}, {len(graph.edges)} edges"
-    yield Statement("Assumption 2, graph", _HOLDS, _PROOF, len(graph.edges), shown, text)
+    yield Statement(Line.GRAPH, _HOLDS, _PROOF, len(graph.edges), shown, text)
+    followers, leaders = len(graph.followers), len(graph.leaders)
+    shown = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
+    text = who_hears_whom(graph)
+    yield Statement(Line.FOLLOWS, _HOLDS, _PROOF, leaders, shown, text)
     shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
-    yield Statement("Assumption 6, M L = I", _HOLDS, _PROOF, low, shown, text)
-    yield Statement("Lemma 1, L > 0", _HOLDS, _PROOF, low, f"{low:.6g}", "grounded Laplacian")
+    yield Statement(Line.GROUNDED, _HOLDS, _PROOF, low, shown, text)
+    yield Statement(Line.POSITIVE, _HOLDS, _PROOF, low, f"{low:.6g}", "grounded Laplacian")
     text = "the LMI is not used"
-    yield Statement("Lemma 2, Schur complement", Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield Statement(Line.SCHUR, Verdict.NOT_NEEDED, _PROOF, text=text)
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
-    yield Statement("Lemma 3, sum over edges", Verdict.FAILS, _PROOF, rows, shown, text)
+    yield Statement(Line.EDGES, Verdict.FAILS, _PROOF, rows, shown, text)
 
 
-def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
+def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
     """Yield what the paper asks of leader and drift: Assumptions 4, 5, Lemma 4, conditions on P."""
     yield _leader_line(promise)
+    reference = reference_of(getattr(parts.drive, "leader", parts.drive))
+    if reference is not None:
+        found = asked(parts.model, reference, settings.horizon)
+        yield _reference_line(parts.model, found, settings)
     monotone = _monotone_line(parts, promise)
     yield monotone
     both = not (promise.hypotheses[Hypothesis.SYMMETRY].fails or monotone.fails)
     text = "needs Assumption 5 and symmetric offsets"
-    yield Statement("Lemma 4, drift along z", Verdict.of(both), Kind.LINEARIZATION, text=text)
+    yield Statement(Line.ALONG, Verdict.of(both), Kind.LINEARIZATION, text=text)
     largest = _printed_lmi(parts, promise)
     shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
     text, remedy = f"{text}block is zero", "use the finite condition"
-    yield Statement("LMI as printed", Verdict.FAILS, _PROOF, largest, shown, text, remedy)
+    yield Statement(Line.PRINTED, Verdict.FAILS, _PROOF, largest, shown, text, remedy)
     yield _finite_line(parts, promise)
 
 
 def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
-    name, slow = "Assumption 4, leader tracks", promise.own
+    name, slow = Line.TRACKS, promise.own
     if slow is None:
         return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
     text, remedy = "at the trim", ""
@@ -67,6 +80,25 @@ def _leader_line(promise: Promise) -> Statement:
         remedy += "method"
     verdict, shown = Verdict.of(slow < -ZERO), f"{slow:.3g} 1/s"
     return Statement(name, verdict, Kind.LINEARIZATION, slow, shown, text, remedy)
+
+
+def _reference_line(model: ControlAffine, found: Asked, settings: Settings) -> Statement:
+    """Say what a leader must do to follow; no model here limits a speed but by its inputs."""
+    name, remedy = Line.ASKED, ""
+    limited = settings.limits and model.input_limits is not None
+    sizes = ((found.speed, "m/s"), (found.acceleration, "m/s^2"))
+    # Below a micrometre and the like are the differences' rounding.
+    shown = [f"{round(x, 5):.3g} {unit}" for x, unit in sizes if x is not None]
+    shown += [f"{100.0 * found.share:.3g} % of the limits' room"] if limited else []
+    text = f"at most, over {settings.horizon:g} s; the limits alone bound what it may ask"
+    text = text if limited else f"at most, over {settings.horizon:g} s; nothing here bounds it"
+    fast = limited and found.share > 1.0
+    if fast:
+        text, remedy = too_fast(model, found), "make it slower or smaller"
+    if not found.feasible:
+        text, remedy = infeasible(model, found), "give knots that the model can move along"
+    verdict = Verdict.of(found.feasible and not fast)
+    return Statement(name, verdict, Kind.SAMPLES, found.share, ", ".join(shown), text, remedy)
 
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
@@ -84,7 +116,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     elif not holds:
         text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
         remedy += "without"
-    name, verdict, shown = "Assumption 5, P-monotone drift", Verdict.of(holds), f"{worst:.3g}"
+    name, verdict, shown = Line.MONOTONE, Verdict.of(holds), f"{worst:.3g}"
     return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
 
 
@@ -107,7 +139,7 @@ def _printed_lmi(parts: Parts, promise: Promise) -> float:
 
 def _finite_line(parts: Parts, promise: Promise) -> Statement:
     """Return the condition (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 on pairs of goals."""
-    P, name = promise.loop.closed.P, "finite condition on P"
+    P, name = promise.loop.closed.P, Line.FINITE
     # Any multiple of P serves the law as well, with the coupling divided by it.
     P = P / float(np.linalg.eigvalsh(P)[0])
     found = finite_condition(P, parts.model, parts.formation, parts.drive)

@@ -38,7 +38,7 @@ def check(parts: Parts, settings: Settings) -> Checked:
     with precision("float64"):
         lines = (
             *graph_lines(parts),
-            *drift_lines(parts, found),
+            *drift_lines(parts, settings, found),
             *found.hypotheses.values(),
             killing_line(parts, found),
             *margin_lines(parts, found),

@@ -26,7 +26,6 @@ from echelon.models.linearization import linearize
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Lemniscate
-from echelon.references.flatness import follow
 from echelon.results.metrics import metrics
 from echelon.scenario import registry
 
@@ -134,7 +133,7 @@ def _flatness() -> Check:
     model, reference = Quadrotor.crazyflie(), Lemniscate()
 
     t = jnp.asarray(1.3)
-    (x, u), (rate, _) = jax.jvp(partial(follow, model, reference), (t,), (jnp.ones_like(t),))
+    (x, u), (rate, _) = jax.jvp(partial(reference.follow, model), (t,), (jnp.ones_like(t),))
     off = float(jnp.abs(rate - model.velocity(x, u)).max())
     return Check(
         "the quadrotor's flatness map solves its equations", off < 1e-9, f"residual {off:.1g}"

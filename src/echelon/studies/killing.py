@@ -12,7 +12,7 @@ from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
 from echelon.models.model import ControlAffine
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Statement
+from echelon.promises.statement import Line, Statement
 
 _SAMPLES = 400
 _NEAR = 0.5  # without a domain, g is looked at this far about the trim
@@ -25,7 +25,7 @@ def killing_line(parts: Parts, promise: Promise) -> Statement:
     domain = _near(parts.model) if claim is None else claim.domain
     where = f"within {_NEAR:g} of the trim" if claim is None else "on the domain"
     residual, kind = killing_residual(parts.model, promise.loop.closed.P, domain)
-    name, shown = "Killing residual of g", f"{residual:.3g} 1/s"
+    name, shown = Line.KILLING, f"{residual:.3g} 1/s"
     if kind is Kind.PROOF:
         text = f"g is constant {where}: a region is nonlocal (T1)"
         return Statement(name, Verdict.HOLDS, kind, residual, shown, text)

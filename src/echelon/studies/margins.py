@@ -15,7 +15,7 @@ from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.promise import Promise
-from echelon.promises.statement import Hypothesis, Statement
+from echelon.promises.statement import Hypothesis, Line, Statement
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 
@@ -29,7 +29,7 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     loop = promise.loop
     if promise.hypotheses[Hypothesis.DECAYS].fails:
         text = "there is nothing to lose"
-        yield Statement("margins", Verdict.NOT_NEEDED, _KIND, text=text)
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
         return
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
@@ -38,11 +38,11 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
         return
     low, high = margins.gain_margin(loop.closed)
     shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
-    yield Statement("gain margin", _HOLDS, _KIND, low, shown, text)
+    yield Statement(Line.GAIN, _HOLDS, _KIND, low, shown, text)
     delay = margins.delay_margin(loop.closed)
     shown = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
-    yield Statement("delay margin", _HOLDS, _KIND, delay.delay, shown, text)
+    yield Statement(Line.DELAY, _HOLDS, _KIND, delay.delay, shown, text)
     yield _scaling_line(parts.model, loop)
     # The bound of the network rests on a symmetric matrix.
     yield from _push_lines(parts.model, loop) if loop.symmetric else ()
@@ -59,7 +59,7 @@ def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
         f"{worst:.3g} 1/s",
     )
     remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
-    return Statement("input scaling", Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
+    return Statement(Line.SCALING, Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
 
 
 class _Push(NamedTuple):
@@ -86,15 +86,15 @@ def _push_lines(model: ControlAffine, loop: Loop) -> Iterator[Statement]:
     units = {model.state_units[k] for k in watched}
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
-    def line(name: str, bounds: Array, text: str) -> Statement:
+    def line(name: Line, bounds: Array, text: str) -> Statement:
         shown = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
         worst, text = float(bounds[list(watched)].max()), f"{unit}per {where}: {text}; {loop.where}"
         return Statement(name, _HOLDS, _KIND, worst, shown, text)
 
     text = "no push of that norm on all followers together takes any farther"
-    yield line("disturbance, network", invariant_ellipsoid(loop.closed, E), text)
+    yield line(Line.PUSHED, invariant_ellipsoid(loop.closed, E), text)
     text = "the exact peak, for a push shaped like the worst eigenvector"
-    yield line("disturbance, one mode", peak_gain(loop.closed, E), text)
+    yield line(Line.PUSHED_MODE, peak_gain(loop.closed, E), text)
 
 
 def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
@@ -112,4 +112,4 @@ def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
     if not used:
         text = "what feeding forward the parent's input would amplify; it is not used here"
     verdict = _HOLDS if used else Verdict.NOT_NEEDED
-    yield Statement("string gain", verdict, _KIND, gain**depth, shown, text)
+    yield Statement(Line.STRING, verdict, _KIND, gain**depth, shown, text)

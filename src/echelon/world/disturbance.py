@@ -152,11 +152,11 @@ class Wind(eqx.Module):
         return jax.random.normal(key, (size,), jnp.float32).astype(float)
 
 
-def draw(
-    wind: Wind | None, step: jax.Array, agent: jax.Array
-) -> tuple[State | None, Input | None]:
+def draw(wind: Wind | None, step: jax.Array, agent: jax.Array) -> tuple[State | None, Input | None]:
     """Return what acts on an agent's rate and on its input during a step; None for nothing."""
-    return (None, None) if wind is None else (wind.on_state(step, agent), wind.on_input(step, agent))
+    return (
+        (None, None) if wind is None else (wind.on_state(step, agent), wind.on_input(step, agent))
+    )
 
 
 def disturbed(plant: ControlAffine, push: State | None, noise: Input | None) -> Field:

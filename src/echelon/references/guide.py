@@ -1,0 +1,32 @@
+"""What a leader follows: a state and an input of a model at each time."""
+
+import abc
+
+import equinox as eqx
+
+from echelon.core.types import Input, Scalar, State
+from echelon.models.model import ControlAffine
+
+
+class Guide(eqx.Module):
+    """What a leader follows, whether it is a path in space or one of states and inputs."""
+
+    @abc.abstractmethod
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return the state (n,) and the input (m,) that follow it exactly at time t (s)."""
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Check what it returns.
+
+        Raises:
+            ReferenceError: it is malformed.
+        """
+
+    @abc.abstractmethod
+    def fit(self, model: ControlAffine) -> None:
+        """Check that a model can be led along it.
+
+        Raises:
+            LawError: it cannot, and why.
+        """

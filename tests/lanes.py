@@ -1,0 +1,56 @@
+"""Runs a function of one agent's numbers as native code, an agent a lane."""
+
+import numpy as np
+
+from echelon.kernels import SLOTS, Body, Code, Graph, Plan, aligned, lower, nodes, program
+
+NOTHING = Body({}, {}, {}, {}, [], [], [])
+
+
+def lowered(function, count, bits=64):
+    """Return the graph's results of a function for JAX of `count` numbers, as nodes."""
+    graph = Graph(bits)
+    x = np.empty(count, object)
+    x[:] = [graph.leaf("row", k) for k in range(count)]
+    found = [node for part in lower(function, graph, [x]) for node in nodes(graph, part)]
+    return [graph.make("select", n, 1.0, 0.0) if n.truth else n for n in found]
+
+
+def text_of(function, count, bits=64, lanes=None):
+    """Return the code of a function, and how many results it has."""
+    results = lowered(function, count, bits)
+    body = NOTHING._replace(stores=dict(enumerate(results, count)))
+    plan = Plan(
+        bits=bits,
+        lanes=lanes or 512 // bits,
+        rows=count + len(results),
+        width=0,
+        first=body,
+        others=NOTHING,
+        tell=0,
+        told=0,
+        one_source=False,
+        one_leader=False,
+        weighted=False,
+        edges=(),
+        table=0,
+        dt=0.0,
+    )
+    return program(plan), len(results)
+
+
+def run(function, columns, bits=64, lanes=None, cache=None):
+    """Return what a function for JAX makes of columns (count, N), as (results, N)."""
+    lanes, (count, agents) = lanes or 512 // bits, columns.shape
+    text, results = text_of(function, count, bits, lanes)
+    blocks, dtype = -(-agents // lanes), np.float64 if bits == 64 else np.float32
+    rows = aligned((blocks, count + results, lanes), dtype)
+    padded = np.resize(columns.T, (blocks * lanes, count))
+    rows[:, :count] = padded.reshape(blocks, lanes, count).transpose(0, 2, 1)
+    segments, slots = np.array([0, blocks], np.int64), np.zeros(len(SLOTS), np.int64)
+    values = {"rows": rows.ctypes.data, "segments": segments.ctypes.data, "steps": 1, "levels": 1}
+    for name, value in values.items():
+        slots[SLOTS.index(name)] = value
+    Code(text, cache).call(slots)
+    found = rows[:, count:].transpose(0, 2, 1)
+    return found.reshape(blocks * lanes, results)[:agents].T.copy()

@@ -1,0 +1,84 @@
+"""Every word that a table prints has an entry in the glossary, and every key one on its page."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import made_up
+
+import echelon as ech
+from echelon.cli import tables
+from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.promises.statement import Hypothesis, Line
+from echelon.reports import comparison, run
+from echelon.scenario.keys import keys_page
+from echelon.scenario.scenario import json_schema
+from echelon.studies.compare import Comparison
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+TEXT = (DOCS / "glossary.md").read_text("utf-8")
+ENTRIES = re.findall(r"\*\*(.+?)\*\*", TEXT)
+WORDS = [
+    *(each.value for each in (*Hypothesis, *Line)),
+    *map(str, (*Verdict, *Kind, *Theorem, *Feedforward)),
+]
+
+
+def heads(table):
+    """The names of a table's columns, without units, spans and footnotes."""
+    names = (" ".join(str(column.header).split()) for column in table.columns)
+    return [re.sub(r"( from)?,.*| \(.*\)| \d+ s$| last .*", "", name) for name in names]
+
+
+def test_each_entry_stands_once_and_says_something():
+    assert len(ENTRIES) == len(set(ENTRIES)), sorted(x for x in ENTRIES if ENTRIES.count(x) > 1)
+    for item in re.split(r"^- ", TEXT, flags=re.MULTILINE)[1:]:
+        assert len(item.split()) > 4, item
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_every_word_of_a_check_is_explained(word):
+    assert word in ENTRIES
+
+
+def test_every_column_of_a_design_is_explained():
+    names = {re.sub(r"(,.*| \(\d\))", "", " ".join(x.split())) for x in tables._COLUMNS.values()}
+    assert names <= set(ENTRIES), names - set(ENTRIES)
+
+
+@pytest.mark.parametrize("model", [ech.models.DoubleIntegrator(2), ech.models.VanDerPol()])
+def test_every_column_of_a_report_is_explained(model):
+    graph = ech.Graph.path(3)
+    result = made_up(np.zeros((4, 3, len(model.state_names))), model, graph)
+    names = heads(run._table(result, ech.metrics(result), printed=False))
+    assert set(names) <= set(ENTRIES), set(names) - set(ENTRIES)
+    assert len(names) == 6
+
+
+def test_every_column_of_a_comparison_is_explained():
+    compared = Comparison("x", (), 10.0, 2.0, ())
+    names = {*heads(comparison._errors_table(compared, False))}
+    names |= {*heads(comparison._costs_table(compared))}
+    assert names <= set(ENTRIES), names - set(ENTRIES)
+
+
+def test_the_page_of_keys_is_what_the_schema_makes():
+    told = (DOCS / "scenario.md").read_text("utf-8")
+    assert told == keys_page(), "write `python -m echelon.scenario.keys` to docs/scenario.md"
+
+
+def numbers_of(what):
+    """Whether a number that is no count may stand in a value of the schema."""
+    if isinstance(what, dict):
+        return what.get("type") == "number" or any(map(numbers_of, what.values()))
+    return any(map(numbers_of, what)) if isinstance(what, list) else what == "number"
+
+
+def test_every_number_of_a_scenario_has_a_unit_and_every_key_a_sentence():
+    schema = json_schema()
+    for name, part in (*schema["$defs"].items(), ("file", schema)):
+        for key, what in part["properties"].items():
+            if name not in ("file", "OwnClass") and (name, key) != ("GraphSpec", "edges"):
+                assert "unit" in what or not numbers_of(what), (name, key)
+            assert "description" in what or "$ref" in repr(what), (name, key)

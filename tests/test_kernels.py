@@ -1,0 +1,274 @@
+"""Native code against JAX and against long doubles: functions, loops, choices, what is refused."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lanes import lowered, run, text_of
+from scipy.special import erf
+
+from echelon.core.numerics import precision
+from echelon.kernels import Graph, Unsupported
+
+rng = np.random.default_rng(7)
+WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)
+# What it is for JAX and for NumPy, where it is tried, and the most that it may be off by, in ulp.
+FUNCTIONS = {
+    "sin": (jnp.sin, np.sin, rng.uniform(-1e3, 1e3, 4000), 1.6),
+    "cos": (jnp.cos, np.cos, rng.uniform(-10.0, 10.0, 4000), 1.6),
+    "tan": (jnp.tan, np.tan, rng.uniform(-10.0, 10.0, 4000), 3.5),
+    "exp": (jnp.exp, np.exp, rng.uniform(-80.0, 80.0, 4000), 1.1),
+    "exp2": (jnp.exp2, np.exp2, rng.uniform(-1.0, 1.0, 4000), 1.6),
+    "expm1": (jnp.expm1, np.expm1, WIDE, 2.0),
+    "log": (jnp.log, np.log, 10.0 ** rng.uniform(-30.0, 30.0, 4000), 1.0),
+    "log near 1": (jnp.log, np.log, 1.0 + 0.1 * rng.normal(size=4000), 1.0),
+    "log1p": (jnp.log1p, np.log1p, np.abs(WIDE), 1.5),
+    "tanh": (jnp.tanh, np.tanh, WIDE, 2.5),
+    "sinh": (jnp.sinh, np.sinh, WIDE, 2.8),
+    "cosh": (jnp.cosh, np.cosh, WIDE, 2.0),
+    "arcsinh": (jnp.arcsinh, np.arcsinh, WIDE, 2.5),
+    "arccosh": (jnp.arccosh, np.arccosh, rng.uniform(1.0, 30.0, 4000), 2.5),
+    "arctanh": (jnp.arctanh, np.arctanh, rng.uniform(-1.0, 1.0, 4000), 2.5),
+    "arctan": (jnp.arctan, np.arctan, WIDE, 3.0),
+    "arcsin": (jnp.arcsin, np.arcsin, rng.uniform(-1.0, 1.0, 4000), 3.5),
+    "arccos": (jnp.arccos, np.arccos, rng.uniform(-1.0, 1.0, 4000), 3.5),
+    "cbrt": (jnp.cbrt, np.cbrt, WIDE, 1.0),
+    "erf": (jax.lax.erf, erf, rng.normal(size=4000), 6.0),
+    "sqrt": (jnp.sqrt, np.sqrt, rng.uniform(0.0, 9.0, 4000), 0.5),
+    "sigmoid": (jax.nn.sigmoid, lambda x: 1.0 / (1.0 + np.exp(-x)), WIDE, 2.5),
+}
+
+
+def units(found, wanted):
+    """How far a result is off, in units of the last place of what is wanted."""
+    info = np.finfo(found.dtype)
+    unit = np.ldexp(np.longdouble(info.eps), np.frexp(np.abs(wanted))[1] - 1)
+    return np.abs(found.astype(np.longdouble) - wanted) / np.maximum(unit, info.tiny * info.eps)
+
+
+@pytest.mark.parametrize("bits", [64, 32])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_are_right_to_a_few_units_of_the_last_place(name, bits):
+    function, wanted, x, most = FUNCTIONS[name]
+    x = x.astype(np.float64 if bits == 64 else np.float32)
+    [found] = run(lambda v: function(v[0]), x[None], bits)
+    exact = wanted(x.astype(float) if name == "erf" else x.astype(np.longdouble))
+    assert units(found, exact).max() <= most
+
+
+@pytest.mark.parametrize("bits", [64, 32])
+def test_the_angle_of_a_point_is_right_in_all_quarters(bits):
+    y, x = rng.normal(size=(2, 4000)).astype(np.float64 if bits == 64 else np.float32)
+    [found] = run(lambda v: jnp.arctan2(v[0], v[1]), np.stack([y, x]), bits)
+    assert units(found, np.arctan2(y.astype(np.longdouble), x.astype(np.longdouble))).max() <= 3.0
+    corners = np.array(
+        [[a, b] for a in (0.0, -0.0, 1.0, np.inf) for b in (0.0, -0.0, -1.0, np.inf)]
+    )
+    [found] = run(lambda v: jnp.arctan2(v[0], v[1]), corners.T)
+    np.testing.assert_allclose(found, np.arctan2(*corners.T), rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "name", ["sin", "cos", "exp", "expm1", "log", "log1p", "tanh", "sinh", "arctan", "cbrt", "erf"]
+)
+def test_what_is_no_number_stays_none_and_what_is_infinite_goes_where_it_must(name):
+    function, wanted, *_ = FUNCTIONS[name]
+    x = np.array([0.0, np.inf, -np.inf, np.nan, 5e-324, 1e-310, 1.0, -1.0])
+    [found] = run(lambda v: function(v[0]), x[None])
+    with np.errstate(all="ignore"):
+        np.testing.assert_allclose(found, wanted(x), rtol=1e-14)
+
+
+@given(
+    x=st.floats(1e-3, 1e3), y=st.one_of(st.floats(-20.0, 20.0), st.sampled_from([0.5, 2.0, -3.0]))
+)
+@settings(max_examples=20)
+def test_powers_are_right_to_the_size_of_their_exponent(x, y):
+    [found] = run(lambda v: v[0] ** v[1], np.array([[x], [y]]))
+    wanted = np.longdouble(x) ** np.longdouble(y)
+    assert units(found, np.array([wanted])).max() <= 4.0 + 2.0 * abs(y * np.log(x))
+    [whole] = run(lambda v: v[0] ** 3 + v[0] ** -2, np.array([[-x]]))
+    np.testing.assert_allclose(whole, (-x) ** 3 + (-x) ** -2.0, rtol=1e-14)
+
+
+def by_jax(function, columns):
+    with precision("float64"):
+        return (
+            np.asarray(jax.vmap(function)(jnp.asarray(columns.T)), float)
+            .reshape(columns.shape[1], -1)
+            .T
+        )
+
+
+def loop(v):
+    return jax.lax.fori_loop(0, 5, lambda k, x: jnp.sin(x) + 0.1 * k, v)
+
+
+def folded(v):
+    return jax.lax.scan(lambda c, w: (c * 0.5 + w, c), v[0], v)[1]
+
+
+def branch(v):
+    return jax.lax.cond(v[0] > 0.3, lambda u: u @ u, lambda u: jnp.prod(u), v)
+
+
+def much(v):
+    """One side of a choice is so much that it stands behind a branch."""
+    far = v
+    for _ in range(12):
+        far = jnp.tanh(far) + far[::-1] * 0.3
+    return jnp.where(v[0] > 1.5, far, v)
+
+
+def both(v):
+    near, far = v, v
+    for _ in range(9):
+        near, far = jnp.cos(near) + 0.1 * near[::-1], jnp.exp(-far * far)
+    return jnp.where(v[1] > 0.5, near, far)
+
+
+def metres(v):
+    M = jnp.array([[2.0, 0.1, 0.0], [0.1, 3.0, 0.2], [0.0, 0.2, 1.0]]) + jnp.diag(v**2)
+    return jnp.concatenate([jnp.linalg.solve(M, v), jnp.linalg.inv(M)[0]])
+
+
+def pivoted(v):
+    return jnp.linalg.solve(jnp.array([[0.0, 1.0], [1.0, 1e-9]]) * (1.0 + v[0] ** 2), v[:2])
+
+
+def halves(v):
+    return jnp.linalg.cholesky(jnp.eye(3) * 4.0 + jnp.outer(v, v))[jnp.tril_indices(3)]
+
+
+PROGRAMS = {
+    "moves": lambda v: jnp.roll(jnp.concatenate([v, v[::-1]]).at[2].add(1.0), 1)[1:5],
+    "matrices": lambda v: jnp.cross(v, v[::-1]) @ (jnp.outer(v, v) + jnp.eye(3)),
+    "extremes": lambda v: jnp.stack([v.max(), v.min(), jnp.clip(v[0], -0.2, 0.3), v.prod()]),
+    "rounding": lambda v: jnp.stack([jnp.floor(v[0]), jnp.ceil(v[1]), jnp.round(v[2] * 2.5)]),
+    "signs": lambda v: jnp.stack([jnp.sign(v[0]), jnp.abs(v[1]), jnp.negative(v[2])]),
+    "truths": lambda v: jnp.where((v[0] > 0) & ~(v[1] > v[2]) | jnp.isnan(v[0]), 1.0, v[2]),
+    "remainders": lambda v: jnp.stack([jnp.fmod(v[0] * 9.0, 0.7), jnp.mod(v[1] * 9.0, 0.7)]),
+    "a smooth norm": lambda v: v / jnp.linalg.norm(v) + jax.nn.softplus(v),
+    "a slope": lambda v: jax.jacfwd(lambda u: jnp.sin(u[0]) * u[1] ** 2 + jnp.tanh(u[2]))(v),
+    "a loop": loop,
+    "a scan": folded,
+    "a branch": branch,
+    "much behind a branch": much,
+    "much on both sides": both,
+    "equations": metres,
+    "equations that need a pivot": pivoted,
+    "a root of a matrix": halves,
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_programs_do_what_jax_does(name):
+    columns = rng.normal(size=(3, 41))
+    found = run(PROGRAMS[name], columns)
+    np.testing.assert_allclose(found, by_jax(PROGRAMS[name], columns), rtol=2e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_bits_are_the_same_for_vectors_of_all_widths(name):
+    columns = rng.normal(size=(3, 41))
+    whole = run(PROGRAMS[name], columns, lanes=8)
+    for lanes in (2, 4, 16):
+        assert run(PROGRAMS[name], columns, lanes=lanes).tobytes() == whole.tobytes()
+
+
+LEAVES = [lambda v: v[0], lambda v: v[1], lambda v: v[2], lambda v: 0.7, lambda v: -1.3]
+ONE = [jnp.sin, jnp.cos, jnp.tanh, jnp.abs, lambda a: jnp.exp(-a * a), lambda a: a / (1.0 + a * a)]
+ONE += [lambda a: jnp.sqrt(a * a + 0.1), lambda a: -a, lambda a: jnp.arctan2(a, 1.3)]
+TWO = [jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum]
+TWO += [lambda a, b: jnp.where(a > b, a * 0.5, b)]
+
+
+def trees(depth):
+    leaf = st.sampled_from(LEAVES)
+    if not depth:
+        return leaf
+    under = trees(depth - 1)
+    one = st.builds(lambda f, a: lambda v: f(a(v)), st.sampled_from(ONE), under)
+    two = st.builds(lambda f, a, b: lambda v: f(a(v), b(v)), st.sampled_from(TWO), under, under)
+    return st.one_of(leaf, one, two, two)
+
+
+@given(tree=trees(4))
+@settings(max_examples=25)
+def test_drawn_functions_are_what_jax_makes_of_them(tree):
+    columns = np.random.default_rng(3).normal(size=(3, 16))
+    found = run(lambda v: jnp.asarray(tree(v)) + 0.0 * v[0], columns)
+    np.testing.assert_allclose(found, by_jax(tree, columns), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.slow
+@given(tree=trees(6))
+@settings(max_examples=200)
+def test_two_hundred_drawn_functions_are_what_jax_makes_of_them(tree):
+    columns = np.random.default_rng(4).normal(size=(3, 16))
+    found = run(lambda v: jnp.asarray(tree(v)) + 0.0 * v[0], columns)
+    np.testing.assert_allclose(found, by_jax(tree, columns), rtol=1e-11, atol=1e-12)
+
+
+def test_what_is_lost_is_never_brought_back_by_a_limit():
+    [found] = run(
+        lambda v: jnp.clip(v[0], -1.0, 1.0) + jnp.maximum(v[0], 0.2), np.full((1, 3), np.nan)
+    )
+    assert np.isnan(found).all()
+
+
+def test_nothing_is_told_twice_and_what_is_plain_is_folded():
+    [a, b] = lowered(lambda v: jnp.stack([jnp.sin(v[0]) * v[1], v[1] * jnp.sin(v[0])]), 2)
+    assert a is b
+    graph = Graph()
+    x = graph.leaf("row", 0)
+    assert (x + 0.0, x * 1.0, -(-x), x - 0.0) == (x, x, x, x)
+    assert (x * 0.0).value == 0.0 and (graph.constant(2.0) * 3.0).value == 6.0
+
+
+def test_much_that_few_need_stands_behind_a_branch():
+    assert "vector.reduce.or" in text_of(much, 3)[0]
+    assert "vector.reduce.or" not in text_of(lambda v: jnp.where(v[0] > 1.0, -v, v), 3)[0]
+
+
+def ends_by_itself(v):
+    return jax.lax.while_loop(lambda x: x < 3.0, lambda x: x + 1.0, v[0])
+
+
+@pytest.mark.parametrize(
+    ("function", "told"),
+    [
+        (ends_by_itself, "a `while` loop"),
+        (lambda v: jnp.sort(v), "`sort`"),
+        (lambda v: jax.lax.fori_loop(0, 999, lambda k, x: jnp.sin(x), v), "a loop of 999 rounds"),
+        (lambda v: jnp.linalg.eigvalsh(jnp.outer(v, v)), "`eigh`"),
+    ],
+)
+def test_what_has_no_code_is_told_with_file_and_line(function, told):
+    with pytest.raises(Unsupported, match=told) as caught:
+        text_of(function, 3)
+    assert "test_kernels.py, line" in str(caught.value)
+
+
+def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):
+    columns = rng.normal(size=(3, 8))
+    first = run(PROGRAMS["a loop"], columns, cache=tmp_path)
+    [file] = tmp_path.iterdir()
+    whole = file.read_bytes()
+    assert run(PROGRAMS["a loop"], columns, cache=tmp_path).tobytes() == first.tobytes()
+    for damaged in (whole[: len(whole) // 2], b"", whole[:40] + b"x" + whole[41:]):
+        file.write_bytes(damaged)
+        assert run(PROGRAMS["a loop"], columns, cache=tmp_path).tobytes() == first.tobytes()
+        assert file.read_bytes() == whole
+
+
+def test_a_folder_without_room_for_code_is_no_fault(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    columns = rng.normal(size=(3, 8))
+    found = run(PROGRAMS["a loop"], columns, cache=blocked)
+    np.testing.assert_allclose(found, by_jax(PROGRAMS["a loop"], columns), rtol=1e-14)
