@@ -18,8 +18,6 @@ from echelon.promises.promise import Promise
 from echelon.promises.statement import Hypothesis, Line, Statement
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
-
-
 _STIFF = 1e10
 """Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
 
@@ -34,7 +32,7 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
         text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
-        yield Statement("margins", Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
         return
     low, high = margins.gain_margin(loop.closed)
     shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
