@@ -18,6 +18,7 @@ class Hypothesis(Word):
     MATCHED = "leader's motion is matched"
     COUPLED = "coupling"
     DECAYS = "disagreement decays"
+    ALONG = "law along the leader's path"
     STEP = "step, input held"
     REGION = "region of the gain"
     SET = "certified set"

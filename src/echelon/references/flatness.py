@@ -20,11 +20,24 @@ def follow(model: ControlAffine, reference: Reference, t: Scalar) -> tuple[State
     return model.flat(reference.derivatives(t, model.flat_order, model.flat_outputs))
 
 
-@eqx.filter_jit
+_FEW = 512
+"""Of so many times or fewer all are followed by one program, since compiling is what costs."""
+
+
 def follow_at(
     model: ControlAffine, reference: Reference, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
+    count = len(times)
+    padded = jnp.pad(times, (0, max(0, _FEW - count)), mode="edge")
+    x, u = _follow_all(model, reference, padded)
+    return x[:count], u[:count]
+
+
+@eqx.filter_jit
+def _follow_all(
+    model: ControlAffine, reference: Reference, times: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(lambda t: follow(model, reference, t))(times)
 
 

@@ -76,8 +76,8 @@ def _settling(result: Result, numbers: Metrics, found: Promise, unit: str) -> It
         f"by {result.times[-1]:g} s."
     )
     yield from (f"Cause: {each.explanation}." for each in found.causes)
-    slow = -found.loop.slowest
-    if found.promised and result.settings.horizon * slow < _SETTLES:
+    slow = found.rate
+    if slow and result.settings.horizon * slow < _SETTLES:
         yield (
             f"The slowest mode falls to 1/e in {1.0 / slow:.3g} s, and the horizon is "
             f"{result.settings.horizon:g} s."
@@ -109,10 +109,10 @@ def _imperfections(result: Result) -> Iterator[str]:
 def _promises(result: Result, found: Promise) -> Iterator[str]:
     """Say what is promised, whether this run is covered, and what the law needs to be told."""
     yield found.sentence()
-    if result.drive.gain is not None:
+    if result.drive.gain is not None and found.slowest is not None:
         edge = "" if found.edge is None else f"; from {found.edge:.4g} on every mode decays"
         yield (
-            f"Near the trim the slowest mode is {found.loop.slowest:.3g} 1/s at coupling "
+            f"Near the trim the slowest mode is {found.slowest:.3g} 1/s at coupling "
             f"{found.loop.closed.coupling:.4g}{edge}."
         )
     yield from coverage(result, found)

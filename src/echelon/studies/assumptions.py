@@ -18,6 +18,7 @@ from echelon.studies.finite_condition import finite_condition
 
 ZERO = 1e-9
 _HOLDS, _PROOF = Verdict.HOLDS, Kind.PROOF
+_BENT = "the model bends at the trim, and has no linearization there"
 
 
 def graph_lines(parts: Parts) -> Iterator[Statement]:
@@ -46,7 +47,8 @@ def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     yield _leader_line(promise)
     monotone = _monotone_line(parts, promise)
     yield monotone
-    both = not (promise.hypotheses[Hypothesis.SYMMETRY].fails or monotone.fails)
+    both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
+    both = both and monotone.verdict is Verdict.HOLDS
     text = "needs Assumption 5 and symmetric offsets"
     yield Statement("Lemma 4, drift along z", Verdict.of(both), Kind.LINEARIZATION, text=text)
     largest = _printed_lmi(parts, promise)
@@ -61,6 +63,8 @@ def _leader_line(promise: Promise) -> Statement:
     name, slow = "Assumption 4, leader tracks", promise.own
     if slow is None:
         return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
+    if not promise.linear:
+        return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
     text, remedy = "at the trim", ""
     if not slow < -ZERO:
         text, remedy = "the tracking error is not damped at the trim", "give `leader.gain` another "
@@ -71,6 +75,9 @@ def _leader_line(promise: Promise) -> Statement:
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
+    name = "Assumption 5, P-monotone drift"
+    if not promise.linear:
+        return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
     A, P = promise.loop.linear.A, promise.loop.closed.P
     slope = P @ A + A.T @ P
     worst = float(np.linalg.eigvalsh(slope)[-1])
@@ -84,7 +91,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     elif not holds:
         text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
         remedy += "without"
-    name, verdict, shown = "Assumption 5, P-monotone drift", Verdict.of(holds), f"{worst:.3g}"
+    verdict, shown = Verdict.of(holds), f"{worst:.3g}"
     return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
 
 
