@@ -417,7 +417,7 @@ def test_a_limit_and_a_wind_leave_a_run_uncovered(swinging):
     world = ech.World(disturbance=ech.Disturbance(constant={"rate": 0.01}))
     parts = swinging(0.5).replace(world=world)
     report = " ".join(ech.report(ech.simulate(parts, settings())).split())
-    assert "The proof does not cover this run: wind or noise acts on the agents." in report
+    assert "The proof does not cover this run: wind or noise acts on the agents; " in report
 
 
 # ---- before a run, and in its data ----
@@ -465,7 +465,8 @@ def test_plans_are_promised_nothing():
     goals = ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
     assert ech.promise(parts, settings()).sentence() == (
-        "Nothing is promised: no theorem is known of `Plans`."
+        "Nothing is promised: no theorem is known of `Plans`. What would help: use laws, which "
+        "theorems speak of."
     )
 
 

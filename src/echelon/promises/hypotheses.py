@@ -97,11 +97,12 @@ def _trim_held(case: Case) -> Statement:
 
 def _exact(case: Case) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
-    text = "states are known exactly, and nothing disturbs the agents"
+    text, remedy = "states are known exactly, and nothing disturbs the agents", ""
     if case.disturbed:
+        remedy = "leave it out to see what it costs"
         text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
     verdict = Verdict.of(not case.disturbed)
-    return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text)
+    return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text, remedy=remedy)
 
 
 def _agreement(case: Case) -> Statement:

@@ -105,7 +105,7 @@ def _decaying(case: Case) -> Statement:
         law = isinstance(case.parts.drive, Laws)
         text = "the followers' law does not act on the disagreement"
         text = text if law else f"no theorem is known of `{type(case.parts.drive).__name__}`"
-        remedy = "use `consensus`" if law else ""
+        remedy = "use `consensus`" if law else "use laws, which theorems speak of"
         return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
     text = f"over {loop.certificate.modes} eigenvalues of the graph"
     if case.fed_by_parents:
@@ -113,7 +113,7 @@ def _decaying(case: Case) -> Statement:
     elif len(loop.closed.eigenvalues) > loop.certificate.modes:
         text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
     if not loop.every:
-        remedy = "raise `coupling`, or use `riccati` or `inner-loop`"
+        remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
         reason = "the disagreement does not decay"
     verdict, shown = Verdict.of(loop.every), f"{loop.slowest:.3g} 1/s"
     return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)

@@ -26,7 +26,7 @@ from echelon.promises.hypotheses import hypotheses
 from echelon.promises.leaders import leaders_of
 from echelon.promises.path import Frozen, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
-from echelon.promises.statement import Hypothesis, Statement
+from echelon.promises.statement import Cause, Hypothesis, Statement
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -116,23 +116,29 @@ class Promise:
         return longest_step(self.loop, self.frozen, settings)
 
     @property
-    def causes(self) -> tuple[Statement, ...]:
+    def causes(self) -> tuple[Cause, ...]:
         """The hypotheses whose failure explains why errors do not shrink.
 
         A mode that does not decay is explained by what the law cannot feel, or a weak coupling.
         """
         failed = {name: each for name, each in self.hypotheses.items() if each.fails}
         grows = Hypothesis.DECAYS in failed
-        why = tuple(failed[name] for name in _BEHIND_GROWTH if grows and name in failed)
+        why = tuple(failed[name].cause for name in _BEHIND_GROWTH if grows and name in failed)
         rest = (each for name, each in failed.items() if each.reason and name not in _BEHIND_GROWTH)
-        return (*why, *(e for e in rest if not why or e.statement is not Hypothesis.DECAYS))
+        rest = (x for x in rest if not why or x.statement is not Hypothesis.DECAYS)
+        return (*why, *(each.cause for each in rest))
 
     def sentence(self) -> str:
         """Return what is promised, in sentences, and no more than that."""
         told = self._promised() if self.promised else None
-        told = told or f"Nothing is promised: {'; '.join(self.reasons)}."
+        told = told or f"Nothing is promised: {'; '.join(self.reasons)}. {self._help()}"
         claims = self.hypotheses[Hypothesis.CLAIMS]
         return f"{told} Note: {claims.explanation}." if claims.fails else told
+
+    def _help(self) -> str:
+        """Return what would help against all that stands against a promise."""
+        against = (each for each in self.hypotheses.values() if each.fails and each.reason)
+        return f"What would help: {'; '.join(dict.fromkeys(x.remedy for x in against))}."
 
     def _promised(self) -> str:
         region = self.region
@@ -158,7 +164,7 @@ class Promise:
             return f"{by}: {text} ({theorem})."
         if not found.radius:
             text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
-            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}."
+            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}; {found.remedy}."
         read = "" if found.kind is self.kind else ", the leader going as in a run of its own"
         start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
         start = "everywhere" if found.radius == float("inf") else start

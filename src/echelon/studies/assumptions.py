@@ -39,7 +39,8 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
-    yield Statement("Lemma 3, sum over edges", Verdict.FAILS, _PROOF, rows, shown, text)
+    remedy = "nothing here rests on it: Lemma 1 serves instead"
+    yield Statement("Lemma 3, sum over edges", Verdict.FAILS, _PROOF, rows, shown, text, remedy)
 
 
 def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
@@ -49,8 +50,9 @@ def drift_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     yield monotone
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
     both = both and monotone.verdict is Verdict.HOLDS
-    text = "needs Assumption 5 and symmetric offsets"
-    yield Statement("Lemma 4, drift along z", Verdict.of(both), Kind.LINEARIZATION, text=text)
+    text, linear = "needs Assumption 5 and symmetric offsets", Kind.LINEARIZATION
+    verdict, remedy = Verdict.of(both), "" if both else "see Assumption 5 and the offsets"
+    yield Statement("Lemma 4, drift along z", verdict, linear, text=text, remedy=remedy)
     largest = _printed_lmi(parts, promise)
     shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
     text, remedy = f"{text}block is zero", "use the finite condition"
