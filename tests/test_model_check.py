@@ -238,6 +238,21 @@ FALSE = {
         "`drift` of `Tank` differs from one call to the next, as a clock or a random number makes "
         "it, and must be a function of its arguments alone.",
     ),
+    "limits that do not say what is delivered": (
+        limits(matrix=((1.0,), (2.0,)), low=(-1.0, -1.0), high=(1.0, 1.0)),
+        "`input_limits` of `Tank` has 2 rows for 1 inputs, which do not say what is delivered of "
+        "an input beyond them; add `limit`.",
+    ),
+    "limits that nothing keeps to": (
+        limits(high=(1.0,)) | {"limit": lambda self, u: u},
+        "`limit` of `Tank` makes [-1.2] of [-1.2], which `input_limits` do not allow; let "
+        "both say the same.",
+    ),
+    "a limit that cuts what is allowed": (
+        limits(high=(1.0,)) | {"limit": lambda self, u: jnp.clip(u, -0.2, 0.2)},
+        "`limit` of `Tank` makes [0.2] of [0.4], which `input_limits` allow; let both say "
+        "the same.",
+    ),
     "numbers for names": (
         {"state_names": (1, 2)},
         "`state_names` of `Tank` is (1, 2), and must be a tuple of names.",

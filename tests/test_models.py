@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from oracles import newton_euler, quadrotor_input_map, rotation
 from scipy.integrate import solve_ivp
 
@@ -192,6 +193,30 @@ def test_the_trim_is_an_equilibrium_within_the_limits(model):
     x, u = map(np.array, model.trim)
     assert np.abs(numpy(model.velocity, x, u)).max() <= 1e-12
     assert numpy(model.limit, u).tobytes() == u.tobytes()
+
+
+@given(
+    matrix=hnp.arrays(float, (2, 2), elements=st.floats(-2.0, 2.0)),
+    wanted=hnp.arrays(float, (2,), elements=st.floats(-9.0, 9.0)),
+)
+def test_limits_alone_say_what_is_delivered(matrix, wanted):
+    assume(np.linalg.cond(matrix) < 1e3)
+
+    class Pushed(ControlAffine):
+        state_names, input_names = ("x", "y"), ("a", "b")
+        input_limits = Limits(tuple(map(tuple, matrix.tolist())), (-1.0, -2.0), (3.0, 0.5))
+
+        def drift(self, x):
+            return -x
+
+        def input_map(self, x):
+            return jnp.eye(2, dtype=x.dtype)
+
+    delivered, rows = numpy(Pushed().limit, wanted), matrix @ wanted
+    nearest = np.clip(rows, [-1.0, -2.0], [3.0, 0.5])
+    np.testing.assert_allclose(matrix @ delivered, nearest, rtol=0, atol=1e-9)
+    if (rows == nearest).all():
+        assert delivered.tobytes() == wanted.tobytes()
 
 
 @every_model

@@ -348,11 +348,16 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
 def test_the_relayed_velocity_has_no_local_theorem_where_g_varies():
     model, bounds = ech.models.PlanarQuadrotor(), {"roll": 0.2, "thrust": 1.0}
     gain = ech.synthesize(model, PATH, ech.gains.RobustLQR(bounds))
+    moving = ech.laws.Tracking(ech.references.Circle(radius=0.2, rate=0.1))
     theorems = [
-        ech.promise(parts_of(model, PATH, gain, name), settings(dt=0.002)).theorem
-        for name in ("relay", "relay-velocity")
+        ech.promise(
+            parts.replace(drive=ech.Laws(leader, parts.drive.follower)), settings(dt=0.002)
+        ).theorem
+        for leader in (moving, ech.laws.TrimInput())
+        for parts in [parts_of(model, PATH, gain, name) for name in ("relay", "relay-velocity")]
     ]
-    assert theorems == [Theorem.T2, None]
+    # A leader that keeps to its trim makes no velocity that g could turn.
+    assert theorems == [Theorem.T2, None, Theorem.T2, Theorem.T2]
 
 
 def test_two_eigenvalues_do_not_stand_for_those_between_them():
@@ -489,6 +494,22 @@ def of_one_state(drift, states="x"):
     return Chain()
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "promised"),
+    [(-1.0, 1.0, True), (0.0, 1.0, False), (-1.0, 0.0, False), (0.2, 1.0, False)],
+)
+def test_a_trim_needs_room_on_both_sides_of_its_input(low, high, promised):
+    model = of_one_state(lambda x: -x)
+    type(model).input_limits = ech.models.Limits(((1.0,),), (low,), (high,))
+    gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.5))
+    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    assert promise.promised == promised
+    unlimited = ech.promise(parts_of(model, PATH, gain), settings(limits=False))
+    assert unlimited.promised
+    if not promised:
+        assert "actuators" in promise.sentence()
+
+
 def test_nothing_linear_is_promised_where_the_drift_bends_at_the_trim():
     model = of_one_state(lambda x: -x + 3.0 * jnp.abs(x))
     gain = ech.synthesize(model, PATH, ech.gains.FixedGain("identity", coupling=0.5))
@@ -505,6 +526,45 @@ def test_slopes_of_both_sides_that_contract_are_promised_without_a_linearization
     # The slower side, -1, and c times the smallest eigenvalue of the graph.
     assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-6)
     assert promise.domain == "x in [-0.001, 0.001]"
+
+
+def slowest_of_sides(sides, gain, graph):
+    """Return how slowly the modes decay on the slower side, 1/s, for constant slopes (n, n)."""
+    B, loop = np.eye(2)[:, 1:], np.zeros((1, 2)) if gain.inner is None else gain.inner
+    modes = np.linalg.eigvalsh(graph.grounded_laplacian().toarray())
+    pull = gain.coupling * np.linalg.solve(gain.R, B.T @ gain.P)
+    closed = [A - B @ (loop + mode * pull) for A in sides for mode in modes]
+    return -max(np.linalg.eigvals(A).real.max() for A in closed)
+
+
+def test_an_inner_loop_closes_around_the_slopes_of_both_sides():
+    model = of_one_state(lambda x: jnp.stack([x[1], -0.5 * jnp.maximum(x[1], 0.0)]), "xv")
+    gain = ech.synthesize(model, PATH, ech.gains.InnerLoop())
+    assert gain.inner is not None
+    promise = ech.promise(parts_of(model, PATH, gain), settings())
+    assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T1)
+    sides = [np.array([[0.0, 1.0], [0.0, -slope]]) for slope in (0.0, 0.5)]
+    assert 0.0 < promise.rate <= slowest_of_sides(sides, gain, PATH) + 1e-9
+
+
+@pytest.mark.parametrize("feedforward", ["none", "relay", "relay-velocity"])
+def test_a_leader_at_its_trim_has_no_velocity_that_a_bend_of_g_could_turn(feedforward):
+    class Bent(ech.ControlAffine):
+        state_names, input_names = ("x",), ("push",)
+
+        def drift(self, x):
+            return -2.0 * x + jnp.maximum(x, 0.0)
+
+        def input_map(self, x):
+            return (1.0 + 0.3 * jnp.abs(x))[:, None]
+
+    gain = ech.synthesize(Bent(), PATH, ech.gains.FixedGain("identity", coupling=0.5))
+    law = ech.laws.Consensus(gain, feedforward=feedforward)
+    parts = parts_of(Bent(), PATH, gain).replace(drive=ech.Laws(ech.laws.TrimInput(), law))
+    promise = ech.promise(parts, settings())
+    assert promise.promised and (promise.kind, promise.theorem) == (Kind.VERTICES, Theorem.T2)
+    # g is 1 at the trim, and 1.0003 at the edge of what was looked at.
+    assert promise.rate == pytest.approx(1.0 + 0.5 * PATH.spectrum().low, rel=1e-3)
 
 
 def test_a_hull_of_both_sides_is_promised_across_a_bend():

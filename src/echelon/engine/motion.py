@@ -10,7 +10,7 @@ from echelon.core.numerics import INTEGRATORS
 from echelon.core.types import Input, Inputs, State, States
 from echelon.engine.settings import Settings
 from echelon.models.model import ControlAffine
-from echelon.world.disturbance import Wind, disturb
+from echelon.world.disturbance import Wind, disturbed, draw
 from echelon.world.world import World
 
 
@@ -49,11 +49,23 @@ class Motion(eqx.Module):
 
         The delivered inputs (N, m) are held over it, and so is the disturbance of this step.
         """
+
         # Integrated with the input held, as a digital controller holds it: the order of the method
         # stays, since u and the wind are constant within a step.
-        integrate = INTEGRATORS[self.integrator]
-
         def one(x: State, u: Input, agent: jax.Array) -> State:
-            return integrate(disturb(self.plant, self.wind, step, agent), x, u, self.dt)
+            push, noise = draw(self.wind, step, agent)
+            return self.move(x, u, push, noise)
 
         return jax.vmap(one)(states, inputs, jnp.arange(len(states)))
+
+    def move(self, x: State, u: Input, push: State | None, noise: Input | None) -> State:
+        """Return the state of one agent one dt later, under what is held over it.
+
+        Args:
+            x: its state (n,).
+            u: its delivered input (m,).
+            push: what is added to its rate (n,), or None.
+            noise: what is added to its input (m,), or None.
+        """
+        field = disturbed(self.plant, push, noise)
+        return INTEGRATORS[self.integrator](field, x, u, self.dt)

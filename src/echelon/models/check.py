@@ -14,6 +14,10 @@ from echelon.models.model import ControlAffine, Limits
 
 # Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
 _TRIM_TOLERANCE = 1e-9
+_REACH = np.array([0.05, 0.05, 0.2, 0.2, 0.6, 0.6, 3.0, 3.0, 3.0, 100.0])
+"""How far from the trim limits are tried, in widths of what they allow."""
+_LITTLE = 1e-6
+"""A change of the normalized input: where limits leave no room for it, nothing linear holds."""
 
 
 class Shortfall(NamedTuple):
@@ -38,6 +42,7 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
         x, u = _check_constants(model, name)
         _check_functions(model, name, x, u)
         _check_trim(model, name, u)
+        _check_limit(model, name, u)
         return (*_low_precision(model, name), *_weak_actuators(model, name))
 
 
@@ -127,6 +132,35 @@ def _check_limits(model: ControlAffine, name: str, m: int) -> None:
     )
     if not (low < high).all():
         raise ModelError(f"`input_limits` of `{name}` must have each `low` below its `high`.")
+    if type(model).limit is ControlAffine.limit:
+        G = np.asarray(limits.matrix, float)
+        if k != m or np.linalg.matrix_rank(G) < m:
+            raise ModelError(
+                f"`input_limits` of `{name}` has {k} rows for {m} inputs, which do not say what is "
+                "delivered of an input beyond them; add `limit`."
+            )
+
+
+def _check_limit(model: ControlAffine, name: str, u: np.ndarray) -> None:
+    """Check that `limit` leaves what `input_limits` allow, and brings the rest in."""
+    if model.input_limits is None:
+        return
+    G, low, high = (np.asarray(part, float) for part in model.input_limits)
+    width = np.where(np.isfinite(high - low), high - low, 1.0 + np.abs(G @ u))
+    away = np.random.default_rng(0).normal(size=(len(_REACH), len(u)))
+    away *= (_REACH / np.abs(away @ G.T / width).max(axis=1))[:, None]
+    for asked in u + away:
+        delivered = np.asarray(model.limit(jnp.asarray(asked)))
+        rows, brought = G @ asked, G @ delivered
+        allowed = ((low <= rows) & (rows <= high)).all()
+        # NaN is within nothing, and an input that is allowed must come back to the bit.
+        within = np.abs(brought - np.clip(brought, low, high)) <= 1e-9 * width
+        if not within.all() or allowed and (delivered != asked).any():
+            raise ModelError(
+                f"`limit` of `{name}` makes {np.round(delivered, 6).tolist()} of "
+                f"{np.round(asked, 6).tolist()}, which `input_limits` "
+                f"{'allow' if allowed else 'do not allow'}; let both say the same."
+            )
 
 
 def _pair(name: str, what: str, pair: Any, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
@@ -234,8 +268,23 @@ def trim_shortfall(model: ControlAffine, wanted: np.ndarray | None = None) -> di
     return {name: Shortfall(got, wanted) for name, got, wanted in triples if got != wanted}
 
 
+def is_limited(model: ControlAffine) -> bool:
+    """Tell whether the actuators of a model have limits, said in either way."""
+    return model.input_limits is not None or type(model).limit is not ControlAffine.limit
+
+
+def at_limits(model: ControlAffine, u: np.ndarray) -> tuple[str, ...]:
+    """Return which normalized inputs cannot be changed by a little both ways about u (m,)."""
+    moved = _LITTLE * np.asarray(model.input_scale, float).T
+    with precision("float64"):
+        asked = np.concatenate([u + moved, u - moved])
+        got = np.stack([np.asarray(model.limit(jnp.asarray(each))) for each in asked])
+    changed = (got != asked).any(axis=1).reshape(2, -1).any(axis=0)
+    return tuple(n for n, cut in zip(model.input_names, changed, strict=True) if cut)
+
+
 def _weak_actuators(model: ControlAffine, name: str) -> tuple[str, ...]:
-    """Warn of a trim that the actuators cannot hold."""
+    """Warn of a trim that the actuators do not deliver."""
     # `limit` returns what fits unchanged, to the bit, so any difference is saturation.
     short = trim_shortfall(model).items()
     told = ", ".join(f"`{what}` {got:.4g} of {asked:.4g}" for what, (got, asked) in short)

@@ -116,9 +116,10 @@ class ControlAffine(eqx.Module):
     """Weights R of the normalized inputs in the law above `damping`, one each; ones without."""
 
     input_limits: ClassVar[Limits | None] = None
-    """The inputs that `limit` leaves unchanged, as inequalities for solvers; None if it never acts.
+    """The inputs that actuators deliver, low <= G u <= high; None where nothing limits them.
 
-    To be replaced together with `limit`.
+    Where G is square and invertible, `limit` clips row by row unless it is replaced; else it must
+    be.
     """
 
     chart: ClassVar[Mapping[str, tuple[float, float]]] = {}
@@ -161,12 +162,19 @@ class ControlAffine(eqx.Module):
         return x - y
 
     def limit(self, u: Input) -> Input:
-        """Return the input that the actuators deliver for a requested u; itself unless replaced.
+        """Return the input that the actuators deliver for a requested u.
 
-        An input within the limits must be returned unchanged, to the bit: that is how saturation is
-        counted.
+        Each row of G u is clipped to its limits unless replaced. An input within the limits must be
+        returned unchanged, to the bit: that is how saturation is counted.
         """
-        return u
+        if self.input_limits is None:
+            return u
+        G, low, high = (jnp.asarray(part, u.dtype) for part in self.input_limits)
+        rows = G @ u
+        held = jnp.clip(rows, low, high)
+        back = jnp.asarray(np.linalg.inv(np.asarray(self.input_limits.matrix)), u.dtype)
+        # There and back would round, and count as saturation.
+        return jnp.where(jnp.all(rows == held), u, back @ held)
 
     def velocity(self, x: State, u: Input) -> State:
         """Return f(x) + g(x) u."""

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import InputMap, Output, State
 from echelon.models.model import ControlAffine, Limits, check_positive, diagonal
 
 
@@ -47,11 +47,6 @@ class LinearPlanarQuadrotor(ControlAffine):
         # To both sides, as the source prints it, though no rotor can pull.
         high = (1.2 * self.mass * self.gravity, self.inertia * float(np.pi) / 10.0)
         return Limits(diagonal(1.0, 1.0), (-high[0], -high[1]), high)
-
-    def limit(self, u: Input) -> Input:
-        """Return the input clipped entry by entry."""
-        limits = self.input_limits
-        return jnp.clip(u, jnp.asarray(limits.low, u.dtype), jnp.asarray(limits.high, u.dtype))
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

@@ -4,7 +4,7 @@ A line whose `reason` is not empty stands against any promise where it fails; th
 left of one, or why.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.jacobians import offsets_are_symmetries
+from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Verdict
 from echelon.engine.drive import Drive
 from echelon.laws.law import Law
-from echelon.models.check import trim_shortfall
+from echelon.models.check import at_limits, is_limited, trim_shortfall
 from echelon.models.linearization import at_trim
 from echelon.models.model import ControlAffine
 from echelon.promises.case import Case
@@ -75,7 +76,7 @@ def _trim_held(case: Case) -> Statement:
     """Within limits an agent holds its trim only if its actuators deliver that input."""
     model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_HELD
     moved = case.parts.world.plant_for(model)
-    if not case.settings.limits or moved.input_limits is None:
+    if not (case.settings.limits and is_limited(moved)):
         text = "no limit acts on the inputs"
         return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
     short = trim_shortfall(moved, np.asarray(model.trim[1], float))
@@ -83,7 +84,10 @@ def _trim_held(case: Case) -> Statement:
         # A heavier plant needs more than the model's trim to stay where it is.
         short |= trim_shortfall(plant)
     if not short:
-        text = "the actuators deliver the input that it takes"
+        held = at_limits(moved, np.asarray(model.trim[1], float))
+        if held:
+            return _no_room(name, held)
+        text = "the actuators deliver the input that it takes, and more either way"
         return Statement(name, Verdict.HOLDS, Kind.PROOF, text=text)
     units = dict(zip(model.input_names, model.input_units, strict=True))
     cut = [f"{got:.4g} of {asked:.4g} {units[i]}".rstrip() for i, (got, asked) in short.items()]
@@ -93,6 +97,15 @@ def _trim_held(case: Case) -> Statement:
     reason = f"{text}, and cannot hold the trim"
     shown = f"{100.0 * worst:.3g} %"
     return Statement(name, Verdict.FAILS, Kind.PROOF, worst, shown, text, remedy, reason)
+
+
+def _no_room(name: Hypothesis, held: Sequence[str]) -> Statement:
+    """Say that the trim stands at a limit, where no small error gets the input that it asks for."""
+    text = (
+        f"the trim stands at a limit of the actuators, which deliver no change of {listing(held)}"
+    )
+    remedy = "give the actuators room about the trim"
+    return Statement(name, Verdict.FAILS, Kind.PROOF, 0.0, "0 %", text, remedy, text)
 
 
 def _exact(case: Case) -> Statement:

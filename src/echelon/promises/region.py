@@ -13,7 +13,7 @@ from echelon.certificates.certificate import RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import jacobians
 from echelon.certificates.lmi import falls
-from echelon.certificates.region import contracting_region, drift_region, pairs_on
+from echelon.certificates.region import Pairs, contracting_region, drift_region, pairs_on
 from echelon.core.errors import GainError
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
@@ -74,10 +74,11 @@ def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     text = "the slopes beside the trim, where the model bends, do not all contract in P"
     none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, shown="none", text=text)
     try:
-        found = _contraction(parts, gain, _near(parts.model), exact=False)
+        pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
+        found = pairs and _contraction(parts, gain, pairs, exact=False)
     except GainError:
         found = None
-    if found is None or found.kind is Kind.SAMPLES or _withheld(parts, leaders, gain, found)[0]:
+    if found is None or found.kind is Kind.SAMPLES or _not_the_law(parts, leaders, found)[0]:
         return Region(None, None, none)
     return Region(found, None, _line(parts, found))
 
@@ -95,10 +96,21 @@ def slopes_beside(parts: Parts) -> Array | None:
         return None
 
 
-def _contraction(parts: Parts, gain: Gain, domain: Domain, exact: bool) -> RegionCertificate | None:
-    """Return what a gain's metric contracts on a domain at its coupling; None for nothing."""
-    pairs, B = pairs_on(parts.model, domain, gain.R), linearize(parts.model).B
-    spectrum = parts.graph.spectrum()
+def _with_inner(parts: Parts, gain: Gain, pairs: Pairs) -> Pairs | None:
+    """Return the slopes with a gain's inner loop closed; None where g turns what the loop does."""
+    if gain.inner is None:
+        return pairs
+    if pairs.W is not None:
+        return None
+    linear = linearize(parts.model)
+    # g is constant, so the loop adds the same matrix to every slope.
+    closed = pairs.A + (linear.with_inner(gain.inner).A - linear.A)
+    return pairs._replace(A=closed, found=pairs.found._replace(matrices=closed))
+
+
+def _contraction(parts: Parts, gain: Gain, pairs: Pairs, exact: bool) -> RegionCertificate | None:
+    """Return what a gain's metric contracts at its coupling; None for nothing."""
+    B, spectrum = linearize(parts.model).B, parts.graph.spectrum()
     return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
 
 
@@ -110,7 +122,7 @@ def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCerti
         if not falls(gain.P, found.matrices):
             return None
         return drift_region(model, claim.domain, found, gain.P, gain.coupling, spectrum)
-    return _contraction(parts, gain, claim.domain, exact)
+    return _contraction(parts, gain, pairs_on(model, claim.domain, gain.R), exact)
 
 
 def _strength(parts: Parts, gain: Gain) -> float:
@@ -120,17 +132,23 @@ def _strength(parts: Parts, gain: Gain) -> float:
 def _withheld(
     parts: Parts, leaders: Leaders, gain: Gain, found: RegionCertificate
 ) -> tuple[str, str]:
-    """Return why the law that runs does not keep what the metric could, and what would."""
-    feedforward, theorem = parts.drive.feedforward, found.theorem
+    """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
     if gain.inner is not None:
         return "the hull is of the drift without the gain's inner loop", "leave the loop out"
+    return _not_the_law(parts, leaders, found)
+
+
+def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tuple[str, str]:
+    """Return why what is fed forward takes away what the metric could keep, and what would not."""
+    feedforward, theorem = parts.drive.feedforward, found.theorem
     if feedforward is Feedforward.PARENT:
         text = "parents' inputs are fed forward, and the modes are no longer those of a symmetric "
         return f"{text}matrix, which {theorem} rests on", "set `feedforward: relay`"
     if feedforward is Feedforward.NONE and not leaders.rest:
         text = f"{theorem} needs the leader's input at every follower, or at rest at its trim"
         return text, "set `feedforward: relay`"
-    if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2:
+    # A leader at its trim makes no velocity beyond it, and its raw input is that of the trim.
+    if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2 and not leaders.rest:
         text = "T2 is of the leader's raw input; what each agent makes of its velocity turns with g"
         return f"{text}, and is not enclosed", "set `feedforward: relay`"
     if not leaders.agree:

@@ -17,7 +17,7 @@ from echelon.engine.motion import Motion
 from echelon.engine.result import Result
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-from echelon.world.disturbance import disturb
+from echelon.world.disturbance import disturbed, draw
 
 # Below this fraction of its largest value V is made of rounding and its rises mean nothing.
 _ROUNDING = 1e-20
@@ -144,7 +144,7 @@ def _fields(
     """
 
     def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
-        return disturb(motion.plant, motion.wind, step, agent)(x, u)
+        return disturbed(motion.plant, *draw(motion.wind, step, agent))(x, u)
 
     moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
     drift = jax.vmap(jax.vmap(lambda x: drive.drift(motion.plant, x)))

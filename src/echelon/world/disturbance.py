@@ -152,12 +152,23 @@ class Wind(eqx.Module):
         return jax.random.normal(key, (size,), jnp.float32).astype(float)
 
 
-def disturb(plant: ControlAffine, wind: Wind | None, step: jax.Array, agent: jax.Array) -> Field:
-    """Return (x, u) -> xdot of an agent during a step, wind and noise included."""
-    if wind is None:
+def draw(
+    wind: Wind | None, step: jax.Array, agent: jax.Array
+) -> tuple[State | None, Input | None]:
+    """Return what acts on an agent's rate and on its input during a step; None for nothing."""
+    return (None, None) if wind is None else (wind.on_state(step, agent), wind.on_input(step, agent))
+
+
+def disturbed(plant: ControlAffine, push: State | None, noise: Input | None) -> Field:
+    """Return (x, u) -> xdot of an agent under wind and noise, which are held over a step."""
+    if push is None and noise is None:
         return plant.velocity
-    push, noise = wind.on_state(step, agent), wind.on_input(step, agent)
-    return lambda x, u: plant.velocity(x, u if noise is None else u + noise) + push
+
+    def velocity(x: State, u: Input) -> State:
+        xdot = plant.velocity(x, u if noise is None else u + noise)
+        return xdot if push is None else xdot + push
+
+    return velocity
 
 
 def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Array:

@@ -1,0 +1,407 @@
+"""Elementary functions as operations of a graph, so that no library's code runs lane by lane.
+
+Polynomials are Taylor's, made shorter by Chebyshev's: the highest power is replaced by the
+combination of lower ones that is nearest to it on the interval, which costs 2^(1-2k) of it for
+degree k. Arguments are brought to the interval by the function's own symmetries. What each is off
+by is measured in the tests, in units of the last place.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from echelon.kernels.scalar import Node
+
+_EPS = {64: 2.0**-53, 32: 2.0**-24}
+_PARTS = {64: (33, 33, 53), 32: (11, 11, 24)}
+"""Bits of the parts of pi/2 and ln 2: products with whole numbers of 20 or 13 bits are exact."""
+
+
+# ---- polynomials ---------------------------------------------------------------------------------
+
+
+def _shifted_chebyshev(degree: int, width: Fraction) -> list[Fraction]:
+    """Return the coefficients of T_k(2 s / width - 1), lowest first."""
+    before, now = [Fraction(1)], [Fraction(-1), 2 / width]
+    for _ in range(degree - 1):
+        # T_k+1 = 2 y T_k - T_k-1 with y = 2 s / width - 1.
+        up = [Fraction(0), *(4 / width * c for c in now)]
+        same = [-2 * c for c in now] + [Fraction(0)]
+        old = [*before, *[Fraction(0)] * (len(up) - len(before))]
+        before, now = now, [a + b - c for a, b, c in zip(up, same, old, strict=True)]
+    return now if degree else before
+
+
+@functools.cache
+def _economized(series: Callable[[int], Fraction], width: float, tolerance: float) -> list[float]:
+    """Return coefficients, lowest first, off by less than a tolerance for s in [0, width].
+
+    `series(k)` is Taylor's coefficient of s^k.
+    """
+    end, rest, count = Fraction(width), Fraction(tolerance), 1
+    while abs(series(count)) * end**count > rest / 8:
+        count += 1
+    coefficients = [series(k) for k in range(count + 1)]
+    while len(coefficients) > 2:
+        # Of all polynomials with this highest coefficient, Chebyshev's is least.
+        chebyshev = _shifted_chebyshev(len(coefficients) - 1, end)
+        share = coefficients[-1] / chebyshev[-1]
+        if abs(share) > rest / 2:
+            break
+        rest -= abs(share)
+        pairs = zip(coefficients[:-1], chebyshev[:-1], strict=True)
+        coefficients = [c - share * t for c, t in pairs]
+    return [float(c) for c in coefficients]
+
+
+def polynomial(s: Node, coefficients: Sequence[float]) -> Node:
+    """Return sum_k c_k s^k, by Horner's rule."""
+    result = s.graph.constant(coefficients[-1])
+    for c in coefficients[-2::-1]:
+        result = result * s + c
+    return result
+
+
+def _parts(value: Fraction, bits: int) -> list[float]:
+    """Return numbers that add up to a value, the first ones with few bits."""
+    parts, rest = list[float](), value
+    for width in _PARTS[bits]:
+        scale = Fraction(2) ** (width - math.frexp(float(rest))[1])
+        part = Fraction(round(rest * scale)) / scale
+        parts.append(float(part))
+        rest -= part
+    return parts
+
+
+# pi by Machin's formula and ln 2 by its own series, to 200 bits.
+def _arctan_inverse(x: int) -> Fraction:
+    return sum((Fraction((-1) ** k, (2 * k + 1) * x ** (2 * k + 1)) for k in range(50)), Fraction())
+
+
+_PI = 4 * (4 * _arctan_inverse(5) - _arctan_inverse(239))
+_LN2 = sum((Fraction(2, (2 * k + 1) * 3 ** (2 * k + 1)) for k in range(70)), Fraction())
+
+
+def _reduce(x: Node, k: Node, period: Fraction) -> Node:
+    """Return x - k period."""
+    for part in _parts(period, x.graph.bits):
+        x = x - k * part
+    return x
+
+
+def _sine_series(k: int) -> Fraction:
+    return Fraction((-1) ** k, math.factorial(2 * k + 1))
+
+
+def _cosine_series(k: int) -> Fraction:
+    return Fraction((-1) ** k, math.factorial(2 * k))
+
+
+def _tail_series(k: int) -> Fraction:
+    return Fraction(1, math.factorial(k + 2))
+
+
+def _arctangent_series(k: int) -> Fraction:
+    return Fraction((-1) ** k, 2 * k + 1)
+
+
+def _logarithm_series(k: int) -> Fraction:
+    return Fraction(2, 2 * k + 3)
+
+
+# ---- choices -------------------------------------------------------------------------------------
+
+
+def choose(which: Node, a: Node | float, b: Node | float) -> Node:
+    """Return a where a truth holds, else b."""
+    return which.graph.make("select", which, a, b)
+
+
+def _less(a: Node | float, b: Node) -> Node:
+    return b.graph.make("lt", a, b)
+
+
+def size(x: Node) -> Node:
+    """Return |x|."""
+    return x.graph.make("abs", x)
+
+
+def signed(x: Node, like: Node) -> Node:
+    """Return |x| with the sign of another number."""
+    return x.graph.make("copysign", x, like)
+
+
+# ---- functions -----------------------------------------------------------------------------------
+
+
+def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
+    """Return both; the graph keeps what they share once."""
+    g, eps = x.graph, _EPS[x.graph.bits]
+    k = g.make("rint", x * (2.0 / math.pi))
+    r = _reduce(x, k, _PI / 2)
+    s, width = r * r, 0.62  # (pi / 4)^2 is 0.617
+    sine = r + r * s * polynomial(s, _economized(lambda k: _sine_series(k + 1), width, eps))
+    cosine = polynomial(s, _economized(lambda k: _cosine_series(k + 2), width, eps))
+    cosine = (1.0 - 0.5 * s) + s * s * cosine
+    # The quarter of the circle, 0 to 3.
+    quarter = k - 4.0 * g.make("floor", 0.25 * k)
+    odd = g.make("ne", quarter - 2.0 * g.make("floor", 0.5 * quarter), 0.0)
+    first, second = choose(odd, cosine, sine), choose(odd, sine, cosine)
+    lower = g.make("le", 2.0, quarter)
+    left = g.make("xor", odd, lower)
+    return choose(lower, -first, first), choose(left, -second, second)
+
+
+def sin(x: Node) -> Node:
+    """Return sin x, for |x| up to 1e5 (1e3 in single precision)."""
+    return _sine_and_cosine(x)[0]
+
+
+def cos(x: Node) -> Node:
+    """Return cos x, for |x| up to 1e5 (1e3 in single precision)."""
+    return _sine_and_cosine(x)[1]
+
+
+def tan(x: Node) -> Node:
+    """Return tan x."""
+    return sin(x) / cos(x)
+
+
+def _scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
+    """Return e^r - 1 and two factors 2^k whose product it is to be scaled by, x = r + k ln 2."""
+    g, eps = x.graph, _EPS[x.graph.bits]
+    low, high = (-746.0, 710.0) if g.bits == 64 else (-105.0, 90.0)
+    x = g.make("min", g.make("max", x, low), high)
+    k = g.make("rint", x * float(1 / _LN2))
+    r = _reduce(x, k, _LN2)
+    grown = r + r * r * _both_signs(r, eps)
+    # In two factors, since 2^k alone may be no number where the result is one.
+    half = g.make("floor", 0.5 * k)
+    return grown, g.make("pow2", half), g.make("pow2", k - half)
+
+
+def _both_signs(r: Node, eps: float) -> Node:
+    """Return (e^r - 1 - r) / r^2 for |r| <= 0.35, even and odd powers apart."""
+    s = r * r
+    even = polynomial(s, _economized(lambda k: _tail_series(2 * k), 0.123, eps))
+    odd = polynomial(s, _economized(lambda k: _tail_series(2 * k + 1), 0.123, eps))
+    return even + r * odd
+
+
+def exp(x: Node) -> Node:
+    """Return e^x."""
+    grown, first, second = _scaled_exponential(x)
+    return (grown + 1.0) * first * second
+
+
+def expm1(x: Node) -> Node:
+    """Return e^x - 1, without loss near 0."""
+    grown, first, second = _scaled_exponential(x)
+    # Up to 2^60 the two terms have their digits in common; beyond, 1 is none of them.
+    factor = first * second
+    near = factor * grown + (factor - 1.0)
+    large = _less(40.0 if x.graph.bits == 64 else 20.0, x)
+    return choose(large, (grown + 1.0) * first * second, near)
+
+
+def log(x: Node) -> Node:
+    """Return ln x; -inf at 0, and NaN below."""
+    g, bits = x.graph, x.graph.bits
+    tiny, lift = (2.0**-1022, 54) if bits == 64 else (2.0**-126, 25)
+    low = _less(x, g.constant(tiny))
+    normal = choose(low, x * 2.0**lift, x)
+    e = g.make("exponent", normal) - choose(low, float(lift), 0.0)
+    f = g.make("mantissa", normal) - 1.0
+    # ln(1 + f) = f - (f^2/2 - s (f^2/2 + R)) with s = f / (2 + f), 2 artanh s = 2 s + s R.
+    s = f / (f + 2.0)
+    square = s * s
+    R = square * polynomial(square, _economized(_logarithm_series, 0.0295, _EPS[bits]))
+    half = 0.5 * f * f
+    high, *rest = _parts(_LN2, bits)
+    result = e * high - ((half - (s * (half + R) + e * sum(rest))) - f)
+    result = choose(g.make("eq", x, math.inf), math.inf, result)
+    result = choose(g.make("eq", x, 0.0), -math.inf, result)
+    # Of what is below 0, and of NaN, which is no number at or above it.
+    return choose(g.make("le", 0.0, x), result, math.nan)
+
+
+def log1p(x: Node) -> Node:
+    """Return ln(1 + x), without loss near 0."""
+    g, u = x.graph, 1.0 + x
+    # What rounding took from 1 + x, which a compiler may not simplify away: no flag allows it.
+    lost = x - (u - 1.0)
+    result = log(u) + lost / u
+    plain = g.make("or", g.make("eq", u, math.inf), g.make("le", u, 0.0))
+    result = choose(plain, log(u), result)
+    # Keeps the sign of 0, and what is smaller than any change of 1.
+    return choose(g.make("eq", u, 1.0), x, result)
+
+
+def tanh(x: Node) -> Node:
+    """Return tanh x."""
+    # From 22 on it is 1 to the last place; `min` keeps NaN.
+    grown = expm1(2.0 * x.graph.make("min", size(x), 22.0))
+    return signed(grown / (grown + 2.0), x)
+
+
+def sinh(x: Node) -> Node:
+    """Return sinh x."""
+    grown = expm1(size(x))
+    near = 0.5 * (grown + grown / (grown + 1.0))
+    half = exp(0.5 * size(x))
+    far = _less(700.0 if x.graph.bits == 64 else 85.0, size(x))
+    return signed(choose(far, 0.5 * half * half, near), x)
+
+
+def cosh(x: Node) -> Node:
+    """Return cosh x."""
+    grown, half = exp(size(x)), exp(0.5 * size(x))
+    far = _less(700.0 if x.graph.bits == 64 else 85.0, size(x))
+    return choose(far, 0.5 * half * half, 0.5 * grown + 0.5 / grown)
+
+
+def asinh(x: Node) -> Node:
+    """Return arsinh x, for |x| up to 1e150 (1e18 in single precision)."""
+    a = size(x)
+    root = x.graph.make("sqrt", a * a + 1.0)
+    return signed(log1p(a + a * a / (root + 1.0)), x)
+
+
+def acosh(x: Node) -> Node:
+    """Return arcosh x, for x up to 1e150 (1e18 in single precision)."""
+    above = x - 1.0
+    return log1p(above + x.graph.make("sqrt", above * (x + 1.0)))
+
+
+def atanh(x: Node) -> Node:
+    """Return artanh x."""
+    a = size(x)
+    return signed(0.5 * log1p(2.0 * a / (1.0 - a)), x)
+
+
+def logistic(x: Node) -> Node:
+    """Return 1 / (1 + e^-x)."""
+    return 1.0 / (1.0 + exp(-x))
+
+
+def atan2(y: Node, x: Node) -> Node:
+    """Return the angle of the point (x, y)."""
+    g, a, b = y.graph, size(y), size(x)
+    low, high = g.make("min", a, b), g.make("max", a, b)
+    # Two infinite sides are alike, and no sides at all make no angle.
+    ratio = choose(g.make("eq", low, high), choose(g.make("eq", high, 0.0), 0.0, 1.0), low / high)
+    # NaN is equal to nothing, so `low / high` keeps it. About 1 instead of 0 beyond tan(pi/8).
+    far = _less(math.tan(math.pi / 8), ratio)
+    t = choose(far, (ratio - 1.0) / (ratio + 1.0), ratio)
+    s = t * t
+    width = math.tan(math.pi / 8) ** 2
+    series = _economized(lambda k: _arctangent_series(k + 1), width, _EPS[g.bits])
+    angle = t + t * s * polynomial(s, series)
+    angle = choose(far, math.pi / 4 + angle, angle)
+    rest = float(_PI / 2 - Fraction(math.pi / 2))
+    angle = choose(_less(b, a), math.pi / 2 - (angle - rest), angle)
+    behind = _less(signed(g.constant(1.0), x), g.constant(0.0))
+    return signed(choose(behind, math.pi - (angle - 2.0 * rest), angle), y)
+
+
+def atan(x: Node) -> Node:
+    """Return arctan x."""
+    return atan2(x, x.graph.constant(1.0))
+
+
+def asin(x: Node) -> Node:
+    """Return arcsin x."""
+    return atan2(x, x.graph.make("sqrt", (1.0 - x) * (1.0 + x)))
+
+
+def acos(x: Node) -> Node:
+    """Return arccos x."""
+    return atan2(x.graph.make("sqrt", (1.0 - x) * (1.0 + x)), x)
+
+
+def cbrt(x: Node) -> Node:
+    """Return the cube root of x."""
+    a = size(x)
+    root = exp(log(a) / 3.0)
+    # One step of Newton's doubles the digits.
+    better = root - (root * root * root - a) / (3.0 * root * root)
+    usual = x.graph.make("and", _less(0.0, a), _less(a, x.graph.constant(math.inf)))
+    return signed(choose(usual, better, a), x)
+
+
+def integer_power(x: Node, exponent: int) -> Node:
+    """Return x^k by squaring."""
+    if exponent < 0:
+        return 1.0 / integer_power(x, -exponent)
+    result, square = x.graph.constant(1.0), x
+    while exponent:
+        result = result * square if exponent & 1 else result
+        square, exponent = square * square, exponent >> 1
+    return result
+
+
+def power(x: Node, y: Node) -> Node:
+    """Return x^y; its relative error grows with |y ln x|."""
+    g = x.graph
+    if y.op == "constant":
+        if y.value == 0.5:
+            return g.make("sqrt", x)
+        if y.value == round(y.value) and abs(y.value) <= 64:
+            return integer_power(x, int(y.value))
+    positive = exp(y * log(size(x)))
+    whole = g.make("eq", g.make("floor", y), y)
+    odd = g.make("ne", 2.0 * g.make("floor", 0.5 * y), y)
+    minus = choose(whole, choose(odd, -positive, positive), math.nan)
+    result = choose(_less(x, g.constant(0.0)), minus, positive)
+    one = g.make("or", g.make("eq", y, 0.0), g.make("eq", x, 1.0))
+    return choose(one, 1.0, result)
+
+
+@functools.cache
+def _error_function_fits() -> tuple[list[float], list[float]]:
+    """Return fits of erf(x) / x in x^2 for |x| <= 1, and of e^(x^2) erfc(x) for 1 <= x <= 6.5.
+
+    The second is a polynomial in (x - 3) / (x + 3), which is nearly that of a straight line.
+    """
+    from scipy.special import erf, erfcx
+
+    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200)
+    square = 0.5 * (nodes + 1.0)
+    root = np.sqrt(square)
+    near = np.polynomial.Chebyshev.fit(square, erf(root) / root, 12, domain=[0.0, 1.0])
+    first, last = (1.0 - 3.0) / (1.0 + 3.0), (6.5 - 3.0) / (6.5 + 3.0)
+    t = 0.5 * (last - first) * (nodes + 1.0) + first
+    far = np.polynomial.Chebyshev.fit(t, erfcx(3.0 * (1.0 + t) / (1.0 - t)), 22, [first, last])
+    power = np.polynomial.Polynomial
+    return near.convert(kind=power).coef.tolist(), far.convert(kind=power).coef.tolist()
+
+
+def erf(x: Node) -> Node:
+    """Return the error function of x."""
+    near, far = _error_function_fits()
+    a = x.graph.make("min", size(x), 6.5)
+    inner = a * polynomial(a * a, near)
+    outer = 1.0 - exp(-(a * a)) * polynomial((a - 3.0) / (a + 3.0), far)
+    return signed(choose(_less(1.0, a), outer, inner), x)
+
+
+def sign(x: Node) -> Node:
+    """Return 1, -1, or x itself where it is 0 or no number."""
+    return choose(_less(0.0, x), 1.0, choose(_less(x, x.graph.constant(0.0)), -1.0, x))
+
+
+def remainder(x: Node, y: Node) -> Node:
+    """Return x - y trunc(x / y), exact while the quotient is small."""
+    quotient = x / y
+    whole = x.graph.make("floor", size(quotient))
+    return x - y * signed(whole, quotient)
+
+
+def round_half_away(x: Node) -> Node:
+    """Return the nearest whole number, halves away from zero."""
+    low = x.graph.make("floor", size(x))
+    up = x.graph.make("le", 0.5, size(x) - low)
+    return signed(choose(up, low + 1.0, low), x)

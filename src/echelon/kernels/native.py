@@ -1,0 +1,121 @@
+"""Code for this machine from text for LLVM, kept between processes, and called by address."""
+
+import ctypes
+import hashlib
+import os
+import platform
+from functools import cache
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from echelon.core.errors import MissingExtraError
+
+
+@cache
+def llvm() -> Any:
+    """Return llvmlite's binding, ready for this machine.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    # Here, since it comes with an extra, and takes long to load.
+    try:
+        import llvmlite.binding as binding
+    except ImportError:
+        raise MissingExtraError(
+            "the native engine needs llvmlite; "
+            "install it with `pip install 'echelon-formation[fast]'`."
+        ) from None
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    return binding
+
+
+def is_installed() -> bool:
+    """Tell whether native code can be made here."""
+    try:
+        llvm()
+    except MissingExtraError:
+        return False
+    return True
+
+
+@cache
+def features() -> str:
+    """Return what this machine's processor has, as LLVM writes it."""
+    return llvm().get_host_cpu_features().flatten()
+
+
+@final
+class Code:
+    """A kernel as machine code, which lives as long as this object."""
+
+    def __init__(self, text: str, cache_folder: Path | None = None) -> None:
+        """Compile a text, or take what was compiled of it before."""
+        binding = llvm()
+        target = binding.Target.from_default_triple()
+        self._machine = target.create_target_machine(
+            cpu=binding.get_host_cpu_name(), features=features(), opt=3, codemodel="jitdefault"
+        )
+        stored = _stored(text, binding, cache_folder)
+        made = None if stored is None else _read(stored)
+        if made is None:
+            made = self._compile(binding, text)
+            if stored is not None:
+                _keep(stored, made)
+        self._jit = binding.create_lljit_compiler(self._machine)
+        name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+        builder = binding.JITLibraryBuilder().add_object_img(made).export_symbol("run")
+        self._library = builder.link(self._jit, name)
+        self.call = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._library["run"])
+
+    def _compile(self, binding: Any, text: str) -> bytes:
+        module = binding.parse_assembly(text)
+        module.verify()
+        options = binding.create_pipeline_tuning_options(speed_level=2)
+        options.loop_vectorization = options.slp_vectorization = False
+        passes = binding.create_pass_builder(self._machine, options)
+        passes.getModulePassManager().run(module, passes)
+        return self._machine.emit_object(module)
+
+
+def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
+    """Return the file that holds what is made of a text on this machine."""
+    if folder is None:
+        return None
+    import llvmlite
+
+    parts = [text, features(), binding.get_host_cpu_name(), llvmlite.__version__]
+    parts += [platform.system(), platform.machine()]
+    return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.kernel"
+
+
+def _read(file: Path) -> bytes | None:
+    """Return machine code from a file; None where it is not there, or not whole."""
+    try:
+        stored = file.read_bytes()
+    except OSError:
+        return None
+    # A half-written or damaged object would end the process and not only the run.
+    return stored[32:] if hashlib.sha256(stored[32:]).digest() == stored[:32] else None
+
+
+def _keep(file: Path, made: bytes) -> None:
+    """Write machine code to a file, beside it first; a folder without room keeps nothing."""
+    beside = file.with_name(f"{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_bytes(hashlib.sha256(made).digest() + made)
+        beside.replace(file)
+    except OSError:
+        beside.unlink(missing_ok=True)
+
+
+def aligned(shape: tuple[int, ...], dtype: np.dtype[Any] | type) -> np.ndarray:
+    """Return zeros that begin at a multiple of 64 bytes, as whole vectors are stored."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    room = np.zeros(size + 64, np.uint8)
+    start = -room.ctypes.data % 64
+    return room[start : start + size].view(dtype).reshape(shape)

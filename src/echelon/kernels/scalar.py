@@ -1,0 +1,257 @@
+"""Scalar operations as a graph in which nothing is told twice: folded, shared, without dead code.
+
+A node is a number that differs from agent to agent, or one that is the same for all of them, such
+as the time. It is made by an operation of `OPERATIONS` from other nodes, and an operation of the
+same operands is the same node. All code for vectors is made from such a graph.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, TypeAlias, final
+
+import numpy as np
+
+Entry: TypeAlias = "Node | float | bool"
+
+
+def _divide(a: float, b: float) -> float:
+    return float(np.divide(a, b))
+
+
+# What each operation does to plain numbers; a name is an instruction of `vector_ir` too.
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    # A difference that no product is fused into, so that it is the same wherever it is made.
+    "apart": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": _divide,
+    "neg": lambda a: -a,
+    "abs": abs,
+    "sqrt": lambda a: float(np.sqrt(a)),
+    "floor": lambda a: float(np.floor(a)),
+    "ceil": lambda a: float(np.ceil(a)),
+    "rint": lambda a: float(np.rint(a)),
+    "min": lambda a, b: float(np.minimum(a, b)),
+    "max": lambda a, b: float(np.maximum(a, b)),
+    "copysign": math.copysign,
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "and": lambda a, b: a and b,
+    "or": lambda a, b: a or b,
+    "xor": lambda a, b: a != b,
+    "not": lambda a: not a,
+    "select": lambda which, a, b: a if which else b,
+    # 2^k, and the parts of |x| = m 2^e with m in [sqrt(1/2), sqrt(2)): by the bits of a number.
+    "pow2": lambda k: float(np.ldexp(1.0, int(k))),
+    "exponent": lambda x: float(np.round(np.log2(x))),
+    "mantissa": lambda x: x / 2.0 ** float(np.round(np.log2(x))),
+}
+TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not"}
+_COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
+_NEVER_FOLDED = {"exponent", "mantissa"}
+
+
+@final
+class Node:
+    """A scalar of a graph; Python's arithmetic on it makes others.
+
+    Attributes:
+        graph: that it belongs to.
+        number: its place; operands come before what is made of them.
+        op: a key of `OPERATIONS`, `constant` or `leaf`.
+        args: its operands.
+        value: the number of a constant, the name of a leaf.
+        uniform: whether it is the same for all agents.
+        truth: whether it is true or false, and no number.
+    """
+
+    __slots__ = ("args", "graph", "number", "op", "truth", "uniform", "value")
+    __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
+
+    def __init__(
+        self, graph: "Graph", op: str, args: tuple["Node", ...], value: Any, uniform: bool
+    ) -> None:
+        self.graph, self.number, self.op = graph, len(graph.nodes), op
+        self.args, self.value, self.uniform = args, value, uniform
+        self.truth = op in TRUTHS or op == "constant" and isinstance(value, bool)
+        if op == "select":
+            self.truth = args[1].truth
+        graph.nodes.append(self)
+
+    def __add__(self, other: Entry) -> "Node":
+        return self.graph.make("add", self, other)
+
+    def __radd__(self, other: Entry) -> "Node":
+        return self.graph.make("add", other, self)
+
+    def __sub__(self, other: Entry) -> "Node":
+        return self.graph.make("sub", self, other)
+
+    def __rsub__(self, other: Entry) -> "Node":
+        return self.graph.make("sub", other, self)
+
+    def __mul__(self, other: Entry) -> "Node":
+        return self.graph.make("mul", self, other)
+
+    def __rmul__(self, other: Entry) -> "Node":
+        return self.graph.make("mul", other, self)
+
+    def __truediv__(self, other: Entry) -> "Node":
+        return self.graph.make("div", self, other)
+
+    def __rtruediv__(self, other: Entry) -> "Node":
+        return self.graph.make("div", other, self)
+
+    def __neg__(self) -> "Node":
+        return self.graph.make("neg", self)
+
+
+@final
+class Graph:
+    """Nodes, each once.
+
+    Args:
+        bits: 64 or 32, the precision in which the code that is made of it computes.
+    """
+
+    def __init__(self, bits: int = 64) -> None:
+        self.bits, self.nodes = bits, list[Node]()
+        self._known: dict[Any, Node] = {}
+
+    def constant(self, value: float | bool) -> Node:
+        """Return a plain number as a node."""
+        value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
+        # By its bits: 0 and -0 are two numbers, and NaN is one.
+        key = value if isinstance(value, bool) else np.float64(value).tobytes()
+        return self._once(("constant", type(value), key), "constant", (), value, True)
+
+    def leaf(self, *name: Any, uniform: bool = False) -> Node:
+        """Return what is read from memory under a name."""
+        return self._once(("leaf", name), "leaf", (), name, uniform)
+
+    def make(self, op: str, *operands: Entry) -> Node:
+        """Return the result of an operation, folded where it can be."""
+        args = tuple(a if isinstance(a, Node) else self.constant(a) for a in operands)
+        if op not in _NEVER_FOLDED and all(a.op == "constant" for a in args):
+            with np.errstate(all="ignore"):
+                return self.constant(OPERATIONS[op](*(a.value for a in args)))
+        simpler = _SIMPLER.get(op, lambda *args: None)(*args)
+        if simpler is not None:
+            return simpler
+        if op in _COMMUTE and args[0].number > args[1].number:
+            args = args[::-1]
+        key = (op, *(a.number for a in args))
+        return self._once(key, op, args, None, all(a.uniform for a in args))
+
+    def _once(
+        self, key: Any, op: str, args: tuple[Node, ...], value: Any, uniform: bool
+    ) -> Node:
+        if key not in self._known:
+            self._known[key] = Node(self, op, args, value, uniform)
+        return self._known[key]
+
+
+def needed(results: Iterable[Node]) -> list[Node]:
+    """Return the nodes that results rest on, operands first."""
+    found, todo = set[Node](), list(results)
+    while todo:
+        node = todo.pop()
+        if node not in found:
+            found.add(node)
+            todo += node.args
+    return sorted(found, key=lambda node: node.number)
+
+
+# ---- what is simpler -----------------------------------------------------------------------------
+#
+# 0 x is 0 for every x that is a number. For one that is none it hides the loss from one entry of a
+# sum, and the frames are looked at in all entries.
+
+
+def _is(node: Node, value: float) -> bool:
+    return node.op == "constant" and not node.truth and node.value == value
+
+
+def _sum(a: Node, b: Node) -> Node | None:
+    if _is(a, 0.0) or _is(b, 0.0):
+        return b if _is(a, 0.0) else a
+    if b.op == "neg":
+        return a - b.args[0]
+    return b - a.args[0] if a.op == "neg" else None
+
+
+def _difference(a: Node, b: Node) -> Node | None:
+    if _is(b, 0.0):
+        return a
+    if _is(a, 0.0):
+        return -b
+    return a + b.args[0] if b.op == "neg" else None
+
+
+def _product(a: Node, b: Node) -> Node | None:
+    for one, other in ((a, b), (b, a)):
+        if _is(one, 0.0):
+            return one
+        if _is(one, 1.0):
+            return other
+        if _is(one, -1.0):
+            return -other
+    if a.op == "neg" and b.op == "neg":
+        return a.args[0] * b.args[0]
+    return None
+
+
+def _quotient(a: Node, b: Node) -> Node | None:
+    if _is(a, 0.0) or _is(b, 1.0):
+        return a
+    # A power of two has an exact inverse; of other constants the product may differ by an ulp.
+    if b.op == "constant" and b.value and math.isfinite(1.0 / b.value):
+        return a * (1.0 / b.value)
+    return None
+
+
+def _negation(a: Node) -> Node | None:
+    if a.op == "neg":
+        return a.args[0]
+    return a.args[1] - a.args[0] if a.op == "sub" else None
+
+
+def _choice(which: Node, a: Node, b: Node) -> Node | None:
+    if which.op == "constant":
+        return a if which.value else b
+    if a is b:
+        return a
+    if which.op == "not":
+        return which.graph.make("select", which.args[0], b, a)
+    return None
+
+
+def _both(a: Node, b: Node) -> Node | None:
+    for one, other in ((a, b), (b, a)):
+        if one.op == "constant":
+            return other if one.value else one
+    return a if a is b else None
+
+
+def _either(a: Node, b: Node) -> Node | None:
+    for one, other in ((a, b), (b, a)):
+        if one.op == "constant":
+            return one if one.value else other
+    return a if a is b else None
+
+
+_SIMPLER: dict[str, Callable[..., Node | None]] = {
+    "add": _sum,
+    "sub": _difference,
+    "mul": _product,
+    "div": _quotient,
+    "neg": _negation,
+    "abs": lambda a: a if a.op == "abs" else None,
+    "not": lambda a: a.args[0] if a.op == "not" else None,
+    "select": _choice,
+    "and": _both,
+    "or": _either,
+}
