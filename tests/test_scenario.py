@@ -339,7 +339,7 @@ def test_the_error_carries_its_faults(load):
 def test_overrides_meet_the_same_rules_and_come_last(refused):
     assert refused("simulation.dt=0", "graph.edges.1=[1, 1]", "graph.agents=4", name="name: 3") == [
         f"s.yaml:1: name: got `3`, allowed is {FOLDER_NAME}.",
-        "--set graph.edges.1=[1, 1]: graph.edges.1: got `[1, 1]`, allowed is an edge between two"
+        "--set graph.edges.1=[1, 1]: got `[1, 1]`, allowed is an edge between two"
         " different agents.",
         "--set simulation.dt=0: got `0`, allowed is a number above 0.",
     ]
