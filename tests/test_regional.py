@@ -431,3 +431,11 @@ def test_a_missing_solver_is_exit_code_four(echelon, monkeypatch):
         )
     code, _, err = echelon("run", "mine.yaml")
     assert code == 4 and "pip install" in err and "certify" in err
+
+
+@pytest.mark.parametrize("domain", [{}, {"angle": 0.5}])
+def test_a_contraction_that_needs_no_feedback_has_the_coupling_one(domain):
+    model = ech.models.Pendulum() if domain else ech.models.Linear([[-1.0]], [[1.0]])
+    gain = ech.synthesize(model, ech.Graph.path(4), ech.gains.Contraction(domain, rate=0.05))
+    assert (gain.coupling, gain.certificate.edge) == (1.0, 0.0)
+    assert gain.certificate.region.rate >= 0.05

@@ -4,6 +4,9 @@ import pytest
 from runs import simulate
 
 import echelon as ech
+from echelon.core.words import Kind, Verdict
+from echelon.promises.statement import Cause, Hypothesis, Statement
+from echelon.reports.causes import causes
 
 
 def run(scenario, *changes):
@@ -110,3 +113,35 @@ def test_a_swarm_shows_best_median_and_worst():
 def test_the_unicycles_relay_is_told_to_the_reader():
     text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
     assert "Each follower is told: neighbours' states, the leader's input of the same step." in text
+
+
+# ---- every cause ends in what to do ----
+
+
+def told(*changes, scenario="paper"):
+    """The causes of a short run, each as text and remedy."""
+    quick = ["simulation.horizon=2", "report.steady_window=0.5"]
+    result = run(scenario, *quick, *changes)
+    found = ech.promise(result.parts, result.settings)
+    return {each.text: each.remedy for each in causes(result, ech.metrics(result), found)}
+
+
+def test_a_horizon_shorter_than_the_slowest_mode_is_told():
+    found = told("graph={name: path, agents: 12}", "formation={name: line}", scenario="integrators")
+    [(text, remedy)] = found.items()
+    assert "the slowest mode takes" in text and "the horizon is 2 s" in text
+    assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
+
+
+@pytest.mark.slow
+def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
+    found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
+    [text] = [each for each in found if "the leader stays" in each]
+    assert "no law has integral action" in text and "`leader.gain`" in found[text]
+
+
+def test_no_failing_line_and_no_cause_is_without_a_remedy():
+    with pytest.raises(AssertionError, match="fails without a remedy"):
+        Statement(Hypothesis.STEP, Verdict.FAILS, Kind.PROOF)
+    with pytest.raises(TypeError):
+        Cause("it fails")
