@@ -362,7 +362,8 @@ def test_followers_that_ignore_each_other_are_promised_nothing():
     _, found = checked({"law": "passive"})
     assert not found.promised
     assert found.sentence() == (
-        "Nothing is promised: the followers' law does not act on the disagreement."
+        "Nothing is promised: the followers' law does not act on the disagreement. What would "
+        "help: use `consensus`."
     )
 
 

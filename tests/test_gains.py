@@ -9,6 +9,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import echelon as ech
 from echelon.core import numerics
 from echelon.core.errors import GainError
 from echelon.core.linear import observability_rank, uncontrollable_modes
@@ -329,3 +330,20 @@ def test_a_model_s_own_trim_scale_and_weights_are_used():
     # Chosen by hand they make the same gain.
     same = synthesize(Shifted(), LINE, Riccati(Q=[4.0, 1.0], R=[0.5]))
     assert np.array_equal(gain.P, same.P)
+
+
+def test_a_file_with_two_equal_keys_is_refused_where_it_is_flown_and_where_it_is_verified(tmp_path):
+    model, graph, file = ech.models.DoubleIntegrator(1), ech.Graph.path(3), tmp_path / "gain.json"
+    ech.save_gain(ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, file)
+    text = file.read_text()
+    file.write_text(text.replace('"coupling":', '"coupling": 0.001, "coupling":', 1))
+    for read in (lambda: ech.load_gain(file, model, graph), lambda: ech.verify(file)):
+        with pytest.raises(ech.errors.GainError, match="`coupling` stands there twice"):
+            read()
+
+
+def test_a_coupling_beyond_all_numbers_is_one_sentence_and_no_warning(recwarn):
+    model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(3)
+    with pytest.raises(ech.errors.GainError, match="eigenvalue is beyond all numbers"):
+        ech.synthesize(model, graph, ech.gains.Riccati(coupling=1e308))
+    assert not [each for each in recwarn if issubclass(each.category, RuntimeWarning)]

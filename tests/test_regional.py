@@ -586,3 +586,11 @@ def test_a_region_whose_numbers_are_none_is_refused(tmp_path, name):
     assert f"`{name}` is {{'x': 1}}, and must be a finite number." in sentence(
         lambda: ech.load_gain(file, model, LINE)
     )
+
+
+@pytest.mark.parametrize("domain", [{}, {"angle": 0.5}])
+def test_a_contraction_that_needs_no_feedback_has_the_coupling_one(domain):
+    model = ech.models.Pendulum() if domain else ech.models.Linear([[-1.0]], [[1.0]])
+    gain = ech.synthesize(model, ech.Graph.path(4), ech.gains.Contraction(domain, rate=0.05))
+    assert (gain.coupling, gain.certificate.edge) == (1.0, 0.0)
+    assert gain.certificate.region.rate >= 0.05

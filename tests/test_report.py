@@ -5,6 +5,9 @@ import pytest
 from runs import made_up, simulate
 
 import echelon as ech
+from echelon.core.words import Kind, Verdict
+from echelon.promises.statement import Cause, Hypothesis, Statement
+from echelon.reports.causes import causes
 
 
 def run(scenario, *changes):
@@ -124,3 +127,35 @@ def test_of_many_followers_the_best_the_worst_and_one_in_the_middle_are_shown(fo
     middle = {order[(followers - 1) // 2], order[followers // 2]}
     assert f"best (follower {order[0]})" in text and f"worst (follower {order[-1]})" in text
     assert any(f"median (follower {k})" in text for k in middle)
+
+
+# ---- every cause ends in what to do ----
+
+
+def told(*changes, scenario="paper"):
+    """The causes of a short run, each as text and remedy."""
+    quick = ["simulation.horizon=2", "report.steady_window=0.5"]
+    result = run(scenario, *quick, *changes)
+    found = ech.promise(result.parts, result.settings)
+    return {each.text: each.remedy for each in causes(result, ech.metrics(result), found)}
+
+
+def test_a_horizon_shorter_than_the_slowest_mode_is_told():
+    found = told("graph={name: path, agents: 12}", "formation={name: line}", scenario="integrators")
+    [(text, remedy)] = found.items()
+    assert "the slowest mode takes" in text and "the horizon is 2 s" in text
+    assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
+
+
+@pytest.mark.slow
+def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
+    found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
+    [text] = [each for each in found if "the leader stays" in each]
+    assert "no law has integral action" in text and "`leader.gain`" in found[text]
+
+
+def test_no_failing_line_and_no_cause_is_without_a_remedy():
+    with pytest.raises(AssertionError, match="fails without a remedy"):
+        Statement(Hypothesis.STEP, Verdict.FAILS, Kind.PROOF)
+    with pytest.raises(TypeError):
+        Cause("it fails")

@@ -55,13 +55,15 @@ class _Acted(NamedTuple):
 class Moment(NamedTuple):
     """All that changes during a run.
 
-    The step number, the states (N, n), the memories of leaders and followers.
+    The step number, the states (N, n), the memories of leaders and followers, and to which side the
+    limits moved each input (N, m) in the step before: -1, 0 or 1.
     """
 
     step: jax.Array
     states: States
     leader_memory: Memory
     follower_memory: Memory
+    cut: jax.Array
 
 
 def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
@@ -115,6 +117,7 @@ def begin(loop: Loop, states: States) -> Moment:
         states=jnp.asarray(states),
         leader_memory=remember(loop.leader, loop.leaders),
         follower_memory=remember(loop.follower, loop.followers),
+        cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
     )
 
 
@@ -122,10 +125,10 @@ def begin(loop: Loop, states: States) -> Moment:
 
 
 class Control(NamedTuple):
-    """Delivered inputs (N, m), who was limited (N,), and the next memories."""
+    """Delivered inputs (N, m), to which side limits moved them (N, m), and the next memories."""
 
     inputs: Inputs
-    limited: jax.Array
+    cut: jax.Array
     leader_memory: Memory
     follower_memory: Memory
 
@@ -157,9 +160,9 @@ def control(loop: Loop, now: Moment) -> Control:
         followed = _by_depth(loop, now, led, act)
     u = jnp.concatenate([led.inputs, followed.inputs])[loop.order]
     wanted = jnp.concatenate([led.wanted, followed.wanted])[loop.order]
-    # To the bit, as `limit` returns what fits; NaN differs from itself, and is a divergence.
-    limited = jnp.any((u != wanted) & ~jnp.isnan(wanted), axis=1)
-    return Control(u, limited, led.memory, followed.memory)
+    # To the bit, as `limit` returns what fits. NaN is neither above nor below: a divergence.
+    cut = (u > wanted).astype(jnp.int8) - (u < wanted).astype(jnp.int8)
+    return Control(u, cut, led.memory, followed.memory)
 
 
 def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) -> _Acted:
@@ -196,7 +199,7 @@ def _broadcast(loop: Loop, x: States, u: Inputs) -> jax.Array:
 def step(loop: Loop, now: Moment, acted: Control) -> Moment:
     """Advance all agents by one dt, under what they do."""
     states = loop.motion.advance(now.states, acted.inputs, now.step)
-    return Moment(now.step + 1, states, acted.leader_memory, acted.follower_memory)
+    return Moment(now.step + 1, states, acted.leader_memory, acted.follower_memory, acted.cut)
 
 
 # ---- many steps ----------------------------------------------------------------------------------
@@ -217,7 +220,10 @@ def advance(
         now, sums = done
         acted = control(loop, now)
         wanted = reference_at(reference, now.step - first, now.states)
-        read = loop.meter.read(now.step, now.states, acted.inputs, acted.limited, wanted)
+        limited = (acted.cut != 0).any(axis=1)
+        chatter = (acted.cut * now.cut < 0).any(axis=1)
+        moment = now.step, now.states, acted.inputs
+        read = loop.meter.read(*moment, limited, chatter, wanted)
         return step(loop, now, acted), sums.plus(read)
 
     def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:

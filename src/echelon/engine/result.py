@@ -84,6 +84,11 @@ class Result:
         return self.sums.limited / max(1.0, float(self.sums.steps[0]))
 
     @property
+    def chatter(self) -> Array:
+        """How many times (N,) an input went from beyond one limit to beyond the other in a step."""
+        return self.sums.chatter
+
+    @property
     def errors(self) -> Array:
         """Deviation of each agent from its goal relative to its leader, (T, N, n).
 

@@ -20,6 +20,9 @@ from echelon.network.graph import Graph
 Total: TypeAlias = Any
 """JAX within a chunk, float64 NumPy on the host: chunks of a float32 run are added without loss."""
 
+ALWAYS = 2**31 - 1
+"""The first step at which a state left its chart, where it never did."""
+
 SETTLED = 0.01
 """A follower has settled when its error stays below this: 1 cm for a position."""
 
@@ -39,6 +42,10 @@ class Sums(NamedTuple):
         spacing: (E,) squared error of the distance between neighbours.
         limited: (N,) how many times a limit changed the input.
         unsettled: (N,) the last step at which the error was not below `SETTLED`; -1 without any.
+        inside: (N, k) the first step at which each of the k states that the model's chart bounds
+            was not inside; `ALWAYS` without any.
+        chatter: (N,) how many times an input went from beyond one limit to beyond the other from a
+            step to the next.
     """
 
     steps: Total
@@ -49,13 +56,17 @@ class Sums(NamedTuple):
     spacing: Total
     limited: Total
     unsettled: Total
+    inside: Total
+    chatter: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
         total = Sums(*(a + b for a, b in zip(self, more, strict=True)))
-        # The later maximum; written so that NumPy on the host and JAX within a chunk both have it.
+        # The maximum, and below the minimum; written so that NumPy on the host and JAX within a
+        # chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
-        return total._replace(unsettled=last)
+        first = self.inside - (self.inside - more.inside).clip(0)
+        return total._replace(unsettled=last, inside=first)
 
 
 def on_host(tree: Any) -> Any:
@@ -74,6 +85,8 @@ class Meter(eqx.Module):
     edges: Array
     spacings: Array
     first_steady: Array
+    charted: Array
+    chart: Array
     # Static, since they decide shapes.
     measured: tuple[int, ...] = eqx.field(static=True)
 
@@ -94,6 +107,8 @@ class Meter(eqx.Module):
             spacings=np.linalg.norm(goals[i] - goals[j], axis=1),
             # An array and not a constant: another window compiles nothing again.
             first_steady=np.asarray(settings.first_steady, np.int32),
+            charted=np.array([model.state_names.index(name) for name in model.chart], int),
+            chart=np.array([*model.chart.values()], float).reshape(-1, 2),
             measured=measured,
         )
 
@@ -111,6 +126,8 @@ class Meter(eqx.Module):
             spacing=jnp.zeros(len(self.edges), dtype),
             limited=jnp.zeros(agents, jnp.int32),
             unsettled=jnp.full(agents, -1, jnp.int32),
+            inside=jnp.full((agents, len(self.charted)), ALWAYS, jnp.int32),
+            chatter=jnp.zeros(agents, jnp.int32),
         )
 
     def read(
@@ -119,6 +136,7 @@ class Meter(eqx.Module):
         states: States,
         inputs: Inputs,
         limited: jax.Array,
+        chatter: jax.Array,
         reference: jax.Array | None,
     ) -> Sums:
         """Return the sums of one step.
@@ -128,6 +146,7 @@ class Meter(eqx.Module):
             states: (N, n) at its beginning.
             inputs: (N, m) delivered over it.
             limited: (N,) whose inputs a limit changed.
+            chatter: (N,) whose inputs went beyond the one limit after the other.
             reference: (n,) what the leaders follow at its beginning, or None.
         """
         # A row for all steps, a row for those of the steady window.
@@ -149,7 +168,16 @@ class Meter(eqx.Module):
             spacing=self._spacing(states),
             limited=limited.astype(jnp.int32),
             unsettled=last.astype(jnp.int32),
+            inside=self._inside(step, states),
+            chatter=chatter.astype(jnp.int32),
         )
+
+    def _inside(self, step: jax.Array, states: States) -> jax.Array:
+        """Return this step for each state (N, k) that is not inside of its chart, else `ALWAYS`."""
+        bounded, (low, high) = states[:, self.charted], self.chart.T.astype(states.dtype)
+        # What is not finite is another outcome.
+        out = (bounded <= low[None]) | (bounded >= high[None])
+        return jnp.where(out, step, ALWAYS).astype(jnp.int32)
 
     def _lengths(self, deviations: jax.Array) -> jax.Array:
         """Return squared lengths (K,) of the measured part of deviations (K, n)."""

@@ -174,7 +174,7 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
 
 def _read(path: PathLike) -> Mapping[str, Any]:
     try:
-        stored = json.loads(Path(path).read_text("utf-8"))
+        stored = json.loads(Path(path).read_text("utf-8"), object_pairs_hook=_mapping)
     except OSError as error:
         raise GainError(f"the gain file `{path}` cannot be read: {error.strerror}.") from error
     except ValueError as error:
@@ -188,6 +188,15 @@ def _read(path: PathLike) -> Mapping[str, Any]:
             f"and {advice}."
         )
     return stored
+
+
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping; of two equal keys one reader takes the first and another the last."""
+    told = dict(pairs)
+    if len(told) < len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"`{next(k for k in names if names.count(k) > 1)}` stands there twice")
+    return told
 
 
 def _gain(stored: Mapping[str, Any]) -> Gain:

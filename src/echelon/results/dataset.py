@@ -134,6 +134,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         "lambda_max": spectrum.high,
         "minimum_distance": numbers.minimum_distance,
         "saturation_fraction": numbers.saturation_fraction,
+        "alternations": int(result.chatter.max()),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),
         "wall_time_s": result.wall_time,

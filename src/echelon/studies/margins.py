@@ -25,9 +25,11 @@ _STIFF = 1e10
 def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
-    if promise.hypotheses[Hypothesis.DECAYS].fails:
-        text = "there is nothing to lose"
-        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+    if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
+        verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
+        if not promise.linear:
+            verdict, text = Verdict.VACUOUS, "the model bends at the trim, and has no modes there"
+        yield Statement(Line.MARGINS, verdict, _KIND, text=text)
         return
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
