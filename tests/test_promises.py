@@ -78,7 +78,7 @@ def agree(name, method, feedforward, folder):
         except ech.EchelonError as also:
             assert str(also) == str(refused)
         else:  # where the method alone is at fault, it is a row with the same reason
-            assert row.gain is None and str(refused).endswith(f"follower.gain: {row.reason}")
+            assert row.gain is None and str(refused).endswith(f": {row.reason}")
         return
     promise, gain = ech.promise(*built), built.parts.drive.gain
     told = tellers(scenario, built, method, folder)

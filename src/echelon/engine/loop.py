@@ -125,9 +125,10 @@ def begin(loop: Loop, states: States) -> Moment:
 
 
 class Control(NamedTuple):
-    """Delivered inputs (N, m), to which side limits moved them (N, m), and the next memories."""
+    """Delivered inputs (N, m), who was limited (N,), to which side (N, m), and next memories."""
 
     inputs: Inputs
+    limited: jax.Array
     cut: jax.Array
     leader_memory: Memory
     follower_memory: Memory
@@ -160,9 +161,18 @@ def control(loop: Loop, now: Moment) -> Control:
         followed = _by_depth(loop, now, led, act)
     u = jnp.concatenate([led.inputs, followed.inputs])[loop.order]
     wanted = jnp.concatenate([led.wanted, followed.wanted])[loop.order]
-    # To the bit, as `limit` returns what fits. NaN is neither above nor below: a divergence.
-    cut = (u > wanted).astype(jnp.int8) - (u < wanted).astype(jnp.int8)
-    return Control(u, cut, led.memory, followed.memory)
+    limited, cut = what_limits_did(u, wanted)
+    return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory)
+
+
+def what_limits_did(u: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return which wanted inputs (..., m) limits changed, and to which side, -1, 0 or 1."""
+    # To the bit, as `limit` returns what fits. NaN differs from itself, and is a divergence.
+    limited = (u != wanted) & ~jnp.isnan(wanted)
+    # Where one input is cut, mixing there and back rounds all others, which says nothing of a side.
+    clear = jnp.abs(u - wanted) > 1e-6 * (jnp.abs(u) + jnp.abs(wanted))
+    side = jnp.where(u > wanted, 1.0, -1.0)
+    return limited, jnp.where(limited & clear, side, 0.0)
 
 
 def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) -> _Acted:
@@ -220,10 +230,9 @@ def advance(
         now, sums = done
         acted = control(loop, now)
         wanted = reference_at(reference, now.step - first, now.states)
-        limited = (acted.cut != 0).any(axis=1)
         chatter = (acted.cut * now.cut < 0).any(axis=1)
         moment = now.step, now.states, acted.inputs
-        read = loop.meter.read(*moment, limited, chatter, wanted)
+        read = loop.meter.read(*moment, acted.limited, chatter, wanted)
         return step(loop, now, acted), sums.plus(read)
 
     def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:

@@ -36,6 +36,7 @@ class Result:
         settings: how it was computed.
         wall_time: seconds of computing, compilation included.
         work: what solving took; None where laws gave the inputs.
+        engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
     """
 
@@ -51,6 +52,7 @@ class Result:
     settings: Settings
     wall_time: float
     work: SolverStats | None = None
+    engine: str = "jax"
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property

@@ -113,16 +113,10 @@ def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: 
     with only_if(w, around.slots["shown"]):
         for row, node in body.shown.items():
             store_row(w, base, row, lanes, emitter.value(node))
-    for row, node in body.sums.items():
-        old = load_row(w, base, row, lanes)
-        total = w.put(f"fadd {w.vector} {old}, {emitter.value(node)}")
-        store_row(w, base, row, lanes, total)
-    for row, node in body.latest.items():
-        step = w.splat(_same_for_all(w, around, "step", []))
-        old, truths = load_row(w, base, row, lanes), w.kind(True, False)
-        which = emitter.value(node)
-        new = w.put(f"select {truths} {which}, {w.vector} {step}, {w.vector} {old}")
-        store_row(w, base, row, lanes, new)
+    for kept, op in ((body.sums, "add"), (body.greatest, "max"), (body.least, "min")):
+        for row, node in kept.items():
+            both = [load_row(w, base, row, lanes), emitter.value(node)]
+            store_row(w, base, row, lanes, w.operation(op, both, False, False))
 
 
 def _same_for_all(w: Writer, around: Context, kind: str, rest: Sequence[int]) -> str:

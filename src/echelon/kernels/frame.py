@@ -17,7 +17,8 @@ class Body(NamedTuple):
     Attributes:
         stores: row -> what it becomes.
         sums: row -> what is added to it.
-        latest: row -> a value; it becomes the step where the value is true.
+        greatest: row -> a value; the row keeps the largest that it ever was.
+        least: row -> a value; the row keeps the smallest.
         shown: row -> what it becomes where `shown` is asked for, since every store costs time.
         now: what neighbours read at the step, entry by entry.
         mirror: what they read after it.
@@ -27,7 +28,8 @@ class Body(NamedTuple):
 
     stores: dict[int, Node]
     sums: dict[int, Node]
-    latest: dict[int, Node]
+    greatest: dict[int, Node]
+    least: dict[int, Node]
     shown: dict[int, Node]
     now: Sequence[Node]
     mirror: Sequence[Node]
@@ -35,7 +37,7 @@ class Body(NamedTuple):
 
     def results(self) -> list[Node]:
         """Return all that is written."""
-        rows = (self.stores, self.sums, self.latest, self.shown)
+        rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
         return [*(node for row in rows for node in row.values()), *self.mirror]
 
 

@@ -137,6 +137,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         "alternations": int(result.chatter.max()),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),
+        "engine": result.engine,
         "wall_time_s": result.wall_time,
         "versions": {
             key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")

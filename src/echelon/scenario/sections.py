@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward
+from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -275,6 +275,9 @@ class SimulationSpec(BaseModel, **STRICT):
     """Steps from one stored sample to the next."""
     precision: Annotated[str, OneOf(("float64", "float32"))] = "float64"
     """Arithmetic used."""
+    engine: Annotated[str, OneOf(ENGINES)] = "auto"
+    """What steps the agents: `jax`, or `native` code for this machine's vectors, which differs by
+    rounding; `auto` takes that for long runs where it can."""
 
 
 @final
