@@ -362,7 +362,7 @@ def violations(
     flight.clipped = False
     with np.errstate(all="ignore"):
         rough, fine = (errors(specimen, flight.fly(begin, horizon, cut)) for cut in (1, 2))
-        if not np.isfinite(fine).all():
+        if not np.isfinite([rough, fine]).all():
             # Far from the goals a drift may be stiffer than at them.
             rough, fine = (errors(specimen, flight.fly(begin, horizon, cut)) for cut in (32, 64))
     if flight.clipped:
