@@ -64,6 +64,13 @@ def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go():
     assert gain.method == "robust-lqr" and gain.domain == {"position": 0.5}
 
 
+def test_a_law_without_a_gain_is_advised_one_that_takes_it():
+    rows = {row.method: row for row in ech.design(ech.load_scenario("integrators")).designs}
+    advice = rows["robust-lqr"].reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
+    follower = ech.load_scenario("integrators", [advice]).follower
+    assert follower.law == "consensus" and follower.gain.method == "robust-lqr"
+
+
 def test_a_scenario_whose_own_gain_cannot_be_made_has_the_other_methods_tried():
     # The Jacobian depends on the velocity too, which the domain does not bound.
     own = "follower.gain={method: robust-lqr, domain: {position: 0.5}}"

@@ -235,7 +235,11 @@ def _wish(method: str, missing: list[str], parts: Parts) -> str:
     state = [*model.state_groups, *model.state_names][0]
     shown = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
     keys = ", ".join(shown.get(key, f"{key}: ...") for key in missing)
-    return f"give `follower.gain={{method: {method}, {keys}}}` to try it"
+    gain = f"{{method: {method}, {keys}}}"
+    if parts.drive.gain is None:
+        # The scenario's own law takes none, so that a gain beside it would be refused.
+        return f"give `follower={{law: consensus, gain: {gain}}}` to try it"
+    return f"give `follower.gain={gain}` to try it"
 
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
