@@ -38,9 +38,12 @@ def _story(result: Result, numbers: Metrics, found: Promise) -> Iterator[str]:
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
     error = formation_errors(result)[:, list(result.graph.followers)]
+    # A square beyond all floats is infinite, which grows as well.
     with np.errstate(over="ignore"):
         first, last = (float(np.sqrt((row**2).mean())) for row in (error[0], error[-1]))
     unit = "" if result.unit == "state" else f" {result.unit}"
+    # Twice, since a last frame may catch an overshoot; and a start on the goals has rounding alone
+    # to grow from.
     if last > 2.0 * first + 1e-9:
         yield (
             f"The formation error grows: {first:.3g}{unit} at the start, "
@@ -90,6 +93,7 @@ def _lag(result: Result, numbers: Metrics, found: Promise, unit: str) -> Iterato
     worst, matched = numbers.worst_steady, found.hypotheses[Hypothesis.MATCHED]
     if worst is None or worst <= _LAG or not matched.fails or result.reference is None:
         return
+    # Behind a leader at rest nobody lags; what is left then has another cause.
     if np.ptp(result.reference, axis=0).max() > 0.0:
         yield (
             "Without feed-forward the followers do not know the leader's motion and lag: "
@@ -129,6 +133,7 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
     rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
+    # V' <= 0 is proved of the undisturbed loop that decays, and forbids nothing to others.
     excused = result.world.disturbance or found.hypotheses[Hypothesis.DECAYS].fails
     if forbidden and not excused:
         when = result.times[int(np.argmax(v.forbidden()))]
@@ -149,6 +154,7 @@ def _excuse(v: Lyapunov, found: Promise) -> str:
     coupled = found.hypotheses[Hypothesis.COUPLED]
     if coupled.fails:
         return coupled.text
+    # Drifts cancel within V', so that rounding leaves some 1e-16 of its largest value.
     broken = float(np.mean(v.drift > 1e-9 * np.abs(v.rate).max()))
     if broken:
         return f"Assumption 5 fails on {100.0 * broken:.0f} % of the frames"

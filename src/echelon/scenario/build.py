@@ -85,6 +85,7 @@ def build(scenario: Scenario) -> Built:
     """
     _check_scenario(scenario)
     faults = _Faults(scenario)
+    # Gains are computed here, and would keep 7 digits under another precision.
     with precision("float64"):
         model = graph = None
         with faults.at("simulation"):
@@ -97,6 +98,7 @@ def build(scenario: Scenario) -> Built:
         reference = None
         with faults.at("reference"):
             reference = _reference(scenario, model)
+        # Before the laws: without a model and a graph each would be blamed for theirs.
         faults.settle()
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
@@ -150,6 +152,7 @@ def _with_laws(
 
 def _initial(scenario: Scenario) -> Any:
     """Return spreads by state or group, and states by agent, in one mapping."""
+    # States have names and agents numbers, so that no key meets another.
     return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
 
 
@@ -235,6 +238,7 @@ def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> D
         return None
     for key in ("constant", "rms", "input_rms"):
         with faults.at("disturbance", key):
+            # Each alone, so that its fault is told at its own line.
             Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
     return Disturbance(**spec.model_dump())
 

@@ -81,10 +81,12 @@ def number_of(value: object) -> float | None:
     try:
         return float(value)
     except OverflowError:
+        # A whole number of 400 digits has no float.
         return math.inf
 
 
 def _whole(value: object) -> int | None:
+    # To `isinstance` a truth value is an int.
     return value if type(value) is int else None
 
 

@@ -14,6 +14,7 @@ def settle_overrides(document: Document) -> Document:
 
     A path that the command line sets is relative to the working folder, and becomes absolute.
     """
+    # The document that was read stays what the file says.
     data = copy.deepcopy(document.data)
     set_ = [path for path, _ in document.overrides]
     for path in set_:

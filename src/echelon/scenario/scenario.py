@@ -221,6 +221,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     """
     file, name = _found(source)
     try:
+        # Some editors begin a file with a byte order mark, which is no part of its first key.
         text = file.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name}: this file cannot be read as UTF-8 text: {error}.") from error
