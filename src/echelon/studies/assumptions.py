@@ -131,8 +131,9 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
 
 def _printed_lmi(parts: Parts, promise: Promise) -> float:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
-    # It fails at any size for one reason: with v and s X v, s small, [[0, X], [X, Z]] gives 2 s |X
-    # v|^2 + O(s^2) > 0. Four followers show it, and eigenvalues cost the cube of their number.
+    # It fails at any size for one reason: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
+    # 2 s |X v|^2 + O(s^2) > 0. Four followers show it, and eigenvalues cost the cube of their
+    # number.
     few = list(parts.graph.followers[:4])
     goals = np.asarray(parts.model.trim[0]) + parts.formation.offsets[few]
     drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[few]

@@ -225,8 +225,8 @@ def _telling(model: ControlAffine) -> tuple[int, int]:
     groups = model.state_groups
     if "velocity" in groups and "attitude" in groups:
         moved, turned = model.states_called("velocity"), model.states_called("attitude")
-        # A tilt turns the thrust aside: the angle with the largest entry of A is the one that drives
-        # a velocity.
+        # A tilt turns the thrust aside: the angle with the largest entry of A is the one that
+        # drives a velocity.
         push = np.abs(linearize(model).A[np.ix_(moved, turned)])
         row, column = np.unravel_index(int(push.argmax()), push.shape)
         return moved[row], turned[column]
