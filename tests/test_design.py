@@ -40,9 +40,8 @@ simulation: {horizon: 1.0, dt: 0.01}
 
 
 @pytest.fixture
-def echelon(echelon, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text(SCENARIO)
+def echelon(echelon, here):
+    (here / "mine.yaml").write_text(SCENARIO)
     return echelon
 
 

@@ -37,10 +37,9 @@ simulation: {horizon: 0.1, dt: 0.1}
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text(SCENARIO)
-    return tmp_path
+def here(here):
+    (here / "mine.yaml").write_text(SCENARIO)
+    return here
 
 
 def test_each_outcome_has_its_code():

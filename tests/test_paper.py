@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import laplacian, skew
+from oracles import laplacian, skew, spd
 from runs import simulate
 
 from echelon.core import numerics
@@ -31,11 +31,6 @@ TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 LINE = Graph.path(4)
 QUAD = Quadrotor()
 OFFSETS = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
-
-
-def spd(rng, size):
-    root = rng.normal(size=(size, size))
-    return root @ root.T + 0.05 * np.eye(size)
 
 
 def symmetric(matrix):
