@@ -291,11 +291,10 @@ def test_where_the_offset_is_no_symmetry_some_state_breaks_lemma_4(seed):
     rng = np.random.default_rng(seed)
     A = -spd(rng, 2)
     P, d, y = np.eye(2), rng.normal(size=2), rng.normal(size=2)
-    if np.abs(A @ d).max() > 1e-6:
-        # Step from y by a little against A d: the linear term wins over the quadratic one.
-        step = 0.1 * (A @ d) / np.linalg.norm(A, 2)
-        s = 0.5 * (d @ A @ step) / abs(step @ A @ step)
-        assert rise_of_a_pair(lambda v: A @ v, P, d, y + s * step, y) > 0.0
+    # Step from y by a little against A d, which is not 0: the linear term wins over the quadratic.
+    step = 0.1 * (A @ d) / np.linalg.norm(A, 2)
+    s = 0.5 * (d @ A @ step) / abs(step @ A @ step)
+    assert rise_of_a_pair(lambda v: A @ v, P, d, y + s * step, y) > 0.0
 
 
 def test_theorem_2_fails_a_follower_settles_at_half_its_offset():
