@@ -33,6 +33,8 @@ HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
   docs    build the documentation into site/, with warnings as errors: zensical
   fuzz    feed the command line nonsense for [SECONDS], and tell what it does not bear
   mutate  change the code in small ways and see which of them no test notices
+  results make the published numbers of docs/ again: results (3 minutes on two free cores),
+          comparison (10) and certificates (30), or [PAGE ...] of them
   wheel   build the wheel into build/, install it alone and without extras, and try it"""
 NO_PIP = (
     "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
@@ -111,6 +113,21 @@ def wheel(rest: list[str]) -> list[list[str]]:
     ]
 
 
+PAGES = {"results": [], "comparison": [], "certificates": ["--all"]}
+"""The benchmarks that write pages of docs/, in the order of their parts."""
+
+
+def results(rest: list[str]) -> list[list[str]]:
+    """Return the commands that make the published numbers again."""
+    unknown = [name for name in rest if name not in PAGES]
+    if unknown:
+        raise SetupError(f"`{unknown[0]}` is no page of numbers; there are {', '.join(PAGES)}.")
+    # The times that are published are those of one thread.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    python = str(program("python"))
+    return [[python, f"benchmarks/{name}.py", *PAGES[name]] for name in rest or PAGES]
+
+
 VERBS = {
     "setup": lambda rest: [],
     "demo": lambda rest: [[str(program("echelon")), "run", "paper", *rest]],
@@ -124,6 +141,7 @@ VERBS = {
     "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
     "fuzz": lambda rest: [[str(program("python")), "benchmarks/fuzz.py", *rest]],
     "mutate": lambda rest: [[str(program("python")), "benchmarks/mutate.py", *rest]],
+    "results": results,
     "wheel": wheel,
 }
 

@@ -1,37 +1,47 @@
 """Feed the command line nonsense: no crash, no hang, no silence; `python3 dev.py fuzz [SECONDS]`.
 
-Scenario files, `--set`, gain files, folders of runs and whole command lines are drawn by a seeded
-grammar: sound ones with a few things spoiled. Each is a process of its own, so that a hang, a crash
-or a hunger for memory ends it alone. What must hold of each: it ends within its time, with an exit
-code that the help lists, without a traceback or a library's warning, and if it refuses, then in
-whole sentences.
+Scenario files, `--set`, gain files, folders of runs, whole command lines and experiments far too
+large are drawn by a seeded grammar: sound ones with a few things spoiled. What must hold of each:
+it ends within its time, with an exit code that the help lists, without a traceback or a library's
+warning, and if it refuses, then in whole sentences.
+
+A process forks after the libraries are imported and before JAX begins, and runs a few hundred
+cases one after another, so that what is refused costs milliseconds and what is compiled is compiled
+once. A hang, a crash or a hunger for memory ends it, and the next one goes on behind that case.
+What looks faulty is repeated in a process of its own, as all cases are with `--alone`.
 """
 
 import argparse
 import contextlib
 import copy
+import gc
 import json
+import math
+import multiprocessing
 import os
 import random
 import resource
-import select
-import shutil
 import signal
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-ALLOWED = {0, 1, 2, 3, 4}
-"""Exit codes: done, not promised, bad input, diverged, an optional part is missing."""
+ALLOWED = {0, 1, 2, 3, 4, 5}
+"""Exit codes: done, not promised, bad input, diverged, an optional part is missing, incomplete."""
 CPU = 20
 """Seconds of computing after which a case hangs; compiling takes some 5 of them."""
+REFUSING = 10
+"""Seconds of computing after which what is refused should have been refused."""
 MEMORY = 4 << 30
 """Bytes of resident memory that no case of these needs."""
+BATCH = 300
+"""Cases that one process runs; what JAX keeps of each adds up."""
 
 BASES: list[dict[str, Any]] = [
     {
@@ -104,7 +114,14 @@ ODD: list[Any] = [
     {"x": 1},
     {1: [0, 0]},
 ]
-FACTORS = [-1, 0, 2, 3, 0.5, 1e-9, 1e9, 1e200]
+FACTORS = [-1, 0, 2, 3, 0.5, 0.9, 1.1, 1e-9, 1e9, 1e200]
+SIZES: list[Any] = [10**7, 10**9, 10**12, 10**18, 10**23, 1e7, 1e9, 1e12, 1e18, 1e23]
+SIZES += [2**31 - 1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64]
+"""All are too large for what is counted or kept, and those of time may be anything."""
+SIZED = ["graph.agents", "graph.rows", "graph.columns", "graph.leaders.0", "graph.edges.0.1"]
+SIZED += ["model.parameters.dimension", "formation.columns", "simulation.horizon", "simulation.dt"]
+SIZED += ["simulation.store_every", "disturbance.hold", "report.steady_window", "seed"]
+SIZED += ["formation.spacing", "reference.rate", "follower.gain.coupling", "graph.edges.1.2"]
 NUMBERS = [0, 1, 2, 3, 0.1, 1e-8, 1e-300, 1e16, 1e155, 1.7e308]
 MARKS = [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
 WORDS = ["dt", "horizon", "gain", "name", "python", "file", "set", "0", "x", "position", "é", "*"]
@@ -173,9 +190,7 @@ def torn(rng: random.Random, text: bytes) -> bytes:
         if how == 0:
             del found[at : at + rng.randint(1, 20)]
         elif how == 1:
-            found[at:at] = rng.choice(
-                [b"{", b"]", b": ", b"\n", b"&a ", b"*a", b"\xff", b"- ", b"!!x "]
-            )
+            found[at:at] = rng.choice(MARKS)
         elif how == 2:
             found[at:at] = found[at : at + 30]
         else:
@@ -230,9 +245,12 @@ def large(value: Any) -> bool:
 def setting(rng: random.Random, data: Any) -> str:
     """Return a `--set` of something that is there, or is not."""
     path = [*rng.choice(places(data))]
+    value = rng.choice(ODD if rng.random() < 0.5 else NUMBERS)
     if rng.random() < 0.3:
         path[rng.randrange(len(path))] = rng.choice(WORDS)
-    value = rng.choice(ODD if rng.random() < 0.5 else NUMBERS)
+    elif rng.random() < 0.5:
+        path, value = rng.choice(figures(data))
+        value *= rng.choice(FACTORS)
     # Long runs and large graphs are no fault.
     if path[-1] in ("horizon", "agents", "rows", "columns") and large(value):
         value = -1
@@ -240,8 +258,39 @@ def setting(rng: random.Random, data: Any) -> str:
         value = max(value, 1e-3) if value > 0 else value
     from echelon.scenario.yaml import inline_yaml
 
-    text = rng.choice([inline_yaml(value), "{", "[1, 2", "*a", "", "3 # three"])
+    broken = ["{", "[1, 2", "*a", "", "3 # three"]
+    text = rng.choice(broken) if rng.random() < 0.2 else inline_yaml(value)
     return f"{'.'.join(map(str, path))}{rng.choice(['=', '=', '=', '=', ''])}{text}"
+
+
+def figures(data: Any) -> list[tuple[list[Any], float]]:
+    """Return the paths of all numbers in plain data, and the numbers."""
+    found = []
+    for path in places(data):
+        part = data
+        for step in path:
+            part = part[step]
+        if isinstance(part, int | float) and not isinstance(part, bool):
+            found.append(([*path], part))
+    return found
+
+
+def put(data: Any, path: str, value: Any) -> bool:
+    """Put a value where a path leads in plain data, and tell whether it leads anywhere."""
+    *above, key = [int(each) if each.isdigit() else each for each in path.split(".")]
+    for step in above:
+        if isinstance(step, str) and isinstance(data, dict) and step in data:
+            data = data[step]
+        elif isinstance(step, int) and isinstance(data, list) and step < len(data):
+            data = data[step]
+        else:
+            return False
+    # A setting that is left out may be given.
+    fits = isinstance(data, dict) if isinstance(key, str) else isinstance(data, list)
+    if fits and (isinstance(key, str) or key < len(data)):
+        data[key] = value
+        return True
+    return False
 
 
 def options(rng: random.Random, verb: str) -> list[str]:
@@ -319,12 +368,25 @@ def typed(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
     return Case([word for word in (verb, *words, *options(rng, verb))], files)
 
 
+def sized(rng: random.Random, gain: bytes, run: dict[str, bytes]) -> Case:
+    """Draw an experiment of which one or two numbers are far too large."""
+    data = copy.deepcopy(rng.choice(BASES))
+    done = [each for each in rng.sample(SIZED, 4) if put(data, each, rng.choice(SIZES))]
+    verb = rng.choice(["check", "check", "design", "run"])
+    # What stores little may be run for as long as one likes.
+    if "simulation.store_every" in done and verb == "run":
+        verb = "check"
+    more = {"design": ["--method", "riccati"], "run": ["--no-figures", "--out", "out"]}
+    return Case([verb, "s.yaml", *more.get(verb, [])], {"s.yaml": as_yaml(data)})
+
+
 KINDS: dict[str, Callable[..., Case]] = {
     "scenario files": flown,
     "--set": overridden,
     "gain files": gained,
     "folders of runs": reopened,
     "command lines": typed,
+    "sizes": sized,
 }
 
 
@@ -346,56 +408,84 @@ def call(arguments: list[str]) -> int:
     return 0
 
 
-def attempt(case: Case) -> Ending:
-    """Run a case in a process of its own, and judge how it ended."""
-    folder = Path(tempfile.mkdtemp(prefix="echelon-fuzz-"))
-    for name, text in case.files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(text)
-    began = time.monotonic()
-    pipes = [os.pipe(), os.pipe()]
-    child = os.fork()
-    if not child:
+def tried(case: Case) -> Ending:
+    """Run a case in this process, which it may end, and judge how it ended."""
+    with tempfile.TemporaryDirectory(prefix="case-", dir=os.environ["TMPDIR"]) as text:
+        folder = Path(text) / "here"
+        for name, content in case.files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        folder.mkdir(exist_ok=True)
         os.chdir(folder)
-        for (_, end), stream in zip(pipes, (1, 2), strict=True):
+        for name, stream in (("out", 1), ("err", 2)):
+            end = os.open(Path(text) / name, os.O_WRONLY | os.O_CREAT)
             os.dup2(end, stream)
-        resource.setrlimit(resource.RLIMIT_CPU, (CPU, CPU + 5))
-        os.environ["TMPDIR"] = str(folder)
+            os.close(end)
+        began = time.process_time()
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(began) + CPU, resource.RLIM_INFINITY))
         code = call(case.arguments)
-        with contextlib.suppress(OSError):
-            sys.stdout.flush()
-            sys.stderr.flush()
-        os._exit(code % 256)
-    for _, end in pipes:
-        os.close(end)
-    (out, err), hungry = _listen(child, [end for end, _ in pipes])
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    shutil.rmtree(folder, ignore_errors=True)
-    seconds = time.monotonic() - began
-    faults = ("it takes more than 4 GiB of memory",) if hungry else judged(code, out, err)
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        seconds = time.process_time() - began
+        told = (
+            (Path(text) / name).read_bytes().decode("utf-8", "replace") for name in ("out", "err")
+        )
+        os.chdir("/")
+        return ended(code, *told, seconds)
+
+
+def ended(code: int, out: str, err: str, seconds: float) -> Ending:
+    """Return an ending with its faults."""
+    faults = [*judged(code, out, err)]
+    if code == 2 and seconds > REFUSING:
+        faults.append(f"it takes {seconds:.0f} s to refuse")
     return Ending(code, out, err, seconds, tuple(faults))
 
 
-def _listen(child: int, ends: list[int]) -> tuple[list[str], bool]:
-    """Return what a process prints, and whether it was ended for its memory or its time."""
-    texts: dict[int, bytes] = dict.fromkeys(ends, b"")
-    still, hungry, began = set(ends), False, time.monotonic()
-    while still:
-        for end in select.select(still, [], [], 0.1)[0]:
-            piece = os.read(end, 1 << 16)
-            texts[end] += piece
-            if not piece:
-                still.remove(end)
+def endings(cases: Sequence[Case]) -> Iterator[Ending]:
+    """Run cases one after another, all in one process unless one of them ends it."""
+    left = list(cases)
+    while left:
+        with tempfile.TemporaryDirectory(prefix="echelon-fuzz-") as folder:
+            here, there = multiprocessing.Pipe(duplex=False)
+            child = os.fork()
+            if not child:
+                os.environ["TMPDIR"] = folder
+                for case in left:
+                    there.send(tried(case))
+                os._exit(0)
+            there.close()
+            alive = True
+            while left and alive:
+                ending, alive = _heard(here, child)
+                left.pop(0)
+                yield ending
+            here.close()
+            if alive:
+                os.waitpid(child, 0)
+
+
+def attempt(case: Case) -> Ending:
+    """Run a case in a process of its own."""
+    [ending] = endings([case])
+    return ending
+
+
+def _heard(here: Connection, child: int) -> tuple[Ending, bool]:
+    """Return how the next case of a process ended, and whether the process goes on."""
+    began, fault = time.monotonic(), ""
+    while not here.poll(0.05):
         with contextlib.suppress(OSError, ValueError):
             resident = int(Path(f"/proc/{child}/statm").read_text().split()[1]) * 4096
-            if resident > MEMORY and not hungry:
-                hungry = True
-                os.kill(child, signal.SIGKILL)
-        if time.monotonic() - began > 6 * CPU:  # it waits, and does not compute
+            fault = fault or ("it takes more than 4 GiB of memory" if resident > MEMORY else "")
+        if fault or time.monotonic() - began > 12 * CPU:  # it waits, and does not compute
             os.kill(child, signal.SIGKILL)
-    for end in ends:
-        os.close(end)
-    return [texts[end].decode("utf-8", "replace") for end in ends], hungry
+    with contextlib.suppress(EOFError):
+        return here.recv(), True
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    found = ended(code, "", "", time.monotonic() - began)
+    return found._replace(faults=(fault,)) if fault else found, False
 
 
 def judged(code: int, out: str, err: str) -> Iterator[str]:
@@ -441,11 +531,18 @@ def sound() -> tuple[bytes, dict[str, bytes]]:
         return (folder / "g.json").read_bytes(), files
 
 
-def drawn(seed: int, made: tuple[bytes, dict[str, bytes]]) -> tuple[str, Case]:
-    """Return the kind and the case that a seed draws."""
-    rng = random.Random(seed)
-    kind = [*KINDS][seed % len(KINDS)]
-    return kind, KINDS[kind](rng, *made)
+class Drawn(NamedTuple):
+    """A case, its kind, and the seed that draws it."""
+
+    seed: int
+    kind: str
+    case: Case
+
+
+def drawn(seed: int, made: tuple[bytes, dict[str, bytes]], kind: str | None = None) -> Drawn:
+    """Return what a seed draws, of one kind or of all in turn."""
+    kind = kind or [*KINDS][seed % len(KINDS)]
+    return Drawn(seed, kind, KINDS[kind](random.Random(seed), *made))
 
 
 def preload() -> None:
@@ -467,30 +564,40 @@ def main() -> int:
     parser.add_argument("seconds", nargs="?", type=float, default=600.0)
     parser.add_argument("--seed", type=int, default=0, help="of the first case")
     parser.add_argument("--cases", type=int, default=sys.maxsize, help="at most so many")
+    parser.add_argument("--kind", choices=KINDS, help="only cases of this kind")
+    parser.add_argument("--alone", action="store_true", help="a process for each case")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
         os.environ["ECHELON_CACHE"] = cache
         preload()
         made, ends, faulty = sound(), Counter[str](), 0
-        deadline, seed = time.monotonic() + given.seconds, given.seed
-        while time.monotonic() < deadline and seed - given.seed < given.cases:
-            kind, case = drawn(seed, made)
-            ending = attempt(case)
-            ends[f"{kind}: exit code {ending.code}"] += 1
-            if ending.faults:
-                faulty += 1
-                print(f"\nseed {seed}: echelon {' '.join(map(ascii, case.arguments))}")
-                print("\n".join(f"  {fault}" for fault in ending.faults))
-                for name, text in case.files.items() if kind != "folders of runs" else ():
-                    print(f"  {name}: {text[:1500]!r}")
-                print(
-                    *(f"  | {line}" for line in ending.err.splitlines()[-6:]), sep="\n", flush=True
-                )
-            seed += 1
+        # A collection in a fork would write to all pages that it shares with this process.
+        gc.freeze()
+        deadline, seeds = time.monotonic() + given.seconds, iter(range(given.seed, sys.maxsize))
+        batch = 1 if given.alone else BATCH
+        while time.monotonic() < deadline and (left := given.cases - sum(ends.values())):
+            some = [drawn(next(seeds), made, given.kind) for _ in range(min(batch, left))]
+            for each, ending in zip(some, endings([each.case for each in some]), strict=True):
+                ends[f"{each.kind}: exit code {ending.code}"] += 1
+                if ending.faults:
+                    faulty += 1
+                    tell(each, ending, ending if given.alone else attempt(each.case))
     for what, count in sorted(ends.items()):
         print(f"{count:6d}  {what}")
     print(f"{sum(ends.values())} cases from seed {given.seed} on, {faulty} of them faulty")
     return int(faulty > 0)
+
+
+def tell(each: Drawn, ending: Ending, alone: Ending) -> None:
+    """Print a faulty case, and whether it is faulty in a process of its own."""
+    case, shown = each.case, alone if alone.faults else ending
+    print(f"\nseed {each.seed}, {each.kind}: echelon {' '.join(map(ascii, case.arguments))}")
+    print(*(f"  {fault}" for fault in shown.faults), sep="\n")
+    if not alone.faults:
+        print("  but not in a process of its own")
+    for name, text in case.files.items() if each.kind != "folders of runs" else ():
+        print(f"  {name}: {text[:1500]!r}")
+    print(*(f"  | {line}" for line in shown.err.splitlines()[-6:]), sep="\n", flush=True)
 
 
 if __name__ == "__main__":

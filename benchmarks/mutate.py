@@ -33,14 +33,16 @@ ROOT = Path(__file__).resolve().parents[1]
 TESTS = {
     "core": ["jaxpr", "linearization", "lyapunov", "bad_input"],
     "enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
-    "network": ["graph", "formation", "recommend"],
+    "network": ["graph", "formation", "recommend", "limits"],
     "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
     "certificates/exact.py": ["exact"],
+    "certificates/jacobians.py": ["regional", "exact"],
+    "certificates/sampling.py": ["regional", "exact"],
     "enclosure/curves.py": ["interval", "hull"],
     "enclosure/interval.py": ["interval", "hull"],
     "verifier": ["verify", "false_claims"],
     "gains": ["gains", "inner_loop", "regional", "paper"],
-    "laws": ["laws", "feedforward", "paper", "attack"],
+    "laws": ["laws", "feedforward", "inner_loop", "bad_input", "paper", "attack"],
     "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans"],
 }
 LIMIT = 4.0, 30.0

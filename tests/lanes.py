@@ -4,7 +4,7 @@ import numpy as np
 
 from echelon.kernels import SLOTS, Body, Code, Graph, Plan, aligned, lower, nodes, program
 
-NOTHING = Body({}, {}, {}, {}, [], [], [])
+NOTHING = Body({}, {}, {}, {}, {}, [], [], [])
 
 
 def lowered(function, count, bits=64):

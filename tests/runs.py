@@ -87,7 +87,7 @@ def metered(meter, states, inputs, reference=None):
         for k in range(len(states) - 1):
             followed = None if reference is None else jnp.asarray(reference[k])
             x, u = jnp.asarray(states[k]), jnp.asarray(inputs[k])
-            read = _read(meter, jnp.asarray(k), x, u, limited, followed)
+            read = _read(meter, jnp.asarray(k), x, u, limited, limited, followed)
             sums = sums.plus(on_host(read))
     return sums
 

@@ -237,6 +237,13 @@ def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, u
     assert not found.hypotheses[Hypothesis.CLAIMS].fails
 
 
+@pytest.mark.parametrize("coupling", [1e13, 1e11])
+def test_margins_are_not_asked_for_where_rounding_hides_the_slowest_mode(coupling):
+    strong = {"gain": {"method": "riccati", "coupling": coupling}}
+    lines, _ = checked(strong, model={"name": "double-integrator"})
+    assert "rounding hides" in lines["margins"].text and "gain margin" not in lines
+
+
 def test_why_a_proof_became_samples_is_said(robust):
     model, wanted = Yielding(), "no more than samples, since "
     gain = ech.synthesize(model, PATH, ech.gains.RobustLQR({"angle": 0.5}, exact=True))
@@ -355,7 +362,8 @@ def test_followers_that_ignore_each_other_are_promised_nothing():
     _, found = checked({"law": "passive"})
     assert not found.promised
     assert found.sentence() == (
-        "Nothing is promised: the followers' law does not act on the disagreement."
+        "Nothing is promised: the followers' law does not act on the disagreement. What would "
+        "help: use `consensus`."
     )
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -11,6 +12,7 @@ from oracles import laplacian
 from runs import simulate
 
 from echelon.core.errors import EchelonError, Outcome, ScenarioError
+from echelon.core.numerics import precision
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
 from echelon.laws import Consensus, Tracking, TrimInput
@@ -166,6 +168,18 @@ def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
     )
     wind = accelerations(formed) - formed.inputs[:-1]
     assert wind == pytest.approx(accelerations(run), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("hold", "dt", "steps"), [(0.3, 0.1, 3), (0.7, 0.1, 7), (0.04, 0.1, 1), (0.26, 0.1, 3)]
+)
+def test_a_draw_lasts_the_nearest_number_of_steps(hold, dt, steps):
+    with precision("float64"):
+        wind = Disturbance(rms={"vx": 1.0}, hold=hold).prepared(DoubleIntegrator(1), dt, 0)
+        drawn = [float(wind.on_state(jnp.asarray(k), jnp.asarray(0))[1]) for k in range(3 * steps)]
+    # 0.3 / 0.1 is a little less than 3.
+    assert len(set(drawn)) == 3
+    assert drawn == [x for x in drawn[::steps] for _ in range(steps)]
 
 
 def test_seeds_make_other_winds_and_the_disturbance_may_have_its_own():

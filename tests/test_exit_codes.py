@@ -44,7 +44,8 @@ def here(here):
 
 def test_each_outcome_has_its_code():
     codes = {each.name: each.exit_code for each in Outcome}
-    assert codes == {"COMPLETED": 0, "DIVERGED": 3, "INTERRUPTED": 130, "STOPPED": 130}
+    ended = {"COMPLETED": 0, "LEFT_CHART": 1, "DIVERGED": 3}
+    assert codes == {**ended, "INTERRUPTED": 130, "STOPPED": 130}
 
 
 def test_help_names_every_code(echelon):

@@ -6,19 +6,21 @@ import json
 from fractions import Fraction
 from itertools import product as combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import echelon as ech
 from echelon.verifier import algebra, exact
 from echelon.verifier.enclosed import farthest_from_all, farthest_outside, steepest, support
-from echelon.verifier.file import SavedGraph
+from echelon.verifier.file import SavedGraph, SavedRegion
+from echelon.verifier.points import pairs, points
 
 ROOT = Path(__file__).resolve().parents[1]
 LINE = ech.Graph.path(4)
@@ -142,6 +144,36 @@ def test_a_domain_that_leaves_out_the_trim_is_refused(files, said):
     assert "the domain holds the trim" in said(told)
 
 
+def test_of_what_errors_shrink_by_nothing_is_promised_but_of_the_drift(files, said):
+    told = edited(files["proof"], "certificate.region.rate", 0.0)
+    assert "the rate is one of decay" in said(told)
+    assert files["drift"]["certificate"]["region"]["rate"] == 0.0
+    assert said(files["drift"]) == []
+
+
+def test_a_drift_that_expands_its_metric_is_refused_at_the_corners(files, said):
+    told = edited(files["drift"], "P.0.0", lambda x: 1.5 * x)
+    assert "rate at 2 corners, 1/s" in said(told)
+    # Nor is it promised to contract, even where it does.
+    told = edited(files["plain"], "certificate.region.theorem", "A5")
+    told = edited(told, "certificate.region.kind", "vertices")
+    assert "rate at 1 corners, 1/s" in said(edited(told, "certificate.region.rate", 0.5))
+    assert "rate at 1 corners, 1/s" not in said(edited(told, "certificate.region.rate", 0.0))
+
+
+def test_the_set_of_a_drift_shrinks_where_inputs_act_unlike(said, tmp_path):
+    model = agent(lambda x: -x, lambda x: 2.0 + jnp.sin(x))
+    told = saved(model, LINE, ech.gains.Monotone({"x0": 1.0}), tmp_path)
+    assert said(told, model) == []
+    # Of one state, x'P x <= r^2 reaches 1 at r^2 = P; the sums differ by the ends of the spectrum.
+    low, high = told["graph"]["spectrum"][0], told["graph"]["spectrum"][-1]
+    widest = np.sqrt(told["P"][0][0])
+    radius = told["certificate"]["region"]["radius"]
+    assert radius == pytest.approx(widest * np.sqrt(low / high), rel=1e-9)
+    for wrong in (1.001 * radius, widest, widest * np.sqrt(high / low)):
+        assert said(edited(told, "certificate.region.radius", wrong), model) != []
+
+
 @pytest.mark.parametrize("name", ["proof", "vertices"])
 def test_a_rate_that_is_a_little_too_fast_is_refused_at_the_corners(files, said, name):
     told = edited(files[name], "certificate.region.rate", lambda x: 1.05 * x)
@@ -229,6 +261,12 @@ def test_a_small_graph_has_edges(files, said):
     assert "`graph.edges` must be given: 4 agents cannot have so many." in said(told)
 
 
+def test_every_edge_has_a_weight(files, said):
+    edges = files["riccati"]["graph"]["edges"]
+    # Without weight it moves nobody, and the spectrum is the same.
+    assert said(edited(files["riccati"], "graph.edges", [*edges, [0, 2, 0.0]])) == ["graph"]
+
+
 def test_no_graph_has_more_than_a_thousand_million_agents(files, said):
     words = "`graph.agents` must be a whole number from 2 on (to 1e9)"
     assert words in said(edited(files["riccati"], "graph.agents", 10**9 + 1))
@@ -310,6 +348,7 @@ def exact_bounds(edges, agents, leaders):
 
 
 @given(st.integers(0, 10**6))
+@example(14671)  # the next eigenvalue is a quarter larger, and of agents far away
 def test_the_smallest_eigenvalue_is_known_to_all_digits_whatever_the_weights(seed):
     random = np.random.default_rng(seed)
     tree = [(int(random.integers(k)), k) for k in range(1, 6)]
@@ -330,14 +369,35 @@ def test_an_agent_that_is_not_reached_has_eigenvalue_zero(files, said):
     assert "lambda_min is positive" in said(told)
 
 
-def test_modes_between_those_that_were_looked_at_must_decay(said, tmp_path):
-    # Stable for weak and for strong feedback, and for none between (its roots were drawn).
+def between(graph, folder):
+    """Agents that are stable for weak and for strong feedback, and for none between.
+
+    The roots were drawn. Returns the file, the drift (4, 4) and the feedback (4,).
+    """
     a, k = [0.08033771, 0.83319848, 2.60835077, 2.917598], [204.267, 187.671, 50.974, 0.26772]
     A = np.vstack([np.eye(4)[1:], np.negative(a)])
     P = np.diag([1e6, 1e6, 1e6, k[3]])
     P[3, :3] = P[:3, 3] = k[:3]
-    model, graph = ech.models.Linear(A, np.eye(4)[:, 3:]), ech.Graph.path(461)
-    told = saved(model, graph, ech.gains.FixedGain(P=P.tolist(), coupling=1.0), tmp_path)
+    model = ech.models.Linear(A, np.eye(4)[:, 3:])
+    told = saved(model, graph, ech.gains.FixedGain(P=P.tolist(), coupling=1.0), folder)
+    return told, A, np.array(k)
+
+
+def test_an_eigenvalue_is_known_to_rounding_of_the_largest(said, tmp_path):
+    one, stiff, weak = 1.3, 3.7e12, 1e-4
+    graph = ech.Graph([(0, 1, one), (1, 2, stiff), (0, 3, weak)])
+    told, A, k = between(graph, tmp_path)
+    # Of one s = x^2 - (one + 2 stiff) x + one stiff: the small root by the product of both.
+    largest = 0.5 * ((one + 2 * stiff) + np.sqrt((one + 2 * stiff) ** 2 - 4 * one * stiff))
+    feedback = one * stiff / largest * np.outer(np.eye(4)[3], k)
+    true = float(np.linalg.eigvals(A - feedback).real.max())
+    assert true > 0.2  # the mode between is the slowest
+    assert said(edited(told, "certificate.abscissa", true)) == []
+    assert said(edited(told, "certificate.abscissa", 0.9 * true)) == ["slowest mode, 1/s"]
+
+
+def test_modes_between_those_that_were_looked_at_must_decay(said, tmp_path):
+    told, _, _ = between(ech.Graph.path(461), tmp_path)
     told["certificate"]["modes"], spectrum = 2, told["graph"]["spectrum"]
     told["graph"]["spectrum"] = [spectrum[0], spectrum[-1]]
     STUDY.abscissa_put_right(told)
@@ -503,6 +563,49 @@ def test_a_domain_stays_where_the_equations_hold(files, said, chart, refused):
     model = agent(lambda x: -x)
     type(model).chart = {"x0": chart}
     assert said(files["plain"], model) == ["the domain stays inside the chart"] * refused
+
+
+# ---- where promises are doubted ----
+
+
+def domain(bounded, lower=-1.0):
+    """A gain, as far as points ask for it, and a domain of six states and of four inputs.
+
+    Of these ten, the first `bounded` have bounds.
+    """
+    low = np.where(np.arange(10) < bounded, lower, -np.inf)
+    high = np.where(np.arange(10) < bounded, 2.0, np.inf)
+    bounds = (low[:6], high[:6], low[6:], high[6:])
+    hull, error = np.zeros((1, 6, 6)), np.zeros((6, 6))
+    gain = SimpleNamespace(P=np.eye(6))
+    return gain, SavedRegion("vertices", "T1", 1.0, None, 1.0, *bounds, hull, error)
+
+
+@pytest.mark.parametrize("bounded", range(11))
+def test_all_corners_are_looked_at_while_they_are_few(bounded):
+    gain, region = domain(bounded)
+    found = points(gain, region)
+    x = np.hstack([found.states, found.inputs])
+    # As many random points and points of the lattice as of random corners.
+    assert len(x) == (2**bounded if bounded <= 7 else 128) + 256
+    assert found.corners == (2**bounded if bounded <= 7 else 0)
+    corners = {tuple(row) for row in x[: found.corners, :bounded]}
+    assert len(corners) == found.corners
+    assert corners <= set(combinations((-1.0, 2.0), repeat=bounded))
+    assert ((x[:, :bounded] >= -1.0) & (x[:, :bounded] <= 2.0)).all()
+    assert (x[-1] == 0.0).all()
+
+
+def test_a_quarter_of_the_pairs_is_about_the_trim_and_a_quarter_about_other_points():
+    gain, region = domain(6)
+    known = points(gain, region)
+    ones, others, _ = pairs(gain, region, known)
+    middle, apart = 0.5 * (ones + others), np.abs(ones - others).max(axis=1)
+    at_rest = (np.abs(middle) <= 0.5 * apart[:, None]).all(axis=1) & (apart < 0.1)
+    near = (np.abs(middle - known.states) <= apart[:, None]).all(axis=1) & (apart < 0.1)
+    assert at_rest.sum() >= 0.15 * len(ones) and (near & ~at_rest).sum() >= 0.15 * len(ones)
+    assert (apart > 0.5).sum() >= 0.4 * len(ones)
+    assert apart[apart > 0.0].min() < 1e-4
 
 
 # ---- the algebra of it ----

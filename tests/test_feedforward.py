@@ -75,6 +75,39 @@ def test_a_graph_that_is_no_tree_is_refused_for_parents(graph, who):
     )
 
 
+# ---- who is sent what ----
+
+
+def test_each_follower_is_sent_what_its_nearest_leader_does():
+    class Own(Law):
+        """A leader whose input is its place."""
+
+        def update(self, model, view, memory):
+            return view.x, memory
+
+    class Sent(Law):
+        """A follower that does what it is told."""
+
+        feedforward = Feedforward.RELAY
+
+        def update(self, model, view, memory):
+            return view.feedforward, memory
+
+    graph = Graph.path(7, leaders=[0, 3, 6])
+    run = simulate(
+        SingleIntegrator(1),
+        graph,
+        Formation(np.zeros((7, 1))),
+        leader=Own(),
+        follower=Sent(),
+        initial=np.arange(1.0, 8.0)[:, None],
+        horizon=0.1,
+        dt=0.1,
+    )
+    # Places 1, 4 and 7 of the leaders, each beside both of its neighbours.
+    assert run.inputs[0, :, 0].tolist() == [1.0, 1.0, 4.0, 4.0, 4.0, 7.0, 7.0]
+
+
 # ---- the law ----
 
 

@@ -324,7 +324,53 @@ def test_all_agents_that_share_a_broken_offset_are_named_whatever_its_zeros():
     assert list(formation.broken_symmetries(QUAD)) == [1, 2]
 
 
+class Carried(SingleIntegrator):
+    """Points that a wind carries along x, and that push with some strength."""
+
+    wind: object = staticmethod(jnp.zeros_like)
+    push: object = staticmethod(jnp.ones_like)
+
+    def drift(self, x):
+        return self.wind(x)
+
+    def input_map(self, x):
+        return self.push(x[0]) * jnp.eye(len(self.state_names))
+
+
+@pytest.mark.parametrize(
+    ("changes", "fine"),
+    [
+        ({"wind": lambda x: 1e-6 * x}, False),
+        ({"wind": lambda x: 1e-6 * x - 1e-6 * x}, True),
+        ({"push": lambda x: 1e6 + x}, False),
+        ({"push": lambda x: 1e8 * (jnp.sin(x) ** 2 + jnp.cos(x) ** 2)}, True),
+        ({"push": lambda x: 1e8 * (jnp.sin(x) ** 2 + 1.0001 * jnp.cos(x) ** 2)}, False),
+        # A ripple too low to be seen by its height.
+        ({"wind": lambda x: 1e-10 * jnp.sin(1e4 * x)}, False),
+        # Of a wave of the offset's length nothing changes, and of half of it the sign alone.
+        ({"wind": lambda x: jnp.sin(2.0 * jnp.pi * x)}, True),
+        ({"wind": lambda x: jnp.sin(jnp.pi * x)}, False),
+        ({"wind": lambda x: jnp.sin(jnp.pi * x) ** 2 + 1e-5 * jnp.sin(jnp.pi * x)}, False),
+    ],
+)
+def test_small_changes_count_and_rounding_does_not(changes, fine):
+    model = Carried(1, **changes)
+    formation = Formation.from_offsets(model, TREE, {1: (1.0,), 2: (0.0,)})
+    assert formation.is_invariant(model) is fine
+
+
 def test_a_whole_turn_is_a_symmetry_of_a_pendulum():
     # f(x + d) = f(x) for all x, which is all that the theorem needs.
     formation = Formation.from_offsets(Pendulum(), TREE, {2: (2.0 * np.pi, 0.0)})
     assert formation.is_invariant(Pendulum())
+
+
+@pytest.mark.parametrize("shape", ["line", "triangle", "wedge", "grid", "circle"])
+def test_drawn_neighbours_are_one_metre_apart_unless_said_otherwise(shape):
+    draw = getattr(Formation, shape)
+    for words, wanted in (({}, 1.0), ({"spacing": 2.5}, 2.5)):
+        places = draw(PLANE, Graph.path(6), **words).offsets[:, :2]
+        if shape == "circle":
+            places = places[1:]  # the leader stands in the middle
+        gaps = np.linalg.norm(places[:, None] - places, axis=-1)[~np.eye(len(places), dtype=bool)]
+        assert gaps.min() == pytest.approx(wanted)

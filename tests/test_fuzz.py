@@ -70,6 +70,7 @@ def test_odd_overrides_are_laid_over_or_refused_in_whole_sentences(tmp_path_fact
         ((70, "", "echelon: a fault of its own.\n"), ["its exit code is 70"]),
         ((-11, "", ""), ["its exit code is -11"]),
         ((-9, "", ""), ["it does not end within 20 s"]),
+        ((5, "", ""), []),
         ((0, "", "x.py:1: RuntimeWarning: overflow\n"), ["it shows a library's warning"]),
         (
             (1, "", "Traceback (most recent call last):\nValueError\n"),

@@ -1,5 +1,7 @@
 """Gains and what their certificates say, against closed forms and eigenvalues."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,9 +9,10 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import echelon as ech
 from echelon.core import numerics
 from echelon.core.errors import GainError
-from echelon.core.linear import observability_rank
+from echelon.core.linear import observability_rank, uncontrollable_modes
 from echelon.core.words import Kind
 from echelon.gains import Feedback, FixedGain, Method, Riccati
 from echelon.gains.gain import synthesize
@@ -203,6 +206,21 @@ def test_the_mode_of_a_unicycle_that_no_input_moves_is_named():
         synthesize(UnicyclePoint(), LINE, Riccati())
 
 
+@pytest.mark.parametrize(("reach", "seen"), [(1e-7, True), (1e-5, True), (1e-11, False)])
+def test_a_mode_that_an_input_moves_little_is_moved(reach, seen):
+    A, B = np.diag([1.0, 2.0]), np.array([[1.0], [reach]])
+    found = uncontrollable_modes(A, B)
+    assert [s for s, _ in found] == ([] if seen else [2.0])
+    for _, direction in found:
+        assert np.abs(direction) == pytest.approx([0.0, 1.0], abs=1e-9)
+
+
+def test_a_certificate_is_stable_below_zero_however_little():
+    certificate = synthesize(SingleIntegrator(1), Graph.path(2), FixedGain()).certificate
+    for abscissa, stable in ((-1e-12, True), (0.0, False), (1e-12, False)):
+        assert dataclasses.replace(certificate, abscissa=abscissa).stable is stable
+
+
 def test_an_uncontrollable_mode_that_decays_by_itself_is_no_obstacle():
     model = Linear([[-1.0, 0.0], [0.0, 1.0]], [[0.0], [1.0]])
     gain = synthesize(model, LINE, Riccati())
@@ -312,3 +330,20 @@ def test_a_model_s_own_trim_scale_and_weights_are_used():
     # Chosen by hand they make the same gain.
     same = synthesize(Shifted(), LINE, Riccati(Q=[4.0, 1.0], R=[0.5]))
     assert np.array_equal(gain.P, same.P)
+
+
+def test_a_file_with_two_equal_keys_is_refused_where_it_is_flown_and_where_it_is_verified(tmp_path):
+    model, graph, file = ech.models.DoubleIntegrator(1), ech.Graph.path(3), tmp_path / "gain.json"
+    ech.save_gain(ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, file)
+    text = file.read_text()
+    file.write_text(text.replace('"coupling":', '"coupling": 0.001, "coupling":', 1))
+    for read in (lambda: ech.load_gain(file, model, graph), lambda: ech.verify(file)):
+        with pytest.raises(ech.errors.GainError, match="`coupling` stands there twice"):
+            read()
+
+
+def test_a_coupling_beyond_all_numbers_is_one_sentence_and_no_warning(recwarn):
+    model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(3)
+    with pytest.raises(ech.errors.GainError, match="eigenvalue is beyond all numbers"):
+        ech.synthesize(model, graph, ech.gains.Riccati(coupling=1e308))
+    assert not [each for each in recwarn if issubclass(each.category, RuntimeWarning)]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import adjacency, connected, laplacian, relabelled
 
-from echelon.core import numerics
+from echelon.core import errors, numerics
 from echelon.network.graph import Graph
 from echelon.verifier.exact import is_positive_definite
 
@@ -340,3 +340,19 @@ def test_both_ends_of_a_line_of_20000_are_those_of_its_closed_form():
     spectrum = Graph.path(n + 1).spectrum()
     for k, found in ((1, spectrum.low), (n, spectrum.high)):
         assert found == pytest.approx(4 * np.sin((2 * k - 1) * np.pi / (4 * n + 2)) ** 2, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("edges", "agents", "said"),
+    [
+        ([("a", 1)], None, "agents are whole numbers from 0 on"),
+        ([(0, 1.5)], None, "agents are whole numbers from 0 on"),
+        ([(0, float("nan"))], None, "agents are whole numbers from 0 on"),
+        ([(0, 1), (1, 5)], 3, "an edge names agent 5, and with 3 agents the last is 2."),
+        ([(0, 1), (1, 3)], 3, "an edge names agent 3, and with 3 agents the last is 2."),
+    ],
+)
+def test_an_edge_is_of_agents_that_there_are(edges, agents, said):
+    with pytest.raises(errors.GraphError) as caught:
+        Graph(edges, agents=agents)
+    assert said in str(caught.value)

@@ -182,6 +182,31 @@ def test_the_error_is_the_distance_to_the_exact_vertices():
     assert 0 < max(found) <= Fraction(hull.error[0, 0]) <= max(found) * (1 + Fraction(1, 2**50))
 
 
+def test_the_error_is_no_less_than_what_was_rounded_away():
+    factors = np.random.default_rng(0).uniform(0.1, 1.0, (3, 40))
+
+    def products(x, v):
+        # Of three, so that what is rounded away has more digits than a float itself.
+        return (x * factors[0] * factors[1] * factors[2])[None]
+
+    hull = value_hull(products, Box([1.0], [1.0]), NO_INPUTS)
+    exact = [math.prod(map(Fraction, some)) for some in factors.T.tolist()]
+    [[values]], [errors] = hull.vertices.tolist(), hull.error.tolist()
+    for value, error, number in zip(values, errors, exact, strict=True):
+        lost = abs(Fraction(value) - number)
+        assert Fraction(math.nextafter(error, 0.0)) < lost <= Fraction(error) or lost == error == 0
+
+
+def test_what_is_not_known_of_a_number_is_part_of_the_error():
+    angles = np.random.default_rng(1).uniform(0.1, 1.5, 20)
+    hull = value_hull(lambda x, v: jnp.cos(x)[None], Box(angles, angles), NO_INPUTS)
+    [[values]], [errors] = hull.vertices.tolist(), hull.error.tolist()
+    for angle, value, error in zip(angles.tolist(), values, errors, strict=True):
+        cosine = circle(Fraction(angle))[0]
+        assert cosine.lo < cosine.hi
+        assert all(abs(Fraction(value) - end) <= Fraction(error) for end in (cosine.lo, cosine.hi))
+
+
 def test_numbers_that_are_not_rational_leave_a_slack():
     atoms, angles = Atoms(), (Fraction(3, 10), Fraction(4, 7))
     (c, _), (_, s) = (atoms.circle(constant(angle)) for angle in angles)
@@ -382,6 +407,69 @@ def test_a_choice_that_the_box_does_not_decide_holds_both():
     lower, upper = scalar_hull(step, 0.0, 0.6)
     assert lower <= 0.0 and upper >= 2.0 + math.cos(0.5)
     assert scalar_hull(lambda x: 1.0 * (x > 0), -1.0, 1.0) == (0.0, 1.0)
+
+
+CONDITIONS = [lambda x: x > 0.0, lambda x: x > 5.0, lambda x: x > 1.5]
+"""On [1, 2]: true, false, and not decided."""
+
+
+@pytest.mark.parametrize("one", CONDITIONS)
+@pytest.mark.parametrize("other", CONDITIONS)
+@pytest.mark.parametrize("join", [operator.and_, operator.or_, operator.xor])
+def test_conditions_that_are_joined_choose_what_is_chosen_somewhere(one, other, join):
+    def chosen(x):
+        first, second = one(x), other(x)
+        # Exclusive or, of the other two.
+        same = (
+            join(first, second)
+            if join is not operator.xor
+            else (first | second) & ~(first & second)
+        )
+        return jnp.where(same, 100.0, x)
+
+    reached = np.asarray(jax.vmap(chosen)(jnp.linspace(1.0, 2.0, 101)))
+    lower, upper = scalar_hull(chosen, 1.0, 2.0)
+    assert lower <= reached.min() and upper >= reached.max()
+    if join is not operator.xor:
+        assert (upper == 100.0) is (reached.max() == 100.0)
+        assert (lower == 100.0) is (reached.min() == 100.0)
+
+
+def test_a_condition_is_joined_entry_by_entry():
+    def chosen(x):
+        # The first is decided and the second is not, so that neither is a constant of the trace.
+        low, high = jnp.stack([x > 0.0, x > 1.5]), jnp.stack([x > 5.0, x > 1.5])
+        return jnp.where(low & high, 100.0, x)[0]
+
+    assert scalar_hull(chosen, 1.0, 2.0) == (1.0, 2.0)
+
+
+def test_a_number_that_is_none_of_the_state_is_cut_as_it_is():
+    assert scalar_hull(lambda x: x * (x - x + 2.7).astype(int), 1.0, 2.0) == (2.0, 4.0)
+    assert scalar_hull(lambda x: x * (x - x - 2.7).astype(int), 1.0, 2.0) == (-4.0, -2.0)
+    assert scalar_hull(lambda x: x * (x - x + 2.7).astype(bool), 1.0, 2.0) == (1.0, 2.0)
+
+
+def test_a_choice_between_what_is_alike_is_no_choice():
+    def both(x):
+        return jnp.where(jnp.where(x > 1.5, x > 0.0, x > -1.0), x, 100.0)
+
+    assert scalar_hull(both, 1.0, 2.0) == (1.0, 2.0)
+    assert scalar_hull(lambda x: jnp.where(x > 1.5, x + 1.0, 1.0 + x), 1.0, 2.0) == (2.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("function", "low", "high"),
+    [
+        (lambda x: jnp.abs(x) + x, -1.0, 0.0),
+        (lambda x: jnp.abs(x) - x, 0.0, 1.0),
+        (lambda x: jnp.maximum(x, 2.0 * x) - x, -1.0, 0.0),
+        (lambda x: jnp.maximum(x, 2.0 * x) - 2.0 * x, 0.0, 1.0),
+        (lambda x: jnp.minimum(x, 2.0 * x) - 2.0 * x, -1.0, 0.0),
+    ],
+)
+def test_a_side_is_known_up_to_its_edge(function, low, high):
+    assert scalar_hull(function, low, high) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("name", ["lt", "le", "gt", "ge", "eq", "ne"])
@@ -676,10 +764,27 @@ def test_each_function_has_the_derivative_that_jax_knows(name):
         (lambda x: jnp.minimum(x, 2.0), (1.0, 1.0)),
         (lambda x: jnp.sign(x + 2.0) * x, (1.0, 1.0)),
         (lambda x: -x + 5 * jax.lax.stop_gradient(x), (4.0, 4.0)),
+        (lambda x: jnp.where((x > 2.0) | (x < -0.5), x + 0.5, 0.0), (0.0, 1.0)),
+        # Up to the ends of [-1, 1], one side alone.
+        (lambda x: jnp.abs(x - 1.0), (-1.0, -1.0)),
+        (lambda x: jnp.abs(x - 2.0), (-1.0, -1.0)),
+        (lambda x: jnp.abs(x + 1.0), (1.0, 1.0)),
+        (lambda x: jnp.maximum(x - 1.0, 0.0), (0.0, 0.0)),
+        (lambda x: jnp.maximum(x + 1.0, 0.0), (1.0, 1.0)),
+        (lambda x: jnp.where(x >= -1.0, 2 * x, 9.0), (2.0, 2.0)),
+        (lambda x: jnp.where(x <= 1.0, 2 * x, 9.0), (2.0, 2.0)),
+        (lambda x: jnp.where(x < -1.0, 9.0, 2 * x), (2.0, 2.0)),
+        (lambda x: jnp.where(x > 1.0, 9.0, 2 * x), (2.0, 2.0)),
     ],
 )
 def test_what_bends_has_the_slopes_of_both_sides(function, wanted):
     np.testing.assert_allclose(slopes(function), wanted, atol=1e-15)
+
+
+def test_two_borders_of_one_condition_leave_both_slopes():
+    low, high = slopes(lambda x: jnp.where((x > 0.5) | (x < -0.5), x * x, 0.25))
+    # Each border is an unknown of its own, and the hull is of their product.
+    assert -4.0 <= low <= -2.0 and 2.0 <= high <= 4.0
 
 
 def test_two_bends_are_two_unknowns():
@@ -711,6 +816,13 @@ def test_a_derivative_written_by_hand_is_not_believed():
         lambda x: jnp.where(x == 0, 1.0, x),
         lambda x: x * (x.astype(int) + 1),
         lambda x: jnp.where(jnp.sin(x) > 0.5, jnp.sin(x), 0.0),
+        # The ends belong to the domain.
+        lambda x: jnp.where(x < 1.0, 0.0, 9.0),
+        lambda x: jnp.where(x > -1.0, 0.0, 9.0),
+        lambda x: jnp.where(x >= 1.0, 9.0, 0.0),
+        lambda x: jnp.where(x <= -1.0, 9.0, 0.0),
+        lambda x: jnp.sign(x - 1.0),
+        lambda x: jnp.sign(x + 1.0),
     ],
 )
 def test_a_jump_has_no_slopes(function):

@@ -65,9 +65,8 @@ def test_the_angle_of_a_point_is_right_in_all_quarters(bits):
     y, x = rng.normal(size=(2, 4000)).astype(np.float64 if bits == 64 else np.float32)
     [found] = run(lambda v: jnp.arctan2(v[0], v[1]), np.stack([y, x]), bits)
     assert units(found, np.arctan2(y.astype(np.longdouble), x.astype(np.longdouble))).max() <= 3.0
-    corners = np.array(
-        [[a, b] for a in (0.0, -0.0, 1.0, np.inf) for b in (0.0, -0.0, -1.0, np.inf)]
-    )
+    sides = itertools.product((0.0, -0.0, 1.0, np.inf), (0.0, -0.0, -1.0, np.inf))
+    corners = np.array(list(sides))
     [found] = run(lambda v: jnp.arctan2(v[0], v[1]), corners.T)
     np.testing.assert_allclose(found, np.arctan2(*corners.T), rtol=1e-15)
 
@@ -91,8 +90,8 @@ def test_powers_are_right_to_the_size_of_their_exponent(x, y):
     [found] = run(lambda v: v[0] ** v[1], np.array([[x], [y]]))
     wanted = np.longdouble(x) ** np.longdouble(y)
     assert units(found, np.array([wanted])).max() <= 4.0 + 2.0 * abs(y * np.log(x))
-    [whole] = run(lambda v: v[0] ** 3 + v[0] ** -2, np.array([[-x]]))
-    np.testing.assert_allclose(whole, (-x) ** 3 + (-x) ** -2.0, rtol=1e-14)
+    whole = run(lambda v: jnp.stack([v[0] ** 3, v[0] ** -2]), np.array([[-x]]))
+    np.testing.assert_allclose(whole[:, 0], [(-x) ** 3, (-x) ** -2.0], rtol=1e-14)
 
 
 def by_jax(function, columns):

@@ -501,3 +501,19 @@ def test_a_law_that_is_called_by_hand_computes_in_double_or_not_at_all():
         u, _ = law.update(model, known(), law.init())
     assert u.dtype == np.float64
     assert float(u[0]) == pytest.approx(-0.3 * float(gain.P[0, 0]) * 0.1, rel=1e-15)
+
+
+@pytest.mark.parametrize("feedforward", ["none", "relay"])
+def test_an_inner_loop_pulls_back_to_the_trim_and_is_not_told_to_others(feedforward):
+    model = DoubleIntegrator(1)
+    gain = synthesize(model, Graph.path(3), InnerLoop())
+    law, (K,) = Consensus(gain, feedforward=feedforward), gain.inner
+    with jax.enable_x64(True):
+        x, sent = jnp.array([0.3, -0.7]), jnp.array([0.2 if feedforward == "relay" else 0.0])
+        view = LocalView(jnp.zeros(()), x, jnp.zeros(2), jnp.zeros(2), sent)
+        u, _ = law.update(model, view, None)
+        told = law.broadcast(model, x, u)
+    # At one with its neighbours, what is left is the loop and what it was sent, which it hands on.
+    assert float(u[0]) == pytest.approx(float(sent[0]) - K @ [0.3, -0.7], rel=1e-12)
+    assert float(told[0]) == pytest.approx(float(sent[0]), abs=1e-15)
+    assert abs(K @ [0.3, -0.7]) > 0.1

@@ -90,6 +90,15 @@ def test_a_hovering_quadrotor_without_drag_has_none():
     assert found.states == (0, 1, 2, 3, 4, 5, 8, 11)
 
 
+@pytest.mark.parametrize("size", [1.0, 1e6])
+def test_a_mode_grows_from_a_thousand_millionth_of_the_fastest_on(size):
+    for growth, grows in ((3e-9, True), (3e-10, False), (-3e-9, False)):
+        found = obstacle(size * np.diag([-1.0, growth])[None])
+        assert (found is not None) is grows
+        if found is not None:
+            assert (found.eigenvalue, found.states) == (growth * size, (1,))
+
+
 def test_the_vertex_with_the_unstable_mode_is_named():
     As = np.stack([-np.eye(2), np.diag([-1.0, 0.3])])
     found = obstacle(As)

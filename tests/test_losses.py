@@ -376,7 +376,7 @@ def test_a_refused_start_leaves_no_folder_and_says_where(here, echelon):
     bad = ["--set", "initial={states: {1: [0, 0, 0]}}"]
     code, out, err = echelon("run", "mine.yaml", *bad, "--out", "o")
     assert code == 2 and out == "" and not (here / "o").exists()
-    assert err.startswith("echelon: --set initial={states: {1: [0, 0, 0]}}: initial: ")
+    assert err.startswith("echelon: --set initial={states: {1: [0, 0, 0]}}: ")
     assert "the initial state of agent 1 has shape (3,)" in err
     code, _, err = echelon("run", "mine.yaml", *bad)
     assert code == 2 and not (here / "runs").exists()

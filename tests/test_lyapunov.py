@@ -5,6 +5,7 @@ import pytest
 from runs import simulate
 
 import echelon as ech
+from echelon.results.dataset import dataset, summary
 from echelon.results.lyapunov import lyapunov
 
 DRAG = 0.7
@@ -24,6 +25,18 @@ def double_integrators(leaders=(0,), **changes):
         ),
         **{**settings, **changes},
     )
+
+
+def test_the_data_of_a_run_hold_v_and_its_derivatives_and_the_ends_of_the_spectrum():
+    result = double_integrators(horizon=1.0, dt=1e-3)
+    data, told = dataset(result), summary(result)
+    V, rate, drift = (data[f"lyapunov{name}"].values for name in ("", "_rate", "_drift"))
+    # Inputs are held, so that the slope of V is known to a step; what drag alone does is a part.
+    assert rate[1:-1] == pytest.approx(np.gradient(V, 1e-3)[1:-1], rel=0.01, abs=0.01 * V[0])
+    assert (V > 0.0).all() and (rate < 0.0).all() and (drift > rate).all()
+    # A ring of 5 grounded at one agent is a chain of 4 between two fixed ends.
+    ends = 2.0 - 2.0 * np.cos(np.pi * np.array([1.0, 4.0]) / 5.0)
+    assert [told["lambda_min"], told["lambda_max"]] == pytest.approx(ends)
 
 
 def test_v_is_the_kronecker_form_of_the_paper():

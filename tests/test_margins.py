@@ -16,6 +16,7 @@ from echelon.certificates.margins import (
     gain_margin,
     input_scaling,
     modes,
+    stiffness,
     string_gain,
 )
 from echelon.core.errors import GainError
@@ -59,6 +60,23 @@ def random_loop(seed, n=3, m=1):
 
 def abscissa(A):
     return float(np.linalg.eigvals(A).real.max())
+
+
+# ---- stiffness ----
+
+
+@given(st.integers(0, 10**6), st.floats(0.0, 8.0))
+@settings(max_examples=20)
+def test_stiffness_is_the_ratio_of_rates(seed, decades):
+    rng = np.random.default_rng(seed)
+    rates = 10.0 ** np.append(rng.uniform(0.0, decades, 2), [0.0, decades])
+    # Each of two strengths shifts all rates alike, and the feedback moves nothing else.
+    loop = ClosedLoop(-np.diag(rates), np.zeros((4, 1)), np.eye(4), ONE, 1.0, [1.0, 2.0])
+    assert stiffness(loop) == pytest.approx(10.0**decades, rel=1e-12)
+    strong = ClosedLoop(-np.eye(1), ONE, ONE, ONE, 1.0, [1.0, 3.0])
+    assert stiffness(strong) == pytest.approx(4.0 / 2.0)
+    growing = ClosedLoop(ONE, ONE, ONE, ONE, 1.0, [1.0, 3.0])
+    assert stiffness(growing) == np.inf
 
 
 # ---- gain ----

@@ -439,6 +439,16 @@ def test_the_demand_is_how_far_the_input_goes_towards_the_limit(model):
             assert not (model.limit(outside) == outside).all()
 
 
+def test_room_is_counted_from_the_trim_to_either_limit():
+    class Leaning(ech.models.SingleIntegrator):
+        trim = ((0.0,), (2.0,))
+        input_limits = ech.models.Limits(np.eye(1), np.array([-1.0]), np.array([3.0]))
+
+    inputs = np.array([[2.0], [2.5], [3.0], [4.0], [0.5], [-1.0], [-4.0]])
+    # One up and three down.
+    assert demand(Leaning(1), inputs).tolist() == [0.0, 0.5, 1.0, 2.0, 0.5, 1.0, 2.0]
+
+
 def test_a_reference_beyond_the_limits_is_warned_of_with_the_ratio():
     model = ech.models.Quadrotor.crazyflie()
     [told] = reference_warnings(model, FIGURE, 4.0)

@@ -52,6 +52,18 @@ def test_one_more_leader_or_edge_is_the_best_of_all(drawn):
         assert slowest([*edges, (*pair, 1.0)], {0}, agents) == pytest.approx(best, rel=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_best_edge_is_among_those_that_are_tried_of_many(seed):
+    random, agents = np.random.default_rng(seed), 40
+    edges = [(int(random.integers(max(0, k - 3), k)), k, 1.0) for k in range(1, agents)]
+    linked = {(i, j) for i, j, _ in edges}
+    free = [pair for pair in itertools.combinations(range(agents), 2) if pair not in linked]
+    assert len(free) > 700
+    (pair,) = ech.network.recommend_edges(ech.Graph.from_edges(edges, agents=agents), 1)
+    best = max(slowest([*edges, (*each, 1.0)], {0}, agents) for each in free)
+    assert slowest([*edges, (*pair, 1.0)], {0}, agents) == pytest.approx(best, rel=1e-9)
+
+
 @settings(max_examples=15)
 @given(graphs(), st.integers(0, 3))
 def test_each_further_leader_raises_lambda_min_and_keeps_the_earlier_ones(drawn, count):

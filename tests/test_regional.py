@@ -10,9 +10,14 @@ import pytest
 
 import echelon as ech
 from echelon.certificates import Domain
-from echelon.certificates.jacobians import has_constant_input_map, jacobians
+from echelon.certificates.jacobians import (
+    has_constant_input_map,
+    jacobians,
+    offsets_are_symmetries,
+)
 from echelon.certificates.lmi import robust_lqr
 from echelon.certificates.region import contracting_region, pairs_on, radius
+from echelon.certificates.sampling import sample_jacobians
 from echelon.core.numerics import precision
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.models.linearization import linearize
@@ -425,3 +430,161 @@ def test_a_missing_solver_is_exit_code_four(echelon, monkeypatch):
         )
     code, _, err = echelon("run", "mine.yaml")
     assert code == 4 and "pip install" in err and "certify" in err
+
+
+# ---- offsets, and jumps ----
+
+
+class Fenced(ech.ControlAffine):
+    """A mass that a soft fence pushes back beyond 7.5 m, on the side of its sign."""
+
+    side: float = 1.0
+    state_names = ("x", "v")
+    input_names = ("u",)
+
+    def drift(self, x):
+        push = 2.0 * jnp.maximum(self.side * x[0] - 7.5, 0.0)
+        return jnp.stack([x[1], -self.side * push])
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [1.0]], x.dtype)
+
+
+@pytest.mark.parametrize(
+    ("side", "offsets", "wanted"),
+    [
+        # Agents reach 6 m, and their places without an offset so much less.
+        (1.0, (0.0, -1.0), True),
+        (1.0, (0.0, -2.0), False),
+        (1.0, (0.0, 9.0), True),
+        (1.0, (0.0, 9.0, -2.0), False),
+        (-1.0, (0.0, 1.0), True),
+        (-1.0, (0.0, 2.0), False),
+        (-1.0, (0.0, -9.0), True),
+        (-1.0, (0.0, -9.0, 2.0), False),
+        (-1.0, (5.0, 6.0, 4.0), True),
+        (-1.0, (5.0, 7.0), False),
+    ],
+)
+def test_offsets_are_proved_as_far_as_places_lie_without_them(side, offsets, wanted):
+    model = Fenced(side=side)
+    domain = Domain.about(model, {"x": 6.0, "v": 2.0})
+    some = np.stack([offsets, np.zeros(len(offsets))], axis=1)
+    assert offsets_are_symmetries(model, domain, some) is wanted
+    # What all share moves nobody against another, and a velocity moves the place.
+    assert offsets_are_symmetries(model, domain, some + [0.0, 3.0]) is wanted
+    some[1, 1] = 0.5
+    assert not offsets_are_symmetries(model, domain, some)
+
+
+@pytest.mark.parametrize("slope", [2.0**-70, -(2.0**-300)])
+def test_an_input_map_is_constant_or_is_not_however_little_it_varies(slope):
+    class Uneven(Fenced):
+        def input_map(self, x):
+            return jnp.stack([0.0, 1.0 + slope * x[1]])[:, None]
+
+    # Floats cannot tell them apart, and what is proved of one is not proved of the other.
+    for model, wanted in ((Uneven(), False), (Fenced(), True)):
+        domain = Domain.about(model, {"x": 6.0, "v": 2.0})
+        assert has_constant_input_map(model, domain) is wanted
+
+
+def test_a_model_that_jumps_has_no_jacobians():
+    class Kicked(Fenced):
+        def drift(self, x):
+            return jnp.stack([x[1], -1.0 * (x[0] > 1.0)])
+
+    model = Kicked()
+    told = sentence(lambda: jacobians(model, Domain.about(model, {"x": 6.0, "v": 2.0})))
+    assert "may jump with `x` inside the domain" in told
+    near = Domain.about(model, {"x": 0.5, "v": 2.0})
+    assert jacobians(model, near).matrices.tolist() == [[[0.0, 1.0], [0.0, 0.0]]]
+
+
+# ---- samples ----
+
+
+def squares(x, v):
+    """A velocity whose Jacobian tells where it was taken: diag(x)."""
+    return 0.5 * x**2
+
+
+@pytest.mark.parametrize("size", [2, 7, 9])
+def test_samples_lie_in_the_domain_and_at_its_corners(size):
+    model = ech.models.Linear(-np.eye(size), np.ones((size, 1)))
+    domain = Domain.about(model, dict.fromkeys(model.state_names, (-1.0, 2.0)))
+    with precision("float64"):
+        found = sample_jacobians(model, domain, squares, None)
+    places = np.einsum("kii->ki", found)
+    corners = places[len(places) // 2 :]
+    assert ((places >= -1.0) & (places <= 2.0)).all() and set(corners.ravel()) == {-1.0, 2.0}
+    # Every one where they are few, and of many about as often one side as the other.
+    if size <= 7:
+        assert len({tuple(row) for row in corners}) == 2**size
+    else:
+        assert len({tuple(row) for row in corners}) > 100
+        assert (np.abs((corners > 0.0).mean(axis=0) - 0.5) < 0.1).all()
+
+
+class Sampled(ech.ControlAffine):
+    """A spring without an enclosure, beside a state that may do something far off."""
+
+    bend: object = staticmethod(jnp.zeros_like)
+    state_names = ("place", "far")
+    input_names = ("force",)
+
+    def drift(self, x):
+        return jnp.stack([-jax.scipy.special.erf(x[0]) + self.bend(x[1]), -x[1]])
+
+    def input_map(self, x):
+        return jnp.array([[1.0], [0.0]], x.dtype)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("edge", [2.0, 20.0, 800.0])
+def test_samples_look_far_along_a_state_without_bounds(side, edge):
+    calm = Sampled()
+    domain = Domain.about(calm, {"place": 0.5})
+    assert jacobians(calm, domain).kind is Kind.SAMPLES
+    model = Sampled(bend=lambda z: jnp.maximum(side * z - edge, 0.0))
+    assert "leaves `far` unbounded" in sentence(lambda: jacobians(model, domain))
+
+
+def test_a_jacobian_of_which_one_entry_is_no_number_is_refused():
+    model = Sampled(bend=lambda z: jnp.sqrt(0.9 - z))
+    domain = Domain.about(model, {"place": 0.5, "far": 1.0})
+    told = sentence(lambda: jacobians(model, domain))
+    assert "the Jacobian of `Sampled` is not finite inside the domain" in told
+
+
+@pytest.mark.parametrize("name", ["lambda_min", "abscissa", "modes", "observable", "edge"])
+@pytest.mark.parametrize("wrong", [{"x": 1}, "1", [1.0], True, -(10**400), float("nan")])
+def test_a_gain_file_whose_numbers_are_none_is_refused(tmp_path, name, wrong):
+    model, file = ech.models.DoubleIntegrator(1), tmp_path / "gain.json"
+    ech.save_gain(ech.synthesize(model, LINE, ech.gains.Riccati()), model, LINE, file)
+    told = json.loads(file.read_text())
+    told["certificate"][name] = wrong
+    file.write_text(json.dumps(told))
+    assert "is no gain that echelon wrote" in sentence(lambda: ech.load_gain(file, model, LINE))
+
+
+@pytest.mark.parametrize("name", ["rate", "radius", "strength"])
+def test_a_region_whose_numbers_are_none_is_refused(tmp_path, name):
+    model, file = ech.models.Pendulum(), tmp_path / "gain.json"
+    ech.save_gain(
+        ech.synthesize(model, LINE, ech.gains.Monotone({"angle": 0.5})), model, LINE, file
+    )
+    told = json.loads(file.read_text())
+    told["certificate"]["region"][name] = {"x": 1}
+    file.write_text(json.dumps(told))
+    assert f"`{name}` is {{'x': 1}}, and must be a finite number." in sentence(
+        lambda: ech.load_gain(file, model, LINE)
+    )
+
+
+@pytest.mark.parametrize("domain", [{}, {"angle": 0.5}])
+def test_a_contraction_that_needs_no_feedback_has_the_coupling_one(domain):
+    model = ech.models.Pendulum() if domain else ech.models.Linear([[-1.0]], [[1.0]])
+    gain = ech.synthesize(model, ech.Graph.path(4), ech.gains.Contraction(domain, rate=0.05))
+    assert (gain.coupling, gain.certificate.edge) == (1.0, 0.0)
+    assert gain.certificate.region.rate >= 0.05

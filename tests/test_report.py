@@ -1,9 +1,13 @@
 """The report: its table, and the sentences that say what happened and why."""
 
+import numpy as np
 import pytest
-from runs import simulate
+from runs import made_up, simulate
 
 import echelon as ech
+from echelon.core.words import Kind, Verdict
+from echelon.promises.statement import Cause, Hypothesis, Statement
+from echelon.reports.causes import causes
 
 
 def run(scenario, *changes):
@@ -110,3 +114,48 @@ def test_a_swarm_shows_best_median_and_worst():
 def test_the_unicycles_relay_is_told_to_the_reader():
     text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
     assert "Each follower is told: neighbours' states, the leader's input of the same step." in text
+
+
+@pytest.mark.parametrize("followers", [13, 14])
+def test_of_many_followers_the_best_the_worst_and_one_in_the_middle_are_shown(followers):
+    model, graph = ech.models.SingleIntegrator(1), ech.Graph.star(followers + 1)
+    order = np.random.default_rng(0).permutation(followers) + 1
+    errors = np.zeros((followers + 1, 1))
+    errors[order, 0] = 0.01 * np.arange(1, followers + 1)
+    states = np.broadcast_to(errors, (4, followers + 1, 1))
+    text = " ".join(ech.report(made_up(states, model, graph, window=2.0)).split())
+    middle = {order[(followers - 1) // 2], order[followers // 2]}
+    assert f"best (follower {order[0]})" in text and f"worst (follower {order[-1]})" in text
+    assert any(f"median (follower {k})" in text for k in middle)
+
+
+# ---- every cause ends in what to do ----
+
+
+def told(*changes, scenario="paper"):
+    """The causes of a short run, each as text and remedy."""
+    quick = ["simulation.horizon=2", "report.steady_window=0.5"]
+    result = run(scenario, *quick, *changes)
+    found = ech.promise(result.parts, result.settings)
+    return {each.text: each.remedy for each in causes(result, ech.metrics(result), found)}
+
+
+def test_a_horizon_shorter_than_the_slowest_mode_is_told():
+    found = told("graph={name: path, agents: 12}", "formation={name: line}", scenario="integrators")
+    [(text, remedy)] = found.items()
+    assert "the slowest mode takes" in text and "the horizon is 2 s" in text
+    assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
+
+
+@pytest.mark.slow
+def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
+    found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
+    [text] = [each for each in found if "the leader stays" in each]
+    assert "no law has integral action" in text and "`leader.gain`" in found[text]
+
+
+def test_no_failing_line_and_no_cause_is_without_a_remedy():
+    with pytest.raises(AssertionError, match="fails without a remedy"):
+        Statement(Hypothesis.STEP, Verdict.FAILS, Kind.PROOF)
+    with pytest.raises(TypeError):
+        Cause("it fails")

@@ -245,7 +245,7 @@ def test_the_table_of_laws_says_what_their_classes_say(role):
 def test_yaml_1_2_decides_what_a_word_is(load, refused):
     assert load("simulation.dt=1e-3").simulation.dt == 0.001
     assert refused("simulation.limits=no") == [
-        "--set simulation.limits=no: simulation.limits: got `no`, allowed is `true` or `false`."
+        "--set simulation.limits=no: got `no`, allowed is `true` or `false`."
     ]
 
 
@@ -347,9 +347,9 @@ def test_the_error_carries_its_faults(load):
 def test_overrides_meet_the_same_rules_and_come_last(refused):
     assert refused("simulation.dt=0", "graph.edges.1=[1, 1]", "graph.agents=4", name="name: 3") == [
         f"s.yaml:1: name: got `3`, allowed is {FOLDER_NAME}.",
-        "--set graph.edges.1=[1, 1]: graph.edges.1: got `[1, 1]`, allowed is an edge between two"
+        "--set graph.edges.1=[1, 1]: got `[1, 1]`, allowed is an edge between two"
         " different agents.",
-        "--set simulation.dt=0: simulation.dt: got `0`, allowed is a number above 0.",
+        "--set simulation.dt=0: got `0`, allowed is a number above 0.",
     ]
 
 

@@ -30,6 +30,7 @@ from echelon.laws import Agreement, Consensus, Tracking, TrimInput
 from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
+    Limits,
     Linear,
     Pendulum,
     PlanarQuadrotor,
@@ -492,6 +493,28 @@ def test_limits_act_and_are_counted_agent_by_agent():
     assert held.saturated[0] == 0.0 and 0.0 < held.saturated[1] <= 1.0
     wild = free.inputs[..., :1] / 2 + free.inputs[..., 1:] / (2 * 0.0325) * [1.0, -1.0]
     assert wild.max() > 2.0 * model.motor_thrust and not free.saturated.any()
+
+
+def test_one_limited_input_of_several_is_enough_to_be_counted():
+    class Boxed(SingleIntegrator):
+        input_limits = Limits(np.eye(2), -np.ones(2), np.ones(2))
+
+    model = Boxed(2)
+    # Behind a leader at rest at 0, each asks for so much of either input.
+    asked = np.array([[0.0, 0.0], [0.5, 0.5], [5.0, 0.5], [5.0, -5.0]])
+    law = Consensus(synthesize(model, Graph.star(4), FixedGain(coupling=1.0)))
+    run = simulate(
+        model,
+        Graph.star(4),
+        Formation(np.zeros((4, 2))),
+        leader=TrimInput(),
+        follower=law,
+        initial=-asked,
+        horizon=0.1,
+        dt=0.1,
+    )
+    assert run.inputs[0].tolist() == np.clip(asked, -1.0, 1.0).tolist()
+    assert run.saturated.tolist() == [0.0, 0.0, 1.0, 1.0]
 
 
 def test_what_is_relayed_is_the_leader_s_input_after_its_limits():

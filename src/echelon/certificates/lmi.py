@@ -194,8 +194,9 @@ def contraction(
     # A thousandth inside the bound, which the solver's error may then use up.
     solved = _least(cp, rho, [V - unit >> 0, 0.999 * condition_max * unit - V >> 0], gaps)
     P = _unscale(V.value, M) if solved else None
-    # A little more strength than the solver's makes up for its error and costs nothing else.
-    tried = max(0.0, float(rho.value)) * np.array([1.0, 1.0001, 1.01, 1.1]) if solved else []
+    # None at all where the drift needs none, of which a solver makes 1e-10. A little more strength
+    # than the solver's makes up for its error and costs nothing else.
+    tried = max(0.0, float(rho.value)) * np.array([0.0, 1.0, 1.0001, 1.01, 1.1]) if solved else []
     enough = [float(s) for s in tried if P is not None and _rate(P, As, S, float(s)) >= rate]
     if P is None or _condition(P) > condition_max or not enough:
         raise GainError(

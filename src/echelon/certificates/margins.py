@@ -97,6 +97,13 @@ def modes(loop: ClosedLoop) -> Array:
     return closed
 
 
+def stiffness(loop: ClosedLoop) -> float:
+    """Return how many times as fast as the slowest mode decays the fastest moves; inf if none."""
+    found = np.linalg.eigvals(loop.A - loop.strengths[:, None, None] * (loop.B @ loop.K))
+    slowest = -float(found.real.max())
+    return float(np.abs(found).max()) / slowest if slowest > 0.0 else np.inf
+
+
 def gain_margin(loop: ClosedLoop) -> GainMargin:
     """Return the interval of factors on the coupling, around 1, for which every mode decays.
 

@@ -27,10 +27,11 @@ from echelon.cli.verify import verify
 from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
-    "Exit codes: 0 done, or promised; 1 not promised, or refused by verify or doctor; 2 bad input, "
-    "or a file that cannot be written; 3 diverged; 4 an optional part is not installed; 5 verified "
-    "as far as it could be checked; 70 a fault of echelon's own; 130 ended by Ctrl-C and 143 by "
-    "SIGTERM, what was computed kept; 141 done, and the reader of the output left before its end. "
+    "Exit codes: 0 done, or promised; 1 not promised, refused by verify or doctor, or an agent "
+    "left the chart of its equations; 2 bad input, or a file that cannot be written; 3 diverged; "
+    "4 an optional part is not installed; 5 verified as far as it could be checked; 70 a fault of "
+    "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept; "
+    "141 done, and the reader of the output left before its end. "
     "ECHELON_CACHE names the folder where compiled code is kept between runs; `off` keeps none."
 )
 

@@ -166,7 +166,7 @@ def _write(chunks: "Chunks", result: "Result", figures: bool, quiet: bool) -> No
     except OutputError as error:
         again = f"what was computed is kept, and {_again(chunks.folder)}"
         raise OutputError(f"{str(error)[:-1]}; {again}.") from error
-    if result.outcome in (Outcome.COMPLETED, Outcome.DIVERGED):
+    if result.outcome.reached or result.outcome is Outcome.DIVERGED:
         chunks.remove()
     if not quiet:
         from echelon.reports.run import say

@@ -44,7 +44,7 @@ def design_row(design: "Design") -> dict[str, Any]:
         "advice": design.advice,
         "coupling": gain.coupling,
         "edge": promise.edge,
-        "slowest_mode": promise.loop.slowest,
+        "slowest_mode": promise.slowest,
         "fastest_mode": design.fastest,
         "longest_step": _finite(design.step),
         "condition": float(np.linalg.cond(gain.P)),

@@ -72,6 +72,7 @@ class Outcome(enum.Enum):
     """How a run ended; the value is the sentence that a person reads."""
 
     COMPLETED = "The run reached its horizon."
+    LEFT_CHART = "An agent left the chart of its equations, which hold inside alone."
     DIVERGED = "A state stopped being finite; everything computed before it is kept."
     INTERRUPTED = "The run was interrupted; everything computed before it is kept."
     STOPPED = "The run was ended from outside; everything until its last chunk is kept."
@@ -80,7 +81,12 @@ class Outcome(enum.Enum):
     def exit_code(self) -> int:
         """Exit code of the command line for a run that ended so."""
         # 130 is 128 + SIGINT, what shells report of a program that was interrupted.
-        return {Outcome.COMPLETED: 0, Outcome.DIVERGED: 3}.get(self, 130)
+        return {Outcome.COMPLETED: 0, Outcome.LEFT_CHART: 1, Outcome.DIVERGED: 3}.get(self, 130)
+
+    @property
+    def reached(self) -> bool:
+        """Whether the run reached its horizon."""
+        return self in (Outcome.COMPLETED, Outcome.LEFT_CHART)
 
 
 def did_you_mean(got: object, allowed: Iterable[str]) -> str:

@@ -17,20 +17,20 @@ def held_step(
     """Return (F, G) of a step x+ = F x + G u of xdot = A x + B u, u held over dt (s).
 
     An integrator makes of a linear field a linear map, read off what it does to unit vectors; the
-    exact flow is taken without one.
+    exact flow is taken without one. Shapes are (..., n, n) and (..., n, m).
     """
-    n, m = B.shape
+    n, m = B.shape[-2:]
     unit = np.eye(n + m)
     if integrator is None:
         # exp([[A, B], [0, 0]] dt) = [[e^(A dt), G], [0, I]] with G = int_0^dt e^(A s) B ds
         # (Van Loan).
-        block = np.zeros((n + m, n + m))
-        block[:n, :n], block[:n, n:] = A, B
-        moved = scipy.linalg.expm(block * dt)[:n]
+        block = np.zeros((*A.shape[:-2], n + m, n + m))
+        block[..., :n, :n], block[..., :n, n:] = A, B
+        moved = scipy.linalg.expm(block * dt)[..., :n, :]
     else:
         step = cast(Callable[..., np.ndarray], INTEGRATORS[integrator])
         moved = step(lambda x, u: A @ x + B @ u, unit[:n], unit[n:], dt)
-    return moved[:, :n], moved[:, n:]
+    return moved[..., :n], moved[..., n:]
 
 
 def held_radius(
@@ -39,9 +39,9 @@ def held_radius(
     """Return the largest spectral radius of a step of xdot = A x - B K x(t_k), u held over dt.
 
     Args:
-        A: (n, n).
-        B: (n, m).
-        gains: (m, n), or (K, m, n) for several loops.
+        A: (..., n, n).
+        B: (..., n, m).
+        gains: (..., m, n), broadcast with them for several loops.
         dt: s.
         integrator: its name; the exact flow without.
     """
@@ -56,7 +56,7 @@ def longest_step(
 
     The step is lengthened by tenths from a thousandth of the fastest mode's time until a loop
     grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
-    slowest mode's. Gains are (K, m, n).
+    slowest mode's. Shapes are those of `held_radius`.
     """
     poles = np.linalg.eigvals(A - B @ gains)
     # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.

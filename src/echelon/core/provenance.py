@@ -7,7 +7,7 @@ from pathlib import Path
 
 from echelon import __version__
 
-_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
+_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy", "llvmlite")
 
 
 def versions() -> dict[str, str]:

@@ -35,6 +35,9 @@ class Feedforward(Word):
     PARENT = "its parent's input of the same step"
 
 
+ENGINES = ("auto", "jax", "native")
+"""What may step agents under laws."""
+
 DEFAULT_FEEDFORWARD = Feedforward.RELAY
 """Of the law `consensus`, in scenarios and in Python: without it followers lag behind a leader that
 moves, which is seldom what is meant; the paper's own network is `none`."""

@@ -132,6 +132,16 @@ class Stepper(abc.ABC):
         """What solving took so far; None where nothing is solved."""
         return None
 
+    @property
+    def engine(self) -> str:
+        """What computes the steps."""
+        return "jax"
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is allowed but probably not meant, a sentence each."""
+        return ()
+
 
 class Information(NamedTuple):
     """What leaders and followers must be sent by others, in words."""

@@ -177,7 +177,9 @@ def _hold_inputs(
 
     def one(step: jax.Array, done: tuple[States, Sums]) -> tuple[States, Sums]:
         x, sums = done
-        read = meter.read(step, x, inputs, limited, reference_at(reference, step - span[1], x))
+        wanted = reference_at(reference, step - span[1], x)
+        # An input that is held does not alternate.
+        read = meter.read(step, x, inputs, limited, jnp.zeros_like(limited), wanted)
         return motion.advance(x, inputs, step), sums.plus(read)
 
     return jax.lax.fori_loop(span[0], span[0] + span[2], one, (states, meter.nothing()))

@@ -3,15 +3,16 @@
 from typing import TYPE_CHECKING, final
 
 import jax
-import jax.numpy as jnp
 
-from echelon.core.errors import check_kind
+from echelon.core.errors import EchelonError, MissingExtraError, SimulationError, check_kind
 from echelon.core.types import Array, State
 from echelon.core.words import Feedforward
-from echelon.engine.drive import Chunk, Drive, Information, Problem, Stepper
-from echelon.engine.loop import Loop, Moment, advance, assemble, begin
+from echelon.engine.by_jax import JaxStepper
+from echelon.engine.drive import Drive, Information, Problem, Stepper
+from echelon.engine.loop import assemble
+from echelon.engine.native import NativeStepper
 from echelon.engine.settings import Settings
-from echelon.engine.sums import on_host
+from echelon.kernels import Unsupported, is_installed
 from echelon.laws.check import leader_warnings, prepare_law
 from echelon.laws.law import Law, gain_of
 from echelon.models.model import ControlAffine
@@ -100,35 +101,35 @@ class Laws(Drive):
         return self.follower.drift(model, x)
 
     def stepper(self, problem: Problem) -> Stepper:
-        """Return the stepper of the closed loop in JAX."""
-        return _LawStepper(assemble(problem, self.leader, self.follower), problem.states)
+        """Return what steps the closed loop, by JAX or by native code.
+
+        Raises:
+            SimulationError: native code is asked for, and cannot be made.
+        """
+        loop, settings = assemble(problem, self.leader, self.follower), problem.settings
+        by_jax = JaxStepper(loop, problem.states)
+        if settings.engine == "jax" or settings.engine == "auto" and not _worth_it(problem):
+            return by_jax
+        try:
+            return NativeStepper(loop, problem.states, int(settings.precision[5:]), by_jax)
+        except (Unsupported, MissingExtraError) as error:
+            if settings.engine == "native":
+                raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
+            return JaxStepper(loop, problem.states, _in_words(error))
 
 
-_AGENT_STEPS, _FEWEST = 100_000, 4
-"""Steps of one agent each in a chunk, and the fewest of all agents.
-
-A quadrotor's take 1.4 to 7 us, and a model may take longer. A chunk computes the inputs at each of
-its frames once more, so that one of a single step would take twice the time.
-"""
+_WORTH = 100_000
+"""Steps of one agent from which on native code saves more than the second that it takes to make."""
 
 
-@final
-class _LawStepper(Stepper):
-    """The closed loop of laws, traced by JAX: many steps a call."""
+def _worth_it(problem: Problem) -> bool:
+    """Tell whether a run is long enough for native code, which computes on processors alone."""
+    long = problem.settings.steps * len(problem.states) >= _WORTH
+    return long and is_installed() and jax.default_backend() == "cpu"
 
-    def __init__(self, loop: Loop, states: Array) -> None:
-        self.loop, self.states = loop, states
 
-    @property
-    def longest(self) -> int:
-        """Steps that take some tenths of a second, or a few of very many agents."""
-        return max(_FEWEST, _AGENT_STEPS // len(self.states))
-
-    def start(self) -> Moment:
-        """Return the moment at which the run begins."""
-        return begin(self.loop, jnp.asarray(self.states))
-
-    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
-        """Store frames and take steps; what happens on the way is seen afterwards."""
-        now, (states, inputs), sums = advance(self.loop, now, jnp.asarray(counts), reference)
-        return Chunk(now, *on_host((states, inputs, sums)))
+def _in_words(error: EchelonError) -> str:
+    """Return why there is no native code."""
+    if isinstance(error, Unsupported):
+        return f"there is no native code for {error}"
+    return str(error).rstrip(".")

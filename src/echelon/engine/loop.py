@@ -55,13 +55,15 @@ class _Acted(NamedTuple):
 class Moment(NamedTuple):
     """All that changes during a run.
 
-    The step number, the states (N, n), the memories of leaders and followers.
+    The step number, the states (N, n), the memories of leaders and followers, and to which side the
+    limits moved each input (N, m) in the step before: -1, 0 or 1.
     """
 
     step: jax.Array
     states: States
     leader_memory: Memory
     follower_memory: Memory
+    cut: jax.Array
 
 
 def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
@@ -115,6 +117,7 @@ def begin(loop: Loop, states: States) -> Moment:
         states=jnp.asarray(states),
         leader_memory=remember(loop.leader, loop.leaders),
         follower_memory=remember(loop.follower, loop.followers),
+        cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
     )
 
 
@@ -122,10 +125,11 @@ def begin(loop: Loop, states: States) -> Moment:
 
 
 class Control(NamedTuple):
-    """Delivered inputs (N, m), who was limited (N,), and the next memories."""
+    """Delivered inputs (N, m), who was limited (N,), to which side (N, m), and next memories."""
 
     inputs: Inputs
     limited: jax.Array
+    cut: jax.Array
     leader_memory: Memory
     follower_memory: Memory
 
@@ -157,9 +161,18 @@ def control(loop: Loop, now: Moment) -> Control:
         followed = _by_depth(loop, now, led, act)
     u = jnp.concatenate([led.inputs, followed.inputs])[loop.order]
     wanted = jnp.concatenate([led.wanted, followed.wanted])[loop.order]
-    # To the bit, as `limit` returns what fits; NaN differs from itself, and is a divergence.
-    limited = jnp.any((u != wanted) & ~jnp.isnan(wanted), axis=1)
-    return Control(u, limited, led.memory, followed.memory)
+    limited, cut = what_limits_did(u, wanted)
+    return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory)
+
+
+def what_limits_did(u: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return which wanted inputs (..., m) limits changed, and to which side, -1, 0 or 1."""
+    # To the bit, as `limit` returns what fits. NaN differs from itself, and is a divergence.
+    limited = (u != wanted) & ~jnp.isnan(wanted)
+    # Where one input is cut, mixing there and back rounds all others, which says nothing of a side.
+    clear = jnp.abs(u - wanted) > 1e-6 * (jnp.abs(u) + jnp.abs(wanted))
+    side = jnp.where(u > wanted, 1.0, -1.0)
+    return limited, jnp.where(limited & clear, side, 0.0)
 
 
 def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) -> _Acted:
@@ -196,7 +209,7 @@ def _broadcast(loop: Loop, x: States, u: Inputs) -> jax.Array:
 def step(loop: Loop, now: Moment, acted: Control) -> Moment:
     """Advance all agents by one dt, under what they do."""
     states = loop.motion.advance(now.states, acted.inputs, now.step)
-    return Moment(now.step + 1, states, acted.leader_memory, acted.follower_memory)
+    return Moment(now.step + 1, states, acted.leader_memory, acted.follower_memory, acted.cut)
 
 
 # ---- many steps ----------------------------------------------------------------------------------
@@ -217,7 +230,9 @@ def advance(
         now, sums = done
         acted = control(loop, now)
         wanted = reference_at(reference, now.step - first, now.states)
-        read = loop.meter.read(now.step, now.states, acted.inputs, acted.limited, wanted)
+        chatter = (acted.cut * now.cut < 0).any(axis=1)
+        moment = now.step, now.states, acted.inputs
+        read = loop.meter.read(*moment, acted.limited, chatter, wanted)
         return step(loop, now, acted), sums.plus(read)
 
     def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:

@@ -9,7 +9,7 @@ from echelon.core.errors import Outcome
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Problem, numbers
 from echelon.engine.grid import Grid
-from echelon.engine.sums import Sums
+from echelon.engine.sums import ALWAYS, Sums
 
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
@@ -156,15 +156,33 @@ class Recorder:
         states, inputs = np.zeros((0, *self.problem.states.shape)), np.zeros((0, agents, m))
         return Stretch(0, 0, np.zeros(0), states, inputs, None, self.sums, (), None, 0.0)
 
+    def _completed(self, whole: Stretch) -> tuple[Outcome, str]:
+        """Return how a run ended that reached its horizon: whether all stayed in their chart."""
+        chart, inside = self.problem.model.chart, self.sums.inside
+        if not inside.size or inside.min() >= ALWAYS:
+            return Outcome.COMPLETED, Outcome.COMPLETED.value
+        agent, k = divmod(int(inside.argmin()), inside.shape[1])
+        name = [*chart][k]
+        unit = self.problem.model.state_units[self.problem.model.state_names.index(name)]
+        low, high = (f"{bound:.4g}" for bound in chart[name])
+        return Outcome.LEFT_CHART, (
+            f"{self._role(agent)} {agent} left the chart of its equations at "
+            f"t = {inside.min() * self.problem.settings.dt:.6g} s: `{name}` is not between {low} "
+            f"and {high} {unit}".rstrip()
+            + ", and what follows is not the agent's motion."
+        )
+
+    def _role(self, agent: int) -> str:
+        return "Leader" if agent in self.problem.graph.leaders else "Follower"
+
     def _verdict(self, whole: Stretch, lost: Array, unfinished: Outcome) -> tuple[Outcome, str]:
         """Return how the run ended; `lost` are the frames and agents that are not finite."""
         if len(lost):
             frame, agent = lost[0]
-            role = "leader" if agent in self.problem.graph.leaders else "follower"
-            when = f"by t = {whole.times[frame]:.6g} s"
+            role, when = self._role(agent).lower(), f"by t = {whole.times[frame]:.6g} s"
             return Outcome.DIVERGED, f"The state of {role} {agent} stopped being finite {when}."
         if whole.stopped is None and self.complete:
-            return Outcome.COMPLETED, Outcome.COMPLETED.value
+            return self._completed(whole)
         reached = float(whole.times[-1]) if len(whole.times) else 0.0
         # One that stopped did so between two frames; the steps themselves were counted.
         if whole.stopped:

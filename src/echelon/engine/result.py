@@ -36,6 +36,7 @@ class Result:
         settings: how it was computed.
         wall_time: seconds of computing, compilation included.
         work: what solving took; None where laws gave the inputs.
+        engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
     """
 
@@ -51,6 +52,7 @@ class Result:
     settings: Settings
     wall_time: float
     work: SolverStats | None = None
+    engine: str = "jax"
     provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
@@ -82,6 +84,11 @@ class Result:
     def saturated(self) -> Array:
         """The fraction of steps (N,) in which an actuator limit changed the agent's input."""
         return self.sums.limited / max(1.0, float(self.sums.steps[0]))
+
+    @property
+    def chatter(self) -> Array:
+        """How many times (N,) an input went from beyond one limit to beyond the other in a step."""
+        return self.sums.chatter
 
     @property
     def errors(self) -> Array:

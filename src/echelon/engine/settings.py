@@ -7,6 +7,7 @@ from typing import NamedTuple
 from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.limits import MOST_STEPS, horizon_fault
 from echelon.core.numerics import INTEGRATORS, Precision
+from echelon.core.words import ENGINES
 
 
 class Settings(NamedTuple):
@@ -21,6 +22,8 @@ class Settings(NamedTuple):
             all steps, whatever is stored.
         seed: of the random starts, and of the disturbance unless it has its own.
         precision: `float64` or `float32`, whatever the flags of JAX are.
+        engine: what steps agents under laws. `jax`; `native`, code for this machine's vectors; or
+            `auto`, which takes that for long runs where it can.
         steady_window: the last part of the run that counts as steady, s; a fifth when left out.
     """
 
@@ -31,6 +34,7 @@ class Settings(NamedTuple):
     store_every: int = 1
     seed: int = 0
     precision: Precision = "float64"
+    engine: str = "auto"
     steady_window: float | None = None
 
     @property
@@ -77,6 +81,7 @@ class Settings(NamedTuple):
         for name, allowed in (
             ("integrator", tuple(INTEGRATORS)),
             ("precision", ("float64", "float32")),
+            ("engine", ENGINES),
         ):
             _check_name(name, getattr(self, name), allowed)
         for name, least, most in (("seed", 0, 2**63 - 1), ("store_every", 1, MOST_STEPS)):

@@ -20,6 +20,9 @@ from echelon.network.graph import Graph
 Total: TypeAlias = Any
 """JAX within a chunk, float64 NumPy on the host: chunks of a float32 run are added without loss."""
 
+ALWAYS = 2**31 - 1
+"""The first step at which a state left its chart, where it never did."""
+
 SETTLED = 0.01
 """A follower has settled when its error stays below this: 1 cm for a position."""
 
@@ -39,6 +42,10 @@ class Sums(NamedTuple):
         spacing: (E,) squared error of the distance between neighbours.
         limited: (N,) how many times a limit changed the input.
         unsettled: (N,) the last step at which the error was not below `SETTLED`; -1 without any.
+        inside: (N, k) the first step at which each of the k states that the model's chart bounds
+            was not inside; `ALWAYS` without any.
+        chatter: (N,) how many times an input went from beyond one limit to beyond the other from a
+            step to the next.
     """
 
     steps: Total
@@ -49,18 +56,40 @@ class Sums(NamedTuple):
     spacing: Total
     limited: Total
     unsettled: Total
+    inside: Total
+    chatter: Total
 
     def plus(self, more: "Sums") -> "Sums":
         """Return the sums of two stretches of a run."""
         total = Sums(*(a + b for a, b in zip(self, more, strict=True)))
-        # The later maximum; written so that NumPy on the host and JAX within a chunk both have it.
+        # The maximum, and below the minimum; written so that NumPy on the host and JAX within a
+        # chunk both have it.
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
-        return total._replace(unsettled=last)
+        first = self.inside - (self.inside - more.inside).clip(0)
+        return total._replace(unsettled=last, inside=first)
 
 
 def on_host(tree: Any) -> Any:
     """Return the same with every array in float64 NumPy."""
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)
+
+
+class OfAgent(NamedTuple):
+    """What one agent adds to the sums at a step: (2,) squared error, effort, and two steps.
+
+    `unsettled` is the step or -1, of which the largest counts; `inside` (k,) is the step or
+    `ALWAYS` for each bounded state, of which the least counts.
+    """
+
+    errors: Any
+    effort: Any
+    unsettled: Any
+    inside: Any
+
+
+def _twice(steady: Any, square: Any) -> Any:
+    """Return a square for all steps and for those of the steady window."""
+    return jnp.where(jnp.stack([jnp.asarray(True), steady]), square, 0.0)
 
 
 @final
@@ -74,6 +103,8 @@ class Meter(eqx.Module):
     edges: Array
     spacings: Array
     first_steady: Array
+    charted: Array
+    chart: Array
     # Static, since they decide shapes.
     measured: tuple[int, ...] = eqx.field(static=True)
 
@@ -94,6 +125,8 @@ class Meter(eqx.Module):
             spacings=np.linalg.norm(goals[i] - goals[j], axis=1),
             # An array and not a constant: another window compiles nothing again.
             first_steady=np.asarray(settings.first_steady, np.int32),
+            charted=np.array([model.state_names.index(name) for name in model.chart], int),
+            chart=np.array([*model.chart.values()], float).reshape(-1, 2),
             measured=measured,
         )
 
@@ -111,6 +144,8 @@ class Meter(eqx.Module):
             spacing=jnp.zeros(len(self.edges), dtype),
             limited=jnp.zeros(agents, jnp.int32),
             unsettled=jnp.full(agents, -1, jnp.int32),
+            inside=jnp.full((agents, len(self.charted)), ALWAYS, jnp.int32),
+            chatter=jnp.zeros(agents, jnp.int32),
         )
 
     def read(
@@ -119,6 +154,7 @@ class Meter(eqx.Module):
         states: States,
         inputs: Inputs,
         limited: jax.Array,
+        chatter: jax.Array,
         reference: jax.Array | None,
     ) -> Sums:
         """Return the sums of one step.
@@ -128,54 +164,93 @@ class Meter(eqx.Module):
             states: (N, n) at its beginning.
             inputs: (N, m) delivered over it.
             limited: (N,) whose inputs a limit changed.
+            chatter: (N,) whose inputs went beyond the one limit after the other.
             reference: (n,) what the leaders follow at its beginning, or None.
         """
-        # A row for all steps, a row for those of the steady window.
-        twice = jnp.stack([jnp.asarray(True), step >= jnp.asarray(self.first_steady)])
-        # y_i = x_i - xi_i, and y_i - y_0 is the deviation from the goal (theory page).
-        y = states - jnp.asarray(self.offsets, states.dtype)
-        squares = self._lengths(y - y[self.nearest])
-        tracking, outputs = self._tracking(y[self.leaders], reference)
-        # A newton and a newton metre cannot be added; accelerations can.
-        v = self.model.normalized(inputs)
-        # Not finite counts as unsettled: a comparison with it is false.
-        last = jnp.where(jnp.sqrt(squares) <= SETTLED, -1, step)
+        offsets = jnp.asarray(self.offsets, states.dtype)
+        y = states - offsets
+        steady = step >= jnp.asarray(self.first_steady)
+
+        def one(x: jax.Array, offset: jax.Array, leader: jax.Array, u: jax.Array) -> OfAgent:
+            return self.of_agent(step, steady, x, offset, leader, u)
+
+        each = jax.vmap(one)(states, offsets, y[self.nearest], inputs)
+        tracking, outputs = self._tracking(steady, states[self.leaders], reference)
         return Sums(
-            steps=twice.astype(jnp.int32),
-            errors=jnp.where(twice[:, None], squares, 0.0),
-            tracking=jnp.where(twice[:, None], tracking, 0.0),
+            steps=jnp.stack([jnp.asarray(True), steady]).astype(jnp.int32),
+            errors=each.errors.T,
+            tracking=tracking,
             outputs=outputs,
-            effort=jnp.sum(v * v, axis=1),
+            effort=each.effort,
             spacing=self._spacing(states),
             limited=limited.astype(jnp.int32),
-            unsettled=last.astype(jnp.int32),
+            unsettled=each.unsettled.astype(jnp.int32),
+            inside=each.inside.astype(jnp.int32),
+            chatter=chatter.astype(jnp.int32),
         )
 
-    def _lengths(self, deviations: jax.Array) -> jax.Array:
-        """Return squared lengths (K,) of the measured part of deviations (K, n)."""
-        part = deviations[:, np.array(self.measured)]
-        return jnp.sum(part * part, axis=1)
+    def of_agent(self, step: Any, steady: Any, x: Any, offset: Any, leader: Any, u: Any) -> OfAgent:
+        """Return what one agent adds at a step.
+
+        Args:
+            step: its number.
+            steady: whether it begins in the steady window.
+            x: the agent's state (n,).
+            offset: its goal's (n,).
+            leader: the state (n,) of its leader less the leader's offset.
+            u: what is delivered to it (m,).
+        """
+        # y_i = x_i - xi_i, and y_i - y_0 is the deviation from the goal (theory page).
+        square = self._length(x - offset - leader)
+        # A newton and a newton metre cannot be added; accelerations can.
+        v = self.model.normalized(u)
+        low, high = jnp.asarray(self.chart.T, x.dtype)
+        bounded = x[self.charted]
+        # What is not finite is another outcome.
+        out = (bounded <= low) | (bounded >= high)
+        return OfAgent(
+            errors=_twice(steady, square),
+            effort=jnp.sum(v * v),
+            # Not finite counts as unsettled: a comparison with it is false.
+            unsettled=jnp.where(jnp.sqrt(square) <= SETTLED, -1, step),
+            inside=jnp.where(out, step, ALWAYS),
+        )
+
+    def of_leader(self, steady: Any, x: Any, offset: Any, wanted: Any) -> tuple[Any, Any]:
+        """Return the squared deviations of a leader at x from a reference, (2,), and its outputs'.
+
+        Args:
+            steady: whether the step begins in the steady window.
+            x: its state (n,).
+            offset: its goal's (n,).
+            wanted: what it follows (n,), without that offset.
+        """
+        # The offset back in: outputs are nonlinear in the state, so each is taken where it holds.
+        away = output_error(self.model, x, wanted + offset)
+        return _twice(steady, self._length(x - offset - wanted)), away * away
+
+    def _length(self, deviation: jax.Array) -> jax.Array:
+        """Return the squared length of the measured part of a deviation (n,)."""
+        part = deviation[np.array(self.measured)]
+        return jnp.sum(part * part)
 
     def _tracking(
-        self, states: jax.Array, reference: jax.Array | None
+        self, steady: jax.Array, states: jax.Array, reference: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the squared deviations of the leaders (L,), and of each of their outputs (L, q).
-
-        `states` (L, n) are without the leaders' offsets.
-        """
+        """Return the squared deviations of the leaders (2, L), and of their outputs (L, q)."""
+        leaders, q, dtype = len(self.leaders), len(self.model.output_names), states.dtype
         if reference is None:
-            q = len(self.model.output_names)
-            return jnp.zeros(len(states), states.dtype), jnp.zeros((len(states), q), states.dtype)
-        offsets = jnp.asarray(self.offsets, states.dtype)[self.leaders]
-        # The offset back in: outputs are nonlinear in the state, so each is taken where it holds.
-        wanted = reference[None] + offsets
-        away = jax.vmap(lambda x, r: output_error(self.model, x, r))(states + offsets, wanted)
-        return self._lengths(states - reference[None]), away * away
+            return jnp.zeros((2, leaders), dtype), jnp.zeros((leaders, q), dtype)
+        offsets = jnp.asarray(self.offsets, dtype)[self.leaders]
+        off, outputs = jax.vmap(lambda x, o: self.of_leader(steady, x, o, reference))(
+            states, offsets
+        )
+        return off.T, outputs
 
     def _spacing(self, states: States) -> jax.Array:
         """Return the squared errors of the distances along the edges, (E,)."""
         i, j = self.edges.T
-        distance = jnp.sqrt(self._lengths(states[i] - states[j]))
+        distance = jnp.sqrt(jax.vmap(self._length)(states[i] - states[j]))
         return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
 
 

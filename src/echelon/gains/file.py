@@ -166,7 +166,7 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
         _check_graph(path, stored["graph"], graph)
         gain = _gain(stored)
     # What a hand has changed in the file fails somewhere in here, in one of these ways.
-    except (LookupError, TypeError, ValueError) as error:
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
     check_strength(gain.coupling * graph.spectrum().high, linearize(model), gain.P, gain.R)
     return gain
@@ -174,7 +174,7 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
 
 def _read(path: PathLike) -> Mapping[str, Any]:
     try:
-        stored = json.loads(Path(path).read_text("utf-8"))
+        stored = json.loads(Path(path).read_text("utf-8"), object_pairs_hook=_mapping)
     except OSError as error:
         raise GainError(f"the gain file `{path}` cannot be read: {error.strerror}.") from error
     except ValueError as error:
@@ -190,19 +190,52 @@ def _read(path: PathLike) -> Mapping[str, Any]:
     return stored
 
 
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping; of two equal keys one reader takes the first and another the last."""
+    told = dict(pairs)
+    if len(told) < len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"`{next(k for k in names if names.count(k) > 1)}` stands there twice")
+    return told
+
+
 def _gain(stored: Mapping[str, Any]) -> Gain:
     # `Gain` and `Certificate` take no words of the file on trust: names become members here.
     inner, certificate = stored["inner"], stored["certificate"]
     region = None if certificate["region"] is None else _region(certificate["region"])
-    parts = {**certificate, "kind": Kind.named(certificate["kind"]), "region": region}
+    numbers = {
+        name: _number(certificate, name) for name in ("lambda_min", "lambda_max", "abscissa")
+    }
+    counts = {name: _count(certificate, name) for name in ("modes", "observable")}
+    edge = None if certificate["edge"] is None else _number(certificate, "edge")
     return Gain(
         np.array(stored["P"], float),
         np.array(stored["R"], float),
-        float(stored["coupling"]),
+        _number(stored, "coupling"),
         str(stored["method"]),
-        Certificate(**parts),
+        Certificate(
+            kind=Kind.named(certificate["kind"]), edge=edge, region=region, **numbers, **counts
+        ),
         inner=None if inner is None else np.array(inner, float),
     )
+
+
+def _number(stored: Mapping[str, Any], name: str) -> float:
+    value = stored[name]
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not np.isfinite(float(value))
+    ):
+        raise ValueError(f"`{name}` is {value!r}, and must be a finite number")
+    return float(value)
+
+
+def _count(stored: Mapping[str, Any], name: str) -> int:
+    value = stored[name]
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"`{name}` is {value!r}, and must be a whole number")
+    return value
 
 
 def _region(stored: Mapping[str, Any]) -> RegionCertificate:
@@ -211,11 +244,11 @@ def _region(stored: Mapping[str, Any]) -> RegionCertificate:
     ]
     return RegionCertificate(
         kind=Kind.named(stored["kind"]),
-        rate=stored["rate"],
+        rate=_number(stored, "rate"),
         theorem=Theorem.named(stored["theorem"]),
         domain=Domain(*(np.array(some, float) for some in bounds)),
-        radius=stored["radius"],
-        strength=stored["strength"],
+        radius=None if stored["radius"] is None else _number(stored, "radius"),
+        strength=_number(stored, "strength"),
         hull=_unpack(stored["hull"]),
         error=np.array(stored["error"], float),
     )

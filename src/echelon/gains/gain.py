@@ -193,9 +193,10 @@ def check_strength(strength: float, linear: Linearization, P: Array, R: Array) -
         # Norms square P B R^-1 B'P.
         known = np.isfinite((P @ fed_back) ** 2).all()
     if not known:
+        size = f"{strength:.3g}" if strength < np.inf else "beyond all numbers"
         raise GainError(
             f"the feedback is too strong to compute with: the coupling times the graph's largest "
-            f"eigenvalue is {strength:.3g}, P goes up to {np.abs(P).max():.3g}; make `coupling`, "
+            f"eigenvalue is {size}, P goes up to {np.abs(P).max():.3g}; make `coupling`, "
             "the edges' weights or P smaller."
         )
 

@@ -58,7 +58,9 @@ class InnerLoop(Method):
         K = self._feedback(model, linear, fixed)
         P = _monotone(model, linear.with_inner(K).A, fixed, self._weights(model, len(fixed)))
         # P A + A'P <= 0 without any feedback, so that every coupling keeps it: rho is 0.
-        return Feedback(P, np.eye(len(model.input_names)), rho=0.0, inner=K)
+        # Any R keeps that too; it bounds how fast an input answers where the agent is turned.
+        R = np.diag(model.symmetry_inputs or np.ones(len(model.input_names)))
+        return Feedback(P, R, rho=0.0, inner=K)
 
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
         """Return K (m, n), zero in the columns of the symmetric states."""

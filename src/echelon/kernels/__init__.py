@@ -1,6 +1,7 @@
 """Code for this machine: from a trace to scalars, to vectors, to the loops about them."""
 
-from echelon.kernels.drivers import SLOTS, Body, Plan, program, stride
+from echelon.kernels.drivers import program
+from echelon.kernels.frame import SLOTS, Body, Plan, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
 from echelon.kernels.native import Code, aligned, is_installed
 from echelon.kernels.scalar import Graph, Node

@@ -1,121 +1,35 @@
 """Elementary functions as operations of a graph, so that no library's code runs lane by lane.
 
-Polynomials are Taylor's, made shorter by Chebyshev's: the highest power is replaced by the
-combination of lower ones that is nearest to it on the interval, which costs 2^(1-2k) of it for
-degree k. Arguments are brought to the interval by the function's own symmetries. What each is off
-by is measured in the tests, in units of the last place.
+Arguments are brought to a short interval by the function's own symmetries, where a polynomial does
+the rest. What each is off by is measured in the tests, in units of the last place.
 """
 
-import functools
 import math
-from collections.abc import Callable, Sequence
 from fractions import Fraction
 
-import numpy as np
-
+from echelon.kernels.polynomials import (
+    EPS,
+    LN2,
+    PI,
+    arctangent_series,
+    cosine_series,
+    economized,
+    error_function_fits,
+    even_series,
+    logarithm_series,
+    odd_series,
+    parts_of,
+    polynomial,
+    sine_series,
+)
 from echelon.kernels.scalar import Node
-
-_EPS = {64: 2.0**-53, 32: 2.0**-24}
-_PARTS = {64: (33, 53), 32: (11, 11, 24)}
-"""Bits of the parts of pi/2 and ln 2: products with whole numbers of 20 or 13 bits are exact."""
-
-
-# ---- polynomials ---------------------------------------------------------------------------------
-
-
-def _shifted_chebyshev(degree: int, width: Fraction) -> list[Fraction]:
-    """Return the coefficients of T_k(2 s / width - 1), lowest first."""
-    before, now = [Fraction(1)], [Fraction(-1), 2 / width]
-    for _ in range(degree - 1):
-        # T_k+1 = 2 y T_k - T_k-1 with y = 2 s / width - 1.
-        up = [Fraction(0), *(4 / width * c for c in now)]
-        same = [-2 * c for c in now] + [Fraction(0)]
-        old = [*before, *[Fraction(0)] * (len(up) - len(before))]
-        before, now = now, [a + b - c for a, b, c in zip(up, same, old, strict=True)]
-    return now if degree else before
-
-
-@functools.cache
-def _economized(series: Callable[[int], Fraction], width: float, tolerance: float) -> list[float]:
-    """Return coefficients, lowest first, off by less than a tolerance for s in [0, width].
-
-    `series(k)` is Taylor's coefficient of s^k.
-    """
-    end, rest, count = Fraction(width), Fraction(tolerance), 1
-    while abs(series(count)) * end**count > rest / 8:
-        count += 1
-    coefficients = [series(k) for k in range(count + 1)]
-    while len(coefficients) > 2:
-        # Of all polynomials with this highest coefficient, Chebyshev's is least.
-        chebyshev = _shifted_chebyshev(len(coefficients) - 1, end)
-        share = coefficients[-1] / chebyshev[-1]
-        if abs(share) > rest / 2:
-            break
-        rest -= abs(share)
-        pairs = zip(coefficients[:-1], chebyshev[:-1], strict=True)
-        coefficients = [c - share * t for c, t in pairs]
-    return [float(c) for c in coefficients]
-
-
-def polynomial(s: Node, coefficients: Sequence[float]) -> Node:
-    """Return sum_k c_k s^k, by Horner's rule."""
-    result = s.graph.constant(coefficients[-1])
-    for c in coefficients[-2::-1]:
-        result = result * s + c
-    return result
-
-
-def _parts(value: Fraction, bits: int) -> list[float]:
-    """Return numbers that add up to a value, the first ones with few bits."""
-    parts, rest = list[float](), value
-    for width in _PARTS[bits]:
-        scale = Fraction(2) ** (width - math.frexp(float(rest))[1])
-        part = Fraction(round(rest * scale)) / scale
-        parts.append(float(part))
-        rest -= part
-    return parts
-
-
-# pi by Machin's formula and ln 2 by its own series, to 200 bits.
-def _arctan_inverse(x: int) -> Fraction:
-    return sum((Fraction((-1) ** k, (2 * k + 1) * x ** (2 * k + 1)) for k in range(50)), Fraction())
-
-
-_PI = 4 * (4 * _arctan_inverse(5) - _arctan_inverse(239))
-_LN2 = sum((Fraction(2, (2 * k + 1) * 3 ** (2 * k + 1)) for k in range(70)), Fraction())
 
 
 def _reduce(x: Node, k: Node, period: Fraction) -> Node:
     """Return x - k period."""
-    for part in _parts(period, x.graph.bits):
+    for part in parts_of(period, x.graph.bits):
         x = x - k * part
     return x
-
-
-# Taylor's coefficients of s^k, s the square of the argument, of what is left of a function when its
-# first terms are taken off.
-def _sine_series(k: int) -> Fraction:
-    return Fraction((-1) ** (k + 1), math.factorial(2 * k + 3))
-
-
-def _cosine_series(k: int) -> Fraction:
-    return Fraction((-1) ** k, math.factorial(2 * k + 4))
-
-
-def _even_series(k: int) -> Fraction:
-    return Fraction(1, math.factorial(2 * k + 2))
-
-
-def _odd_series(k: int) -> Fraction:
-    return Fraction(1, math.factorial(2 * k + 3))
-
-
-def _arctangent_series(k: int) -> Fraction:
-    return Fraction((-1) ** (k + 1), 2 * k + 3)
-
-
-def _logarithm_series(k: int) -> Fraction:
-    return Fraction(2, 2 * k + 3)
 
 
 # ---- choices -------------------------------------------------------------------------------------
@@ -145,14 +59,14 @@ def signed(x: Node, like: Node) -> Node:
 
 def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
     """Return both; the graph keeps what they share once."""
-    g, eps = x.graph, _EPS[x.graph.bits]
+    g, eps = x.graph, EPS[x.graph.bits]
     # Adding 1.5 2^52 leaves the whole number nearest to x / (pi / 2) in the last bits.
     magic = 1.5 * 2.0 ** (52 if g.bits == 64 else 23)
     shifted = x * (2.0 / math.pi) + magic
-    r = _reduce(x, g.make("apart", shifted, magic), _PI / 2)
+    r = _reduce(x, g.make("apart", shifted, magic), PI / 2)
     s, width = r * r, 0.62  # (pi / 4)^2 is 0.617
-    sine = r + r * s * polynomial(s, _economized(_sine_series, width, eps))
-    cosine = polynomial(s, _economized(_cosine_series, width, eps))
+    sine = r + r * s * polynomial(s, economized(sine_series, width, eps))
+    cosine = polynomial(s, economized(cosine_series, width, eps))
     cosine = (1.0 - 0.5 * s) + s * s * cosine
     # The quarter of the circle, 0 to 3, in two bits.
     odd, lower = g.make("bit0", shifted), g.make("bit1", shifted)
@@ -178,11 +92,11 @@ def tan(x: Node) -> Node:
 
 def _scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
     """Return e^r - 1 and two factors 2^k whose product it is to be scaled by, x = r + k ln 2."""
-    g, eps = x.graph, _EPS[x.graph.bits]
+    g, eps = x.graph, EPS[x.graph.bits]
     low, high = (-746.0, 710.0) if g.bits == 64 else (-105.0, 90.0)
     x = g.make("min", g.make("max", x, low), high)
-    k = g.make("rint", x * float(1 / _LN2))
-    r = _reduce(x, k, _LN2)
+    k = g.make("rint", x * float(1 / LN2))
+    r = _reduce(x, k, LN2)
     grown = r + r * r * _both_signs(r, eps)
     # In two factors, since 2^k alone may be no number where the result is one.
     half = g.make("floor", 0.5 * k)
@@ -192,8 +106,8 @@ def _scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
 def _both_signs(r: Node, eps: float) -> Node:
     """Return (e^r - 1 - r) / r^2 for |r| <= 0.35, even and odd powers apart."""
     s = r * r
-    even = polynomial(s, _economized(_even_series, 0.123, eps))
-    odd = polynomial(s, _economized(_odd_series, 0.123, eps))
+    even = polynomial(s, economized(even_series, 0.123, eps))
+    odd = polynomial(s, economized(odd_series, 0.123, eps))
     return even + r * odd
 
 
@@ -224,9 +138,9 @@ def log(x: Node) -> Node:
     # ln(1 + f) = f - (f^2/2 - s (f^2/2 + R)) with s = f / (2 + f), 2 artanh s = 2 s + s R.
     s = f / (f + 2.0)
     square = s * s
-    R = square * polynomial(square, _economized(_logarithm_series, 0.0295, _EPS[bits]))
+    R = square * polynomial(square, economized(logarithm_series, 0.0295, EPS[bits]))
     half = 0.5 * f * f
-    high, *rest = _parts(_LN2, bits)
+    high, *rest = parts_of(LN2, bits)
     result = e * high - ((half - (s * (half + R) + e * sum(rest))) - f)
     result = choose(g.make("eq", x, math.inf), math.inf, result)
     result = choose(g.make("eq", x, 0.0), -math.inf, result)
@@ -304,10 +218,10 @@ def atan2(y: Node, x: Node) -> Node:
     t = choose(far, (ratio - 1.0) / (ratio + 1.0), ratio)
     s = t * t
     width = math.tan(math.pi / 8) ** 2
-    series = _economized(_arctangent_series, width, _EPS[g.bits])
+    series = economized(arctangent_series, width, EPS[g.bits])
     angle = t + t * s * polynomial(s, series)
     angle = choose(far, math.pi / 4 + angle, angle)
-    rest = float(_PI / 2 - Fraction(math.pi / 2))
+    rest = float(PI / 2 - Fraction(math.pi / 2))
     angle = choose(_less(b, a), math.pi / 2 - (angle - rest), angle)
     behind = _less(signed(g.constant(1.0), x), g.constant(0.0))
     return signed(choose(behind, math.pi - (angle - 2.0 * rest), angle), y)
@@ -369,28 +283,9 @@ def power(x: Node, y: Node) -> Node:
     return choose(one, 1.0, result)
 
 
-@functools.cache
-def _error_function_fits() -> tuple[list[float], list[float]]:
-    """Return fits of erf(x) / x in x^2 for |x| <= 1, and of e^(x^2) erfc(x) for 1 <= x <= 6.5.
-
-    The second is a polynomial in (x - 3) / (x + 3), which is nearly that of a straight line.
-    """
-    from scipy.special import erf, erfcx
-
-    nodes = np.cos(np.pi * (np.arange(200) + 0.5) / 200)
-    square = 0.5 * (nodes + 1.0)
-    root = np.sqrt(square)
-    near = np.polynomial.Chebyshev.fit(square, erf(root) / root, 12, domain=[0.0, 1.0])
-    first, last = (1.0 - 3.0) / (1.0 + 3.0), (6.5 - 3.0) / (6.5 + 3.0)
-    t = 0.5 * (last - first) * (nodes + 1.0) + first
-    far = np.polynomial.Chebyshev.fit(t, erfcx(3.0 * (1.0 + t) / (1.0 - t)), 22, [first, last])
-    power = np.polynomial.Polynomial
-    return near.convert(kind=power).coef.tolist(), far.convert(kind=power).coef.tolist()
-
-
 def erf(x: Node) -> Node:
     """Return the error function of x."""
-    near, far = _error_function_fits()
+    near, far = error_function_fits()
     a = x.graph.make("min", size(x), 6.5)
     inner = a * polynomial(a * a, near)
     outer = 1.0 - exp(-(a * a)) * polynomial((a - 3.0) / (a + 3.0), far)

@@ -98,7 +98,7 @@ def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
 
     parts = [text, features(), binding.get_host_cpu_name(), llvmlite.__version__]
     parts += [platform.system(), platform.machine()]
-    return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}.kernel"
+    return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
 
 
 def _read(file: Path) -> bytes | None:

@@ -112,6 +112,9 @@ class ControlAffine(eqx.Module):
     symmetry_weights: ClassVar[tuple[float, ...] | None] = None
     """Weights of the symmetric states in the P that goes with `damping`, one each."""
 
+    symmetry_inputs: ClassVar[tuple[float, ...] | None] = None
+    """Weights R of the normalized inputs in the law above `damping`, one each; ones without."""
+
     input_limits: ClassVar[Limits | None] = None
     """The inputs that actuators deliver, low <= G u <= high; None where nothing limits them.
 

@@ -106,7 +106,10 @@ class Quadrotor(ControlAffine):
         "rate": ("p", "q", "r"),
     }
     # By simulation: weights of 1 make a rate of 0.008 1/s, and with 700 a line of 10 is lost.
-    symmetry_weights = (500.0, 500.0, 50.0)
+    symmetry_weights = (500.0, 500.0, 100.0)
+    # A tilt turns the thrust into the direction that weighs 500: with a weight of 1 for it the
+    # fastest mode goes from 143 1/s at hover to 706 1/s at 30 degrees.
+    symmetry_inputs = (4.0, 1.0, 1.0, 1.0)
     # One over the square of what counts as much: 1 m, 2 m/s, 0.7 rad, 5 rad/s; 5 m/s^2, 20 rad/s^2.
     weights = ((1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3, (1 / 25,) + (1 / 400,) * 3)
 

@@ -21,11 +21,13 @@ class CertifiedSet(NamedTuple):
         radius: 0 where the set is empty, infinite where the domain bounds nothing.
         kind: of the argument; samples where the leader's excursion is read off a run of its own.
         why: what limits the radius, or why there is none.
+        remedy: what would make one; empty where there is one.
     """
 
     radius: float
     kind: Kind
     why: str
+    remedy: str = ""
 
 
 def certified_set(
@@ -41,17 +43,18 @@ def certified_set(
         return None
     kind, free = region.kind, region.theorem is Theorem.A5
     if free and not leaders.rest and not _constant(parts, region):
-        text = "g varies, and a leader that moves then adds to V; needs a constant g"
-        return CertifiedSet(0.0, kind, text)
+        text = "g varies, and a leader that moves then adds to V"
+        return CertifiedSet(0.0, kind, text, "use a model whose g is constant")
     trim = np.asarray(parts.model.trim[0], float)
     if leaders.rest and (leaders.starts == trim).all():
         return _less(parts, region, kind, np.zeros(len(trim)))
     if leaders.answer:
-        text = "the leader reacts, so its excursion is not its own; `reacts: false`"
-        return CertifiedSet(0.0, kind, text)
+        text = "the leader reacts, so its excursion is not its own"
+        return CertifiedSet(0.0, kind, text, "set `leader.reacts: false`")
     paths = own_paths(parts, settings, leaders.starts)
     if paths is None:
-        return CertifiedSet(0.0, kind, "the leader alone diverges; see Assumption 4")
+        text = "the leader alone diverges"
+        return CertifiedSet(0.0, kind, text, "give `leader.gain` another method")
     return _less(parts, region, Kind.SAMPLES, excursion(parts, paths))
 
 
@@ -66,7 +69,7 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     name, wide = model.state_names[j], margins[j]
     if radii[j] == 0.0:
         text = f"the leader alone reaches {away[j]:.3g} in `{name}`, and the domain {wide:.3g}"
-        return CertifiedSet(0.0, kind, f"{text}; widen the domain, or slow the reference")
+        return CertifiedSet(0.0, kind, text, "widen the domain, or slow the reference")
     shrink = 1.0
     if region.theorem is Theorem.A5 and not _constant(parts, region):
         shrink = np.sqrt(parts.graph.spectrum().proved / parts.graph.spectrum().high)
@@ -101,7 +104,7 @@ def set_lines(
         ]
     size, radius, text, remedy = size_of(parts, states), found.radius, "", ""
     shown, holds = f"radius {radius:.3g}" if radius else "empty", Verdict.of(radius > 0.0)
-    line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why)
+    line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why, found.remedy)
     text, holds = "from there no follower leaves the domain", Verdict.of(size <= radius)
     if not size <= radius:
         text, remedy = "what the set promises does not reach them", "start nearer to the goals"

@@ -28,13 +28,15 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
         return
     what = "proof" if promise.kind is Kind.PROOF else "promise on the domain"
     left, limited = first_exit(result, promise), float(result.saturated.max())
-    against = promise.without
+    against, remedy = promise.without, "leave it out to see what it costs"
     if left is not None:
         against = f"agent {left.agent} left the domain at {left.time:.4g} s (`{left.name}`)"
+        remedy = "widen the `domain`, start nearer to the goals, or slow the reference"
     elif limited:
         against = f"a limit acted on an agent in {100.0 * limited:.3g} % of the steps"
+        remedy = "start nearer to the goals, or slow the reference"
     if against:
-        yield f"The {what} does not cover this run: {against}."
+        yield f"The {what} does not cover this run: {against}; {remedy}."
     else:
         yield f"The {what} covers this run: {_stayed(promise)}."
 

@@ -5,69 +5,28 @@ left of one, or why.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import offsets_are_symmetries
-from echelon.certificates.margins import detectability
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
-from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.core.words import Kind, Verdict
 from echelon.engine.drive import Drive
-from echelon.engine.laws import Laws
-from echelon.engine.parts import Parts
-from echelon.engine.settings import Settings
 from echelon.laws.law import Law
 from echelon.models.check import at_limits, is_limited, trim_shortfall
 from echelon.models.linearization import at_trim
 from echelon.models.model import ControlAffine
-from echelon.promises.closed_loop import Loop
-from echelon.promises.leaders import Leaders, apart
+from echelon.promises.case import Case
+from echelon.promises.leaders import apart
+from echelon.promises.modes import modes
 from echelon.promises.statement import Hypothesis, Statement
 
 _LINEAR = Kind.LINEARIZATION
-
-
-class Case(NamedTuple):
-    """What runs, prepared, its loop near the trim, its leaders, and the domain of a region."""
-
-    parts: Parts
-    settings: Settings
-    loop: Loop
-    leaders: Leaders
-    domain: Domain | None = None
-
-    @property
-    def governed(self) -> bool:
-        """Whether the followers run a law that a theorem speaks of, u = u_ff - c R^-1 g'P z."""
-        return self.parts.drive.metric(self.parts.model) is not None
-
-    @property
-    def fed_by_parents(self) -> bool:
-        """Whether each follower is sent the input of its parent."""
-        return self.parts.drive.feedforward is Feedforward.PARENT
-
-    @property
-    def matched(self) -> bool:
-        """Whether the followers are sent an input, or the leader has none beyond the trim."""
-        sent = self.parts.drive.feedforward is not Feedforward.NONE
-        return sent or self.leaders.rest or self.leaders.alike
-
-    @property
-    def disturbed(self) -> str:
-        """What acts that no promise covers, in words; empty without any."""
-        world = self.parts.world
-        found = {
-            "wind or noise acts on the agents": world.disturbance,
-            "the agents differ from the model": world.plant,
-        }
-        return " and ".join(text for text, what in found.items() if what is not None)
 
 
 def hypotheses(case: Case) -> Iterator[Statement]:
@@ -78,11 +37,8 @@ def hypotheses(case: Case) -> Iterator[Statement]:
     yield _agreement(case)
     yield _symmetric(case)
     yield _smooth(case)
-    yield _detectable(case)
     yield _matched(case)
-    yield _coupled(case)
-    yield _decaying(case)
-    yield _held(case)
+    yield from modes(case)
 
 
 # ---- the agents and their leaders ---------------------------------------------------------------
@@ -154,11 +110,12 @@ def _no_room(name: Hypothesis, held: Sequence[str]) -> Statement:
 
 def _exact(case: Case) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
-    text = "states are known exactly, and nothing disturbs the agents"
+    text, remedy = "states are known exactly, and nothing disturbs the agents", ""
     if case.disturbed:
+        remedy = "leave it out to see what it costs"
         text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
     verdict = Verdict.of(not case.disturbed)
-    return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text)
+    return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text, remedy=remedy)
 
 
 def _agreement(case: Case) -> Statement:
@@ -235,31 +192,12 @@ def _smooth(case: Case) -> Statement:
         return Statement(name, Verdict.HOLDS, Kind.SAMPLES, text=text)
     entry, variable = (parts.model.state_names[k] for k in np.argwhere(bends)[0])
     text = f"the rate of `{entry}` bends or jumps with `{variable}` at the trim"
-    remedy, reason = "", ""
-    if case.domain is None:
+    remedy, reason = "what holds of all its sides is said", ""
+    if case.region is None or case.region.kind is Kind.SAMPLES:
         remedy = "use `robust-lqr` or `contraction`, whose hull holds the slopes of both sides"
         reason = f"{text}, where nothing linear holds"
     verdict = Verdict.FAILS
     return Statement(name, verdict, Kind.SAMPLES, None, "", text, remedy, reason)
-
-
-# ---- the law near the trim ----------------------------------------------------------------------
-
-
-def _detectable(case: Case) -> Statement:
-    model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
-    if not case.governed:
-        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, text="there is no P")
-    rank, n = loop.certificate.observable, len(model.state_names)
-    hidden = detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
-    names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
-    along = ", ".join(f"`{model.state_names[k]}`" for k in names)
-    text, remedy = "z = 0 is reached", ""
-    if hidden:
-        text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} "
-        text, remedy = f"{text}it does not decay by itself", "choose another P"
-    verdict = Verdict.of(not hidden)
-    return Statement(name, verdict, _LINEAR, rank, f"rank {rank} of {n}", text, remedy)
 
 
 def _matched(case: Case) -> Statement:
@@ -279,63 +217,3 @@ def _matched(case: Case) -> Statement:
             text = reason = f"{text}nothing is known of that loop"
     verdict = Verdict.of(case.matched)
     return Statement(name, verdict, Kind.PROOF, None, "", text, remedy, reason)
-
-
-def _coupled(case: Case) -> Statement:
-    edge, c = case.loop.certificate.edge, case.loop.closed.coupling
-    if edge is None:
-        text = "no edge known"
-        return Statement(Hypothesis.COUPLED, Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
-    fine, shown = c >= edge, f"c {c:.4g}, edge {edge:.4g}"
-    text, remedy = (
-        "from the edge on every mode decays: near the trim, of linear agents anywhere",
-        "",
-    )
-    if not fine:
-        text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
-        remedy = f"raise `coupling` to {edge:.4g} or more"
-    return Statement(Hypothesis.COUPLED, Verdict.of(fine), Kind.PROOF, c, shown, text, remedy)
-
-
-def _decaying(case: Case) -> Statement:
-    """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    name, loop, remedy, reason = Hypothesis.DECAYS, case.loop, "", ""
-    if not case.governed:
-        law = isinstance(case.parts.drive, Laws)
-        text = "the followers' law does not act on the disagreement"
-        text = text if law else f"no theorem is known of `{type(case.parts.drive).__name__}`"
-        remedy = "use `consensus`" if law else ""
-        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
-    text = f"over {loop.certificate.modes} eigenvalues of the graph"
-    if case.fed_by_parents:
-        text = "over the edges' weights, as parents' inputs are fed forward"
-    elif len(loop.closed.eigenvalues) > loop.certificate.modes:
-        text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
-    if not loop.every:
-        remedy = "raise `coupling`, or use `riccati` or `inner-loop`"
-        reason = "the disagreement does not decay"
-    verdict, shown = Verdict.of(loop.every), f"{loop.slowest:.3g} 1/s"
-    return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)
-
-
-def _held(case: Case) -> Statement:
-    """Whether it still decays in steps of the integrator that runs, with the input held."""
-    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
-    shown = f"dt {settings.dt:g} s"
-    if not (loop.every and case.governed):
-        text = "there is nothing to lose"
-        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, None, shown, text)
-    radius, printed = loop.radius(settings), settings.integrator == "printed"
-    text, remedy, reason = f"spectral radius {radius:.4g} a step, {loop.where}", "", ""
-    goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
-    if printed and goals.any():
-        radius, text = np.inf, "`printed` takes f + g u for the state, and so forgets the goals"
-    if not radius < 1.0:
-        remedy = "use `simulation.integrator: rk4`"
-        if not printed:
-            longest = loop.longest_step(settings)
-            remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
-        text = f"the step `dt` = {settings.dt:g} s is too long for this gain: {text}"
-        reason = "with the input held over the step `dt` it grows"
-    verdict = Verdict.of(radius < 1.0)
-    return Statement(name, verdict, _LINEAR, float(radius), shown, text, remedy, reason)

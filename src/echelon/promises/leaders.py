@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import Outcome
 from echelon.core.types import Array, States
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
@@ -103,7 +102,7 @@ def own_paths(parts: Parts, settings: Settings, starts: Array) -> Array | None:
     alone = Parts(parts.model, graph, goals, parts.drive.with_follower(TrimInput()), initial=states)
     every = 1 + settings.steps // _FRAMES
     result = simulate(alone, settings._replace(store_every=every, precision="float64"))
-    return result.states[:, :count] if result.outcome is Outcome.COMPLETED else None
+    return result.states[:, :count] if result.outcome.reached else None
 
 
 class Apart(NamedTuple):

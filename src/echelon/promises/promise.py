@@ -13,17 +13,20 @@ from weakref import WeakKeyDictionary
 
 from echelon.certificates.certificate import RegionCertificate
 from echelon.core.numerics import precision
-from echelon.core.words import Kind, Theorem
+from echelon.core.words import Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.settings import Settings
+from echelon.models.linearization import at_trim
+from echelon.promises.case import Case
 from echelon.promises.certified_set import CertifiedSet, certified_set, set_lines
 from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
-from echelon.promises.hypotheses import Case, hypotheses
+from echelon.promises.hypotheses import hypotheses
 from echelon.promises.leaders import leaders_of
-from echelon.promises.region import region_of, weaken
-from echelon.promises.statement import Hypothesis, Statement
+from echelon.promises.path import Frozen, frozen_of, longest_step
+from echelon.promises.region import region_of, slopes_beside, weaken
+from echelon.promises.statement import Cause, Hypothesis, Statement
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -42,6 +45,7 @@ class Promise:
         condition: on the leader, in words; empty where there is none.
         without: what acts on the agents that is left out, in words; empty without any.
         own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
+        frozen: the laws away from the trim; None where they are not looked at.
     """
 
     loop: Loop
@@ -52,6 +56,12 @@ class Promise:
     condition: str
     without: str
     own: float | None
+    frozen: Frozen | None
+
+    @property
+    def linear(self) -> bool:
+        """Whether the model has a linearization at its trim, and so modes."""
+        return not self.hypotheses[Hypothesis.SMOOTH].fails
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -89,35 +99,58 @@ class Promise:
     @property
     def edge(self) -> float | None:
         """The coupling from which on every mode is proved to decay; None where none is known."""
-        return self.loop.certificate.edge
+        return self.loop.certificate.edge if self.linear else None
 
     @property
-    def causes(self) -> tuple[Statement, ...]:
+    def slowest(self) -> float | None:
+        """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
+        return self.loop.slowest if self.linear else None
+
+    @property
+    def decays(self) -> bool:
+        """Whether errors that are small enough are known to shrink, in continuous time."""
+        return self.hypotheses[Hypothesis.DECAYS].verdict is Verdict.HOLDS
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
+        return longest_step(self.loop, self.frozen, settings)
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
         """The hypotheses whose failure explains why errors do not shrink.
 
         A mode that does not decay is explained by what the law cannot feel, or a weak coupling.
         """
         failed = {name: each for name, each in self.hypotheses.items() if each.fails}
         grows = Hypothesis.DECAYS in failed
-        why = tuple(failed[name] for name in _BEHIND_GROWTH if grows and name in failed)
+        why = tuple(failed[name].cause for name in _BEHIND_GROWTH if grows and name in failed)
         rest = (each for name, each in failed.items() if each.reason and name not in _BEHIND_GROWTH)
-        return (*why, *(e for e in rest if not why or e.statement is not Hypothesis.DECAYS))
+        rest = (x for x in rest if not why or x.statement is not Hypothesis.DECAYS)
+        return (*why, *(each.cause for each in rest))
 
     def sentence(self) -> str:
         """Return what is promised, in sentences, and no more than that."""
         told = self._promised() if self.promised else None
-        told = told or f"Nothing is promised: {'; '.join(self.reasons)}."
+        told = told or f"Nothing is promised: {'; '.join(self.reasons)}. {self._help()}"
         claims = self.hypotheses[Hypothesis.CLAIMS]
         return f"{told} Note: {claims.explanation}." if claims.fails else told
 
+    def _help(self) -> str:
+        """Return what would help against all that stands against a promise."""
+        against = (each for each in self.hypotheses.values() if each.fails and each.reason)
+        return f"What would help: {'; '.join(dict.fromkeys(x.remedy for x in against))}."
+
     def _promised(self) -> str:
-        local = (
-            "Promised, by linearization: followers that start near enough to their goals, with the "
-            f"leader near enough to the trim, converge to them{self.condition}"
-        )
-        text = f"{local}; no region is proved."
-        if self.region is not None:
-            text = f"{local}. {self._regional(self.region)}"
+        region = self.region
+        if self.linear:
+            text = "by linearization: followers that start near enough to their goals, with the "
+            text += f"leader near enough to the trim, converge to them{self.condition}"
+            text += "; no region is proved" if region is None else ""
+        else:
+            text = "on a domain alone, with the slopes of all sides of the trim: the model bends "
+            text += "there, and has no linearization"
+        text = f"Promised, {text}."
+        text = text if region is None else f"{text} {self._regional(region)}"
         without = f" This is said without what the scenario adds: {self.without}."
         return text + without if self.without else text
 
@@ -131,7 +164,7 @@ class Promise:
             return f"{by}: {text} ({theorem})."
         if not found.radius:
             text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
-            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}."
+            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}; {found.remedy}."
         read = "" if found.kind is self.kind else ", the leader going as in a run of its own"
         start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
         start = "everywhere" if found.radius == float("inf") else start
@@ -148,9 +181,9 @@ class Promise:
             "theorem": None if theorem is None else str(theorem),
             "kind": str(self.kind),
             "rate": self.rate,
-            "slowest_mode": self.loop.slowest,
+            "slowest_mode": self.slowest,
             "coupling": self.loop.closed.coupling,
-            "edge": certificate.edge,
+            "edge": self.edge,
             "lambda_min": certificate.lambda_min,
             "lambda_max": certificate.lambda_max,
             "domain": self.domain or None,
@@ -191,8 +224,17 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
     region = region_of(parts, leaders)
-    domain = None if region.certificate is None else region.certificate.domain
-    case = Case(parts, settings, loop, leaders, domain)
+    # What does not decay at the trim has nothing to lose elsewhere.
+    asked = loop.every and parts.drive.metric(parts.model) is not None
+    case = Case(
+        parts,
+        settings,
+        loop,
+        leaders,
+        region.certificate,
+        slopes_beside(parts) if at_trim(parts.model).bends.any() else None,
+        frozen_of(parts, settings, loop, leaders, states) if asked else None,
+    )
     lines = list(hypotheses(case))
     region = weaken(parts, region, lines)
     certificate = region.certificate
@@ -208,4 +250,5 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         condition="" if case.matched else ", once the leader's input rests at its trim",
         without=case.disturbed,
         own=None if leaders.rest else leaders.slowest,
+        frozen=case.frozen,
     )

@@ -15,10 +15,12 @@ from echelon.certificates.jacobians import jacobians
 from echelon.certificates.lmi import falls
 from echelon.certificates.region import Pairs, contracting_region, drift_region, pairs_on
 from echelon.core.errors import GainError
+from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.models.linearization import at_trim, linearize
+from echelon.models.model import ControlAffine
 from echelon.promises.leaders import Leaders
 from echelon.promises.statement import Hypothesis, Statement
 
@@ -71,15 +73,27 @@ def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     """
     text = "the slopes beside the trim, where the model bends, do not all contract in P"
     none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, shown="none", text=text)
-    near = Domain.about(parts.model, dict.fromkeys(parts.model.state_names, _NEAR))
     try:
-        pairs = _with_inner(parts, gain, pairs_on(parts.model, near, gain.R))
+        pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
         found = pairs and _contraction(parts, gain, pairs, exact=False)
     except GainError:
         found = None
     if found is None or found.kind is Kind.SAMPLES or _not_the_law(parts, leaders, found)[0]:
         return Region(None, None, none)
     return Region(found, None, _line(parts, found))
+
+
+def _near(model: ControlAffine) -> Domain:
+    return Domain.about(model, dict.fromkeys(model.state_names, _NEAR))
+
+
+def slopes_beside(parts: Parts) -> Array | None:
+    """Return the drift's slopes on all sides of the trim, (K, n, n); None where none are found."""
+    gain = parts.drive.gain
+    try:
+        return None if gain is None else pairs_on(parts.model, _near(parts.model), gain.R).A
+    except GainError:
+        return None
 
 
 def _with_inner(parts: Parts, gain: Gain, pairs: Pairs) -> Pairs | None:

@@ -1,6 +1,7 @@
 """One statement that was looked at: its verdict, by which kind of argument, and what would help."""
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import Any, NamedTuple, final
 
 from echelon.core.words import Kind, Verdict, Word
 
@@ -18,6 +19,7 @@ class Hypothesis(Word):
     MATCHED = "leader's motion is matched"
     COUPLED = "coupling"
     DECAYS = "disagreement decays"
+    ALONG = "law along the leader's path"
     STEP = "step, input held"
     REGION = "region of the gain"
     SET = "certified set"
@@ -51,8 +53,21 @@ class Line(Word):
     STRING = "string gain"
 
 
-class Statement(NamedTuple):
-    """A hypothesis of a promise, or another line of a check.
+class Cause(NamedTuple):
+    """Why something is not as it should be, and what to do about it; neither is ever empty."""
+
+    text: str
+    remedy: str
+
+    def sentence(self) -> str:
+        """Return both, as a report has them."""
+        return f"Cause: {self.text}; {self.remedy}."
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Statement:
+    """A hypothesis of a promise, or another line of a check; what fails has a remedy.
 
     Attributes:
         statement: its name.
@@ -61,7 +76,7 @@ class Statement(NamedTuple):
         number: behind the verdict; None where there is none.
         shown: the number as a table has it, with its unit.
         text: what was found, in words.
-        remedy: what would be needed; empty where nothing is.
+        remedy: what would be needed; empty where nothing fails.
         reason: what the failure says against any promise; empty where it leaves one.
     """
 
@@ -73,6 +88,15 @@ class Statement(NamedTuple):
     text: str = ""
     remedy: str = ""
     reason: str = ""
+
+    def __post_init__(self) -> None:
+        """Hold that nobody is left with a failure and nothing to do."""
+        assert self.remedy or not self.fails, f"`{self.name}` fails without a remedy"
+
+    @property
+    def cause(self) -> Cause:
+        """What was found and what to do about it, of one that fails."""
+        return Cause(self.text, self.remedy)
 
     @property
     def name(self) -> str:

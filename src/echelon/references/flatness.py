@@ -14,12 +14,24 @@ from echelon.models.model import ControlAffine
 from echelon.references.guide import Guide
 from echelon.references.reference import check_reference
 
+_FEW = 512
+"""Of so many times or fewer all are followed by one program, since compiling is what costs."""
 
-@eqx.filter_jit
+
 def follow_at(
     model: ControlAffine, reference: Guide, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
+    count = len(times)
+    padded = jnp.pad(times, (0, max(0, _FEW - count)), mode="edge")
+    x, u = _follow_all(model, reference, padded)
+    return x[:count], u[:count]
+
+
+@eqx.filter_jit
+def _follow_all(
+    model: ControlAffine, reference: Guide, times: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(lambda t: reference.follow(model, t))(times)
 
 

@@ -10,13 +10,9 @@ from echelon.network.hearing import who_hears_whom
 from echelon.promises.covering import coverage
 from echelon.promises.promise import Promise, promise
 from echelon.promises.statement import Hypothesis
+from echelon.reports.causes import causes, grows, sizes
 from echelon.results.lyapunov import Lyapunov, lyapunov
-from echelon.results.metrics import Metrics, formation_errors
-
-_LAG = 1e-6
-"""A steady error above this, in the result's unit, is told as a lag."""
-_SETTLES = 5.0
-"""Time constants of the slowest mode in which a metre becomes a centimetre: ln 100 = 4.6."""
+from echelon.results.metrics import Metrics
 
 
 def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
@@ -24,6 +20,7 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
     found = promise(result.parts, result.settings)
     return (
         *_story(result, numbers, found),
+        *(each.sentence() for each in causes(result, numbers, found)),
         *_imperfections(result),
         *_promises(result, found),
         *_lyapunov_story(result, found),
@@ -33,72 +30,27 @@ def explain(result: Result, numbers: Metrics) -> tuple[str, ...]:
 def _story(result: Result, numbers: Metrics, found: Promise) -> Iterator[str]:
     """Tell the outcome and how the formation did."""
     yield result.message
-    if result.outcome is Outcome.DIVERGED:
-        yield from _why_growth(result, found)
     if result.outcome is Outcome.DIVERGED or len(result.times) < 2:
         return
-    error = formation_errors(result)[:, list(result.graph.followers)]
-    # A square beyond all floats is infinite, which grows as well.
-    with np.errstate(over="ignore"):
-        first, last = (float(np.sqrt((row**2).mean())) for row in (error[0], error[-1]))
     unit = "" if result.unit == "state" else f" {result.unit}"
-    # Twice, since a last frame may catch an overshoot; and a start on the goals has rounding alone
-    # to grow from.
-    if last > 2.0 * first + 1e-9:
+    if grows(result):
+        first, last = sizes(result)
         yield (
             f"The formation error grows: {first:.3g}{unit} at the start, "
             f"{last:.4g}{unit} at {result.times[-1]:g} s."
         )
-        yield from _why_growth(result, found)
         return
-    yield from _settling(result, numbers, found, unit)
-    yield from _lag(result, numbers, found, unit)
-
-
-def _why_growth(result: Result, found: Promise) -> Iterator[str]:
-    """Name the causes among what a promise rests on, or what it leaves out."""
-    yield from (f"Cause: {each.explanation}." for each in found.causes)
-    limited = float(result.saturated.max())
-    if found.promised:
-        left = found.without or "the starts were not near enough to the goals"
-        left = f"{left}; a limit acted in {100.0 * limited:.3g} % of the steps" if limited else left
-        yield f"What is promised does not reach this run: {left}."
-
-
-def _settling(result: Result, numbers: Metrics, found: Promise, unit: str) -> Iterator[str]:
-    """Tell how many followers came to their goals, and what keeps the others."""
-    settled = [each.settling_time for each in numbers.followers]
-    known = [time for time in settled if time is not None]
-    if len(known) == len(settled):
+    times = [each.settling_time for each in numbers.followers]
+    known = [time for time in times if time is not None]
+    if len(known) == len(times):
         yield (
-            f"All {len(settled)} followers stay within 0.01{unit} of their goals "
+            f"All {len(times)} followers stay within 0.01{unit} of their goals "
             f"from {max(known):.3g} s on."
         )
-        return
-    yield (
-        f"{len(settled) - len(known)} of {len(settled)} followers have not settled to 0.01{unit} "
-        f"by {result.times[-1]:g} s."
-    )
-    yield from (f"Cause: {each.explanation}." for each in found.causes)
-    slow = -found.loop.slowest
-    if found.promised and result.settings.horizon * slow < _SETTLES:
+    else:
         yield (
-            f"The slowest mode falls to 1/e in {1.0 / slow:.3g} s, and the horizon is "
-            f"{result.settings.horizon:g} s."
-        )
-
-
-def _lag(result: Result, numbers: Metrics, found: Promise, unit: str) -> Iterator[str]:
-    """Tell how far followers stay behind a leader whose input they are not sent."""
-    worst, matched = numbers.worst_steady, found.hypotheses[Hypothesis.MATCHED]
-    if worst is None or worst <= _LAG or not matched.fails or result.reference is None:
-        return
-    # Behind a leader at rest nobody lags; what is left then has another cause.
-    if np.ptp(result.reference, axis=0).max() > 0.0:
-        yield (
-            "Without feed-forward the followers do not know the leader's motion and lag: "
-            f"{worst:.3g}{unit} RMS over the last {numbers.steady_window:.3g} s for the worst. "
-            f"{matched.remedy[:1].upper()}{matched.remedy[1:]}."
+            f"{len(times) - len(known)} of {len(times)} followers have not settled to 0.01{unit} "
+            f"by {result.times[-1]:g} s."
         )
 
 
@@ -114,10 +66,10 @@ def _imperfections(result: Result) -> Iterator[str]:
 def _promises(result: Result, found: Promise) -> Iterator[str]:
     """Say what is promised, whether this run is covered, and what the law needs to be told."""
     yield found.sentence()
-    if result.drive.gain is not None:
+    if result.drive.gain is not None and found.slowest is not None:
         edge = "" if found.edge is None else f"; from {found.edge:.4g} on every mode decays"
         yield (
-            f"Near the trim the slowest mode is {found.loop.slowest:.3g} 1/s at coupling "
+            f"Near the trim the slowest mode is {found.slowest:.3g} 1/s at coupling "
             f"{found.loop.closed.coupling:.4g}{edge}."
         )
     yield from coverage(result, found)
@@ -139,7 +91,7 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
             f"Warning: V rises at {forbidden} of {len(v.value)} stored steps (first at {when:.4g} "
-            "s) although V' <= 0 where they begin; the step `dt` is too long for this gain."
+            "s) although V' <= 0 where they begin; the step `dt` is too long: halve it."
         )
     elif rises:
         excuse = "the disturbance pushes it up"

@@ -7,7 +7,6 @@ import io
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from echelon.core.errors import Outcome
 from echelon.engine.result import Result
 from echelon.reports.explain import explain
 from echelon.reports.printed import PRINTED, ROUNDING, is_papers_experiment
@@ -69,7 +68,7 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
 def _length(result: Result) -> str:
     """Return how long the run was, and how long it should have been where that is not the same."""
     horizon = f"{result.settings.horizon:g} s"
-    if result.outcome is Outcome.COMPLETED:
+    if result.outcome.reached:
         return horizon
     return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
 

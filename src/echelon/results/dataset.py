@@ -134,8 +134,10 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         "lambda_max": spectrum.high,
         "minimum_distance": numbers.minimum_distance,
         "saturation_fraction": numbers.saturation_fraction,
+        "alternations": int(result.chatter.max()),
         "steady_window_s": numbers.steady_window,
         "warnings": list(result.warnings),
+        "engine": result.engine,
         "wall_time_s": result.wall_time,
         "versions": {
             key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")

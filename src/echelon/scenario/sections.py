@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward
+from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -285,6 +285,9 @@ class SimulationSpec(BaseModel, **STRICT):
     """Steps from one stored frame to the next; means are over all steps."""
     precision: Annotated[str, OneOf(("float64", "float32"))] = "float64"
     """Arithmetic of the run; gains and promises are always in float64."""
+    engine: Annotated[str, OneOf(ENGINES)] = "auto"
+    """What steps the agents: `jax`, or `native` code for this machine's vectors, which differs by
+    rounding; `auto` takes that for long runs where it can."""
 
 
 @final

@@ -33,7 +33,10 @@ class Fault(NamedTuple):
     message: str
 
     def __str__(self) -> str:
-        return ": ".join(part for part in self if part)
+        # What the command line sets names its own field.
+        said = self.place.startswith(f"--set {self.field}=")
+        parts = (self.place, "" if said else self.field, self.message)
+        return ": ".join(part for part in parts if part)
 
 
 class Document(NamedTuple):

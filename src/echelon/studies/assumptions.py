@@ -25,6 +25,7 @@ from echelon.studies.finite_condition import finite_condition
 # error takes 30 years to fall to 1/e.
 ZERO = 1e-9
 _HOLDS, _PROOF = Verdict.HOLDS, Kind.PROOF
+_BENT = "the model bends at the trim, and has no linearization there"
 
 
 def graph_lines(parts: Parts) -> Iterator[Statement]:
@@ -53,7 +54,8 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
-    yield Statement(Line.EDGES, Verdict.FAILS, _PROOF, rows, shown, text)
+    remedy = "nothing here rests on it: Lemma 1 serves instead"
+    yield Statement(Line.EDGES, Verdict.FAILS, _PROOF, rows, shown, text, remedy)
 
 
 def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
@@ -65,9 +67,11 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
         yield _reference_line(parts.model, found, settings)
     monotone = _monotone_line(parts, promise)
     yield monotone
-    both = not (promise.hypotheses[Hypothesis.SYMMETRY].fails or monotone.fails)
-    text = "needs Assumption 5 and symmetric offsets"
-    yield Statement(Line.ALONG, Verdict.of(both), Kind.LINEARIZATION, text=text)
+    both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
+    both = both and monotone.verdict is Verdict.HOLDS
+    text, linear = "needs Assumption 5 and symmetric offsets", Kind.LINEARIZATION
+    verdict, remedy = Verdict.of(both), "" if both else "see Assumption 5 and the offsets"
+    yield Statement(Line.ALONG, verdict, linear, text=text, remedy=remedy)
     largest = _printed_lmi(parts, promise)
     shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
     text, remedy = f"{text}block is zero", "use the finite condition"
@@ -80,6 +84,8 @@ def _leader_line(promise: Promise) -> Statement:
     name, slow = Line.TRACKS, promise.own
     if slow is None:
         return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
+    if not promise.linear:
+        return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
     text, remedy = "at the trim", ""
     # So asked that NaN counts as not damped.
     if not slow < -ZERO:
@@ -110,6 +116,9 @@ def _reference_line(model: ControlAffine, found: Asked, settings: Settings) -> S
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
+    name = Line.MONOTONE
+    if not promise.linear:
+        return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
     A, P = promise.loop.linear.A, promise.loop.closed.P
     slope = P @ A + A.T @ P
     worst = float(np.linalg.eigvalsh(slope)[-1])
@@ -125,7 +134,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     elif not holds:
         text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
         remedy += "without"
-    name, verdict, shown = Line.MONOTONE, Verdict.of(holds), f"{worst:.3g}"
+    verdict, shown = Verdict.of(holds), f"{worst:.3g}"
     return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
 
 

@@ -69,7 +69,7 @@ class Design(NamedTuple):
     def stable(self) -> bool:
         """Whether every mode of the disagreement decays."""
         found = self.promise
-        return found is not None and not found.hypotheses[Hypothesis.DECAYS].fails
+        return found is not None and found.decays
 
     def merit(self, dt: float) -> tuple[bool, int, int, float]:
         """Return what stable designs are ranked by, the better the larger.
@@ -255,10 +255,10 @@ def _known(gain: Gain, parts: Parts, settings: Settings, found: Promise) -> Desi
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
     known = Design(gain.method, gain, parts, found, fastest=float(np.abs(poles).max()))
-    if not loop.every:
-        return known
+    if not (loop.every and found.linear):
+        return known if found.linear else known._replace(fastest=None)
     return known._replace(
-        step=loop.longest_step(settings),
+        step=found.longest_step(settings),
         factors=margins.gain_margin(closed),
         delay=margins.delay_margin(closed).delay,
         advice=_advice(gain, parts),

@@ -18,14 +18,23 @@ from echelon.promises.promise import Promise
 from echelon.promises.statement import Hypothesis, Line, Statement
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
+_STIFF = 1e10
+"""Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
 
 
 def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
-    if promise.hypotheses[Hypothesis.DECAYS].fails:
-        text = "there is nothing to lose"
-        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+    if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
+        verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
+        if not promise.linear:
+            verdict, text = Verdict.VACUOUS, "the model bends at the trim, and has no modes there"
+        yield Statement(Line.MARGINS, verdict, _KIND, text=text)
+        return
+    stiffness = margins.stiffness(loop.closed)
+    if stiffness > _STIFF:
+        text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
         return
     low, high = margins.gain_margin(loop.closed)
     shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"

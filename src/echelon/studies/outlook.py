@@ -24,7 +24,8 @@ def outlook(parts: Parts, settings: Settings) -> str:
         EchelonError: a part is malformed or does not fit the others.
     """
     found = promise(parts, settings)
-    grows = any(found.hypotheses[each].fails for each in (Hypothesis.DECAYS, Hypothesis.STEP))
+    # A step that is too long for a moment only has no reason to say so.
+    grows = any(found.hypotheses[each].reason for each in (Hypothesis.DECAYS, Hypothesis.STEP))
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
         return found.sentence()
@@ -35,7 +36,7 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     """Yield the changes of a scenario, cheap to find, with which something is promised."""
     step = promise(parts, settings).hypotheses[Hypothesis.STEP]
     if step.fails:
-        longest = _ROOM * promise(parts, settings).loop.longest_step(settings)
+        longest = _ROOM * promise(parts, settings).longest_step(settings)
         # A whole part of the step keeps the horizon a whole number of steps.
         shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
         if promise(parts, settings._replace(dt=shorter)).promised:

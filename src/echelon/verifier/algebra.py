@@ -48,8 +48,8 @@ def spectrum(graph: SavedGraph, edges: Array) -> Spectrum:
     W = np.zeros((graph.agents, graph.agents))
     np.add.at(W, (np.append(i, j), np.append(j, i)), np.append(weights, weights))
     apart, led = W[np.ix_(kept, kept)], W[np.ix_(kept, graph.leaders)].sum(axis=1)
-    values, vectors = scipy.linalg.eigh(np.diag(apart.sum(axis=1) + led) - apart)
-    values[0], bound = _least(apart, led, np.abs(vectors[:, 0]))
+    values = scipy.linalg.eigvalsh(np.diag(apart.sum(axis=1) + led) - apart)
+    values[0], bound = _least(apart, led)
     return Spectrum(values, bound)
 
 
@@ -58,7 +58,7 @@ def ends_of_many(values: Array) -> Array:
     return values if len(values) <= ALL_MODES else values[[0, -1]]
 
 
-def _least(apart: Array, led: Array, guess: Array) -> tuple[float, float]:
+def _least(apart: Array, led: Array) -> tuple[float, float]:
     """Return the smallest eigenvalue of L = diag(apart 1 + led) - apart, and a lower bound of it.
 
     L^-1 has no negative entry. It is applied by an elimination that only adds, so that no digit is
@@ -68,7 +68,9 @@ def _least(apart: Array, led: Array, guess: Array) -> tuple[float, float]:
     steps = _eliminate(apart, led)
     if steps is None:
         return 0.0, 0.0
-    x, y = guess, guess + 1e-16
+    # Where the next eigenvalue is close, iterations alone would not leave it behind. Small entries
+    # of the guess must be too large: from above, y / x comes down to the eigenvalue at once.
+    x = y = np.abs(scipy.linalg.eigh(_solve(*steps, np.eye(len(led))))[1][:, -1]) + 1e-8
     for _ in range(_ITERATIONS):
         # What is far from the slowest mode dies out, and must not become zero.
         x = np.maximum(y / np.linalg.norm(y), 1e-150)
@@ -95,10 +97,10 @@ def _eliminate(apart: Array, led: Array) -> tuple[Array, Array] | None:
 
 
 def _solve(W: Array, pivots: Array, b: Array) -> Array:
-    """Return L^-1 b, b not negative, by the steps of an elimination."""
+    """Return L^-1 b, b (N,) or (N, K) not negative, by the steps of an elimination."""
     x = b.copy()
     for k in range(len(x)):
-        x[k + 1 :] += W[k + 1 :, k] * (x[k] / pivots[k])
+        x[k + 1 :] += np.multiply.outer(W[k + 1 :, k], x[k] / pivots[k])
     for k in reversed(range(len(x))):
         x[k] = (x[k] + W[k, k + 1 :] @ x[k + 1 :]) / pivots[k]
     return x

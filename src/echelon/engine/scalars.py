@@ -1,0 +1,261 @@
+"""What one agent does in a step, as scalars, and the rows of a block where they lie.
+
+It is traced from the same laws, model, integrator and meter that `loop` runs.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.words import Feedforward
+from echelon.engine.loop import Loop, what_limits_did
+from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes
+from echelon.laws.law import Law, LocalView, Memory
+
+
+class Rows(NamedTuple):
+    """Where the numbers of an agent lie in its block; each a range of rows.
+
+    Attributes:
+        state: x (n,).
+        offset: its goal's (n,).
+        push, noise: what wind adds to its rate (n,), and noise to its input (m,).
+        memory: of its law, one number after the other.
+        cut: to which side limits moved each input in the step before (m,).
+        tell: what it sends besides its state.
+        input: what is delivered to it (m,).
+        errors, tracking, outputs, effort, limited, unsettled, inside, chatter: as in `Sums`.
+        total: how many rows there are.
+    """
+
+    state: range
+    offset: range
+    push: range
+    noise: range
+    memory: range
+    cut: range
+    tell: range
+    input: range
+    errors: range
+    tracking: range
+    outputs: range
+    effort: range
+    limited: range
+    unsettled: range
+    inside: range
+    chatter: range
+    total: int
+
+    @classmethod
+    def of(cls, loop: Loop) -> "Rows":
+        """Return the rows of a loop.
+
+        Raises:
+            Unsupported: a law remembers what is no number.
+        """
+        n, m = len(loop.model.state_names), len(loop.model.input_names)
+        wind, q = loop.motion.wind, len(loop.model.output_names)
+        noisy = wind is not None and wind.noise is not None
+        memory = max(memory_size(law) for law in (loop.leader, loop.follower))
+        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, told_by(loop), m]
+        sizes += [2, 2, q, 1, 1, 1, len(loop.meter.charted), 1]
+        ends = np.cumsum([0, *sizes]).tolist()
+        rows: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
+        return cls(*rows)
+
+
+def memory_size(law: Law) -> int:
+    """Return how many numbers one agent under a law remembers.
+
+    Raises:
+        Unsupported: it remembers what is no number, such as a random key.
+    """
+    leaves = jax.tree.leaves(law.init())
+    for leaf in leaves:
+        if not jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating):
+            raise Unsupported(f"a memory of the type {jnp.asarray(leaf).dtype}")
+    return sum(np.size(leaf) for leaf in leaves)
+
+
+def told_by(loop: Loop) -> int:
+    """Return how many numbers an agent sends besides its state."""
+    n, m = len(loop.model.state_names), len(loop.model.input_names)
+    return jax.eval_shape(lambda x, v: _tell(loop, x, v), jnp.zeros(n), jnp.zeros(m)).shape[0]
+
+
+def _tell(loop: Loop, x: Any, v: Any) -> Any:
+    """Return what an agent at x with normalized input v sends to followers."""
+    if loop.follower.feedforward is Feedforward.NONE:
+        return jnp.zeros_like(v)
+    return loop.follower.broadcast(loop.model, x, v)
+
+
+class _Known(NamedTuple):
+    """What an agent's step rests on, entry by entry."""
+
+    t: Any
+    step: Any
+    steady: Any
+    wanted: Any
+    x: Any
+    offset: Any
+    z: Any
+    told: Any
+    memory: Memory
+    leader: Any
+    push: Any
+    noise: Any
+    before: Any
+
+
+class _Done(NamedTuple):
+    """What it comes to."""
+
+    state: Any
+    memory: Memory
+    cut: Any
+    tell: Any
+    input: Any
+    errors: Any
+    tracking: Any
+    outputs: Any
+    effort: Any
+    limited: Any
+    unsettled: Any
+    inside: Any
+    chatter: Any
+
+
+def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
+    """Return what an agent under a law does in a step, as a function for JAX."""
+    model, motion, meter = loop.model, loop.motion, loop.meter
+
+    def act(known: _Known) -> _Done:
+        x, offset = known.x, known.offset
+        view = LocalView(known.t, x, offset, known.z, known.told)
+        asked, memory = law.update(model, view, known.memory)
+        u = motion.plant.limit(asked) if motion.limits else asked
+        limited, cut = what_limits_did(u, asked)
+        read = meter.of_agent(known.step, known.steady, x, offset, known.leader, u)
+        tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
+        if known.wanted is not None:
+            tracking, outputs = meter.of_leader(known.steady, x, offset, known.wanted)
+        return _Done(
+            state=motion.move(x, u, known.push, known.noise),
+            memory=memory,
+            cut=cut,
+            tell=_tell(loop, x, model.normalized(u)),
+            input=u,
+            errors=read.errors,
+            tracking=tracking,
+            outputs=outputs,
+            effort=read.effort,
+            limited=jnp.where(limited.any(), 1.0, 0.0),
+            unsettled=read.unsettled,
+            inside=read.inside,
+            chatter=jnp.where((cut * known.before < 0.0).any(), 1.0, 0.0),
+        )
+
+    return act
+
+
+def body_of(loop: Loop, bits: int, rows: Rows, leads: bool, follows: bool) -> Body:
+    """Return what the leaders or all others do in a step.
+
+    Args:
+        loop: of the run.
+        bits: 64 or 32.
+        rows: where its numbers lie.
+        leads: whether leaders are meant.
+        follows: whether they follow a reference, which stands in the table.
+
+    Raises:
+        Unsupported: the law or the model uses what has no scalar operations.
+    """
+    graph, law = Graph(bits), loop.leader if leads else loop.follower
+    known = _known(loop, graph, rows, law, leads, follows)
+    found = lower(_agent(loop, law), graph, [known])
+    shapes = jax.tree.structure(_Done(*[0] * 13)._replace(memory=law.init()))
+    done: _Done = shapes.unflatten([nodes(graph, part) for part in found])
+    remembered = jax.tree.leaves(done.memory, is_leaf=lambda part: isinstance(part, list))
+    stores = {"state": done.state, "cut": done.cut, "memory": sum(remembered, start=[])}
+    if leads or loop.levels is not None:
+        stores["tell"] = done.tell
+    sums = {name: getattr(done, name) for name in ("errors", "effort", "limited", "chatter")}
+    if leads and follows:
+        sums |= {"tracking": done.tracking, "outputs": done.outputs}
+    n = len(known.x)
+    [difference] = lower(
+        loop.model.difference,
+        graph,
+        [_leaves(graph, kind, range(n)) for kind in ("own", "their")],
+    )
+    return Body(
+        stores=_placed(rows, stores),
+        sums=_placed(rows, sums),
+        greatest=_placed(rows, {"unsettled": done.unsettled}),
+        least=_placed(rows, {"inside": done.inside}),
+        shown=_placed(rows, {"input": done.input}),
+        now=[graph.make("apart", a, b) for a, b in zip(known.x, known.offset, strict=True)],
+        mirror=[graph.make("apart", a, b) for a, b in zip(done.state, known.offset, strict=True)],
+        difference=nodes(graph, difference),
+    )
+
+
+def _known(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follows: bool) -> _Known:
+    """Return what a step rests on as leaves of a graph."""
+    n = len(rows.state)
+
+    def row(places: range) -> np.ndarray:
+        return _leaves(graph, "row", places)
+
+    x, offset, size = row(rows.state), row(rows.offset), memory_size(law)
+    late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
+    return _Known(
+        t=_single(graph.leaf("time", uniform=True)),
+        step=_single(graph.leaf("step", uniform=True)),
+        steady=_single(late),
+        wanted=_leaves(graph, "table", range(n), True) if leads and follows else None,
+        x=x,
+        offset=offset,
+        z=_leaves(graph, "z", range(n)),
+        # Nobody is before a leader whose input it could be sent.
+        told=np.zeros(len(rows.input)) if leads else _leaves(graph, "told", range(len(rows.tell))),
+        memory=_shaped(row(rows.memory[:size]), law.init()),
+        leader=x - offset if leads else _leaves(graph, "leader", range(n)),
+        push=row(rows.push) if len(rows.push) else None,
+        noise=row(rows.noise) if len(rows.noise) else None,
+        before=row(rows.cut),
+    )
+
+
+def _leaves(graph: Graph, kind: str, places: Sequence[int], uniform: bool = False) -> np.ndarray:
+    entries = np.empty(len(places), object)
+    entries[:] = [graph.leaf(kind, place, uniform=uniform) for place in places]
+    return entries
+
+
+def _single(node: Node) -> np.ndarray:
+    array = np.empty((), object)
+    array[()] = node
+    return array
+
+
+def _shaped(entries: np.ndarray, like: Memory) -> Memory:
+    """Return a memory whose numbers are entries, in the order of its tree."""
+    leaves, tree = jax.tree.flatten(like)
+    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
+    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
+    return tree.unflatten([entries[a:b].reshape(np.shape(leaf)) for leaf, a, b in parts])
+
+
+def _placed(rows: Rows, named: dict[str, list[Node]]) -> dict[int, Node]:
+    """Return row -> node for the entries of each name."""
+    return {
+        row: node
+        for name, entries in named.items()
+        for row, node in zip(getattr(rows, name), entries, strict=name != "memory")
+    }

@@ -1,0 +1,198 @@
+"""What the loops of a kernel are made of: what is written of it, loops, loads and stores."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from echelon.kernels.scalar import Node
+from echelon.kernels.vector_ir import Writer
+
+
+class Body(NamedTuple):
+    """What some of the agents do in a step; the same code for all of them.
+
+    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), or, the
+    same for all, ("time",), ("step",), ("steady",), ("table", c).
+
+    Attributes:
+        stores: row -> what it becomes.
+        sums: row -> what is added to it.
+        greatest: row -> a value; the row keeps the largest that it ever was.
+        least: row -> a value; the row keeps the smallest.
+        shown: row -> what it becomes where `shown` is asked for, since every store costs time.
+        now: what neighbours read at the step, entry by entry.
+        mirror: what they read after it.
+        difference: of what stands in the leaves `own` and `their`, entry by entry; z_k is the
+            weighted sum of entry k over the neighbours.
+    """
+
+    stores: dict[int, Node]
+    sums: dict[int, Node]
+    greatest: dict[int, Node]
+    least: dict[int, Node]
+    shown: dict[int, Node]
+    now: Sequence[Node]
+    mirror: Sequence[Node]
+    difference: Sequence[Node]
+
+    def results(self) -> list[Node]:
+        """Return all that is written."""
+        rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
+        return [*(node for row in rows for node in row.values()), *self.mirror]
+
+
+class Plan(NamedTuple):
+    """A kernel before it is code.
+
+    Attributes:
+        bits: 64 or 32.
+        lanes: of a vector.
+        rows: of a block.
+        width: numbers that neighbours read of an agent; they stand in whole vectors.
+        first: the body of those that act first.
+        others: the body of all others, level by level.
+        tell: the first row of what an agent tells others.
+        told: how many rows that is.
+        one_source: whether one agent tells all others, so that none needs to be looked up.
+        one_leader: whether all have the same leader.
+        weighted: whether edges differ in weight from 1.
+        edges: which of the numbers that neighbours read make a distance; none for none.
+        table: numbers that each step has in the table.
+        dt: s.
+    """
+
+    bits: int
+    lanes: int
+    rows: int
+    width: int
+    first: Body
+    others: Body
+    tell: int
+    told: int
+    one_source: bool
+    one_leader: bool
+    weighted: bool
+    edges: tuple[int, ...]
+    table: int
+    dt: float
+
+
+SLOTS = (
+    "rows",
+    "mirror",
+    "next_mirror",
+    "table",
+    "segments",
+    "neighbour_starts",
+    "neighbours",
+    "weights",
+    "sources",
+    "leaders",
+    "edges",
+    "edge_ends",
+    "first_step",
+    "steps",
+    "levels",
+    "edge_blocks",
+    "first_steady",
+    "shown",
+)
+"""What a kernel is called with: 12 addresses and 6 whole numbers of 64 bits."""
+ADDRESSES = 12
+
+
+def stride(width: int, lanes: int) -> int:
+    """Return how many numbers lie between two agents for their neighbours."""
+    return -(-width // lanes) * lanes
+
+
+class Context(NamedTuple):
+    """Names of what a body finds around it."""
+
+    plan: Plan
+    slots: dict[str, str]
+    mirror: str
+    following: str
+    step: str
+    table: str
+
+
+@contextlib.contextmanager
+def loop(
+    w: Writer, start: str, end: str, carried: Sequence[tuple[str, str]]
+) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Write a loop; give its index, what it carries, and a list for what it carries on.
+
+    What it carries is, after the loop, in the same list.
+    """
+    before, head, body, after = (w.fresh(s) for s in ("before", "head", "body", "after"))
+    index = "%" + w.fresh("i")
+    names = ["%" + w.fresh("c") for _ in carried]
+    w.do(f"br label %{before}")
+    w.label(before)
+    w.do(f"br label %{head}")
+    w.label(head)
+    place = len(w.lines)
+    w.lines += [""] * (1 + len(carried))
+    more = w.put(f"icmp slt i64 {index}, {end}")
+    w.do(f"br i1 {more}, label %{body}, label %{after}")
+    w.label(body)
+    on = list(names)
+    yield index, names, on
+    final, latch = w.put(f"add i64 {index}, 1"), w.fresh("latch")
+    w.do(f"br label %{latch}")
+    w.label(latch)
+    w.do(f"br label %{head}")
+    w.lines[place] = f"  {index} = phi i64 [ {start}, %{before} ], [ {final}, %{latch} ]"
+    for k, ((kind, first), name, new) in enumerate(zip(carried, names, on, strict=True), 1):
+        w.lines[place + k] = f"  {name} = phi {kind} [ {first}, %{before} ], [ {new}, %{latch} ]"
+    w.label(after)
+
+
+@contextlib.contextmanager
+def only_if(w: Writer, wanted: str) -> Iterator[None]:
+    """Write what is done only where a whole number is not 0."""
+    some = w.put(f"icmp ne i64 {wanted}, 0")
+    then, after = w.fresh("then"), w.fresh("done")
+    w.do(f"br i1 {some}, label %{then}, label %{after}")
+    w.label(then)
+    yield
+    w.do(f"br label %{after}")
+    w.label(after)
+
+
+def bytes_of(w: Writer) -> int:
+    """Return the bytes of a number."""
+    return w.bits // 8
+
+
+def load_row(w: Writer, base: str, row: int, lanes: int) -> str:
+    """Write the load of a row of a block."""
+    at = w.put(f"getelementptr {w.scalar}, ptr {base}, i64 {row * lanes}")
+    return w.put(f"load {w.vector}, ptr {at}, align {lanes * bytes_of(w)}")
+
+
+def store_row(w: Writer, base: str, row: int, lanes: int, value: str) -> None:
+    """Write the store of a row of a block."""
+    at = w.put(f"getelementptr {w.scalar}, ptr {base}, i64 {row * lanes}")
+    w.do(f"store {w.vector} {value}, ptr {at}, align {lanes * bytes_of(w)}")
+
+
+def load_places(w: Writer, start: str, first: str) -> str:
+    """Write the load of whole numbers of 32 bits, one a lane, as 64 bits."""
+    at = w.put(f"getelementptr i32, ptr {start}, i64 {first}")
+    found = w.put(f"load <{w.lanes} x i32>, ptr {at}, align 4")
+    return w.put(f"sext <{w.lanes} x i32> {found} to <{w.lanes} x i64>")
+
+
+def gather(w: Writer, start: str, places: str, offset: int) -> str:
+    """Write the load of one number a lane, at `places` after a start and an offset."""
+    at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {offset}")
+    lanes, name = w.lanes, f"llvm.masked.gather.v{w.lanes}f{w.bits}.v{w.lanes}p0"
+    truths = f"<{lanes} x i1>"
+    w.declare(w.vector, name, f"<{lanes} x ptr>", "i32", truths, w.vector)
+    all_at = w.put(f"getelementptr {w.scalar}, ptr {at}, <{lanes} x i64> {places}")
+    return w.put(
+        f"call {w.vector} @{name}(<{lanes} x ptr> {all_at}, i32 {bytes_of(w)}, "
+        f"{truths} splat (i1 true), {w.vector} poison)"
+    )

@@ -1,0 +1,196 @@
+"""What neighbours read of an agent, and what each makes of it: sums over the edges."""
+
+from collections.abc import Callable, Sequence
+
+from echelon.kernels.frame import (
+    Body,
+    Context,
+    bytes_of,
+    load_row,
+    loop,
+    store_row,
+    stride,
+)
+from echelon.kernels.scalar import Node, needed
+from echelon.kernels.vector_ir import Emitter, Writer
+
+
+def exchange(
+    w: Writer,
+    around: Context,
+    body: Body,
+    block: str,
+    first: str,
+    heard: Sequence[int],
+    load: Callable[[Node], str],
+) -> dict[int, str]:
+    """Write the sums over the neighbours, slot by slot: the k-th neighbour of each agent."""
+    plan, slots = around.plan, around.slots
+    at = w.put(f"getelementptr i64, ptr {slots['neighbour_starts']}, i64 {block}")
+    after = w.put(f"getelementptr i64, ptr {at}, i64 1")
+    start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
+    wanted = [body.difference[k] for k in heard]
+    if all(_is_plain(node) for node in wanted):
+        return _subtract(w, around, (start, end), first, heard)
+    leaves = [n for n in needed(wanted) if n.op == "leaf"]
+    own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
+    mine = Emitter(w, load)
+    mine.emit(list(own.values()))
+    zero = [(w.vector, "zeroinitializer")] * len(heard)
+    pieces = sorted({n.value[1] // w.lanes for n in leaves if n.value[0] == "their"})
+    with loop(w, start, end, zero) as (slot, totals, on):
+        place = w.put(f"mul i64 {slot}, {plan.lanes}")
+        theirs = _columns(w, around, "neighbours", place, pieces)
+
+        def entry_of(leaf: Node) -> str:
+            kind, entry = leaf.value
+            return mine.value(own[leaf]) if kind == "own" else theirs[entry]
+
+        emitter = Emitter(w, entry_of)
+        emitter.emit(wanted)
+        weight = None
+        if plan.weighted:
+            at = w.put(f"getelementptr {w.scalar}, ptr {slots['weights']}, i64 {place}")
+            weight = w.put(f"load {w.vector}, ptr {at}, align {plan.lanes * bytes_of(w)}")
+        for k, node in enumerate(wanted):
+            value = emitter.value(node)
+            if weight is not None:
+                value = w.put(f"fmul contract {w.vector} {value}, {weight}")
+            on[k] = w.put(f"fadd contract {w.vector} {totals[k]}, {value}")
+    return dict(zip(heard, totals, strict=True))
+
+
+def _columns(
+    w: Writer, around: Context, which: str, place: str, pieces: Sequence[int]
+) -> dict[int, str]:
+    """Write the load of what some agents show, whose places stand in a list: entry -> a vector."""
+    at = w.put(f"getelementptr i32, ptr {around.slots[which]}, i64 {place}")
+    others = [_their(w, around.mirror, at, lane) for lane in range(w.lanes)]
+    found = dict[int, str]()
+    for piece in pieces:
+        # A gather of one number a lane would cost more than turning whole rows about.
+        rows = [_load_at(w, other, piece * w.lanes) for other in others]
+        found |= enumerate(_transposed(w, rows), piece * w.lanes)
+    return found
+
+
+def _is_plain(node: Node) -> bool:
+    """Tell whether an entry of the difference is that of two numbers, and winds no angle."""
+    leaves = [a.value[0] for a in node.args if a.op == "leaf"]
+    return node.op == "sub" and leaves == ["own", "their"]
+
+
+def _subtract(
+    w: Writer, around: Context, slots: tuple[str, str], first: str, heard: Sequence[int]
+) -> dict[int, str]:
+    """Write the sums of plain differences, agent by agent: their numbers lie in whole vectors."""
+    plan, lanes = around.plan, w.lanes
+    pieces = sorted({k // lanes for k in heard})
+    far = stride(plan.width, lanes)
+    begin = w.put(f"mul i64 {first}, {far}")
+    start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
+    places = [(lane, piece) for lane in range(lanes) for piece in pieces]
+    zero = [(w.vector, "zeroinitializer")] * len(places)
+    with loop(w, *slots, zero) as (slot, totals, on):
+        place = w.put(f"mul i64 {slot}, {lanes}")
+        at = w.put(f"getelementptr i32, ptr {around.slots['neighbours']}, i64 {place}")
+        heavy = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
+        other, weight = "", ""
+        for k, (lane, piece) in enumerate(places):
+            if piece == pieces[0]:
+                other = _their(w, around.mirror, at, lane)
+                weight = _weight(w, heavy, lane) if plan.weighted else ""
+            own = _load_at(w, start, lane * far + piece * lanes)
+            away = w.operation("sub", [own, _load_at(w, other, piece * lanes)], False, False)
+            away = w.operation("mul", [away, weight], False, False) if weight else away
+            on[k] = w.operation("add", [totals[k], away], False, False)
+    found = dict[int, str]()
+    for piece in pieces:
+        rows = [totals[k] for k, (_, p) in enumerate(places) if p == piece]
+        found |= enumerate(_transposed(w, rows), piece * lanes)
+    return found
+
+
+def _their(w: Writer, mirror: str, places: str, lane: int) -> str:
+    """Write the address of what a lane's neighbour shows."""
+    at = w.put(f"getelementptr i32, ptr {places}, i64 {lane}")
+    place = w.put(f"load i32, ptr {at}, align 4")
+    far = w.put(f"sext i32 {place} to i64")
+    return w.put(f"getelementptr {w.scalar}, ptr {mirror}, i64 {far}")
+
+
+def _weight(w: Writer, weights: str, lane: int) -> str:
+    at = w.put(f"getelementptr {w.scalar}, ptr {weights}, i64 {lane}")
+    return w.splat(w.put(f"load {w.scalar}, ptr {at}"))
+
+
+def _load_at(w: Writer, start: str, place: int) -> str:
+    at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {place}")
+    return w.put(f"load {w.vector}, ptr {at}, align {w.lanes * bytes_of(w)}")
+
+
+def write_mirror(w: Writer, around: Context, values: Sequence[str], first: str) -> None:
+    """Write what neighbours will read, one agent after the other."""
+    lanes, far = w.lanes, stride(len(values), w.lanes)
+    begin = w.put(f"mul i64 {first}, {far}")
+    start = w.put(f"getelementptr {w.scalar}, ptr {around.following}, i64 {begin}")
+    padded = [*values, *["zeroinitializer"] * (far - len(values))]
+    for block in range(0, far, lanes):
+        for lane, column in enumerate(_transposed(w, padded[block : block + lanes])):
+            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + block}")
+            w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * bytes_of(w)}")
+
+
+def _transposed(w: Writer, rows: Sequence[str]) -> list[str]:
+    """Write the transpose of as many vectors as a vector has lanes, in log2 of them stages."""
+    lanes, rows = w.lanes, list(rows)
+    distance = 1
+    while distance < lanes:
+        mixed = list(rows)
+        for k in range(lanes):
+            if k & distance:
+                continue
+            a, b = rows[k], rows[k + distance]
+            low = [i if not i & distance else lanes + i - distance for i in range(lanes)]
+            high = [i + distance if not i & distance else lanes + i for i in range(lanes)]
+            mixed[k], mixed[k + distance] = (_shuffle(w, a, b, order) for order in (low, high))
+        rows, distance = mixed, 2 * distance
+    return rows
+
+
+def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
+    places = ", ".join(f"i32 {k}" for k in order)
+    if a == b == "zeroinitializer":
+        return a
+    return w.put(f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>")
+
+
+def measure_edges(w: Writer, around: Context) -> None:
+    """Write the loop that adds up how far distances along edges are from those of the formation.
+
+    A block of edges has the differences of their goals, row by row, the distances that these make,
+    and the sums.
+    """
+    plan, slots = around.plan, around.slots
+    axes = plan.edges
+    size = (len(axes) + 2) * plan.lanes
+    with loop(w, "0", slots["edge_blocks"], []) as (block, _, _):
+        begin = w.put(f"mul i64 {block}, {size}")
+        base = w.put(f"getelementptr {w.scalar}, ptr {slots['edges']}, i64 {begin}")
+        first = w.put(f"mul i64 {block}, {2 * plan.lanes}")
+        second = w.put(f"add i64 {first}, {plan.lanes}")
+        pieces = sorted({axis // w.lanes for axis in axes})
+        ends = [_columns(w, around, "edge_ends", place, pieces) for place in (first, second)]
+        squares = "zeroinitializer"
+        for k, axis in enumerate(axes):
+            apart = w.operation("sub", [end[axis] for end in ends], False, False)
+            apart = w.operation("add", [apart, load_row(w, base, k, plan.lanes)], False, False)
+            square = w.operation("mul", [apart, apart], False, False)
+            squares = w.operation("add", [squares, square], False, False)
+        distance = w.operation("sqrt", [squares], False, False)
+        wanted = load_row(w, base, len(axes), plan.lanes)
+        off = w.operation("sub", [distance, wanted], False, False)
+        square = w.operation("mul", [off, off], False, False)
+        total = load_row(w, base, len(axes) + 1, plan.lanes)
+        total = w.put(f"fadd {w.vector} {total}, {square}")
+        store_row(w, base, len(axes) + 1, plan.lanes, total)

@@ -1,0 +1,250 @@
+"""Native steps against JAX's: states, inputs, sums and moments, for all that a run may have."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import echelon as ech
+from echelon.engine import native
+from echelon.engine.drive import numbers
+from echelon.engine.prepare import prepare
+
+QUADROTOR = ech.models.Quadrotor()
+CIRCLE = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5))
+
+
+def stepped(parts, chosen, counts, engine):
+    """Return the chunk of some frames, and the stepper, by one of the engines."""
+    prepared = prepare(parts, chosen._replace(engine=engine))
+    stepper = prepared.parts.drive.stepper(prepared.problem)
+    with jax.enable_x64(chosen.precision == "float64"):
+        times = chosen.dt * jnp.arange(int(np.sum(counts)) + 1)
+        wanted = prepared.parts.drive.reference_states(prepared.parts.model, times)
+        wanted = None if wanted is None else np.asarray(wanted, float)
+        return stepper.advance(stepper.start(), np.array(counts), wanted), stepper
+
+
+def check_alike(parts, chosen, counts=(1, 0, 17, 60, 0), tolerance=1e-13):
+    (ours, stepper), (theirs, _) = (
+        stepped(parts, chosen, counts, name) for name in ("native", "jax")
+    )
+    assert stepper.engine == "native"
+    for a, b in ((ours.states, theirs.states), (ours.inputs, theirs.inputs)):
+        size = np.maximum(np.abs(b).max(axis=(0, 1)), 1.0)
+        assert (np.abs(a - b) / size).max() <= tolerance
+    for name, a, b in zip(ours.sums._fields, ours.sums, theirs.sums, strict=True):
+        size = np.abs(b).max(initial=1e-12)
+        np.testing.assert_allclose(a, b, rtol=0, atol=100 * tolerance * size, err_msg=name)
+    for a, b in zip(numbers(ours.now), numbers(theirs.now), strict=True):
+        assert a.shape == b.shape and np.abs(a.astype(float) - b).max(initial=0.0) <= max(
+            1e-10, tolerance
+        )
+    return ours, theirs
+
+
+def flock(graph, model=QUADROTOR, leader=CIRCLE, feedforward="relay", **more):
+    # Weak enough for the step: what grows makes any rounding large.
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.3))
+    formation = ech.Formation.circle(model, graph, spacing=1.0)
+    follower = ech.laws.Consensus(gain, feedforward=feedforward)
+    drive = ech.Laws(leader, follower)
+    more = {"initial": {"position": 0.02}} | more
+    return ech.Parts(model, graph, formation, drive, **more)
+
+
+def run_settings(**changes):
+    return ech.Settings(**{"horizon": 1.0, "dt": 0.005, "steady_window": 0.8, **changes})
+
+
+@pytest.mark.parametrize("name", ["paper", "unicycle", "van-der-pol", "planar-quadrotor"])
+def test_a_scenario_steps_as_by_jax(name):
+    check_alike(*ech.build(ech.load_scenario(name)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(ech.bundled_scenarios()))
+def test_every_scenario_steps_as_by_jax_for_a_thousand_steps(name):
+    parts, chosen = ech.build(ech.load_scenario(name))
+    # One that grows without bound makes any rounding large.
+    check_alike(parts, chosen, (200,) if name == "paper-literal" else (1000,), 1e-12)
+
+
+WEIGHTED = ech.Graph.from_edges([(0, 1, 0.5), (1, 2, 3.0), (2, 3, 1.0), (0, 4, 2.0)], (0,), 5)
+NETWORKS = {
+    "a ring": (ech.Graph.ring(11), {}),
+    "weights": (WEIGHTED, {}),
+    "the parent's input": (ech.Graph.path(12), {"feedforward": "parent"}),
+    "a relayed velocity": (ech.Graph.path(3), {"feedforward": "relay-velocity"}),
+    "nothing fed forward": (ech.Graph.star(10), {"feedforward": "none"}),
+    "several leaders": (ech.Graph.ring(9, leaders=(0, 4)), {}),
+    "a leader at its trim": (ech.Graph.grid(3, 4), {"leader": ech.laws.TrimInput()}),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_all_networks_and_feedforwards_step_as_by_jax(name):
+    graph, more = NETWORKS[name]
+    check_alike(flock(graph, **more), run_settings())
+
+
+def test_a_leader_that_reacts_hears_its_neighbours():
+    graph = ech.Graph.path(4)
+    gain = ech.synthesize(QUADROTOR, graph, ech.gains.Riccati())
+    leader = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5), reaction=gain)
+    check_alike(flock(graph, leader=leader, feedforward="none"), run_settings())
+
+
+@pytest.mark.parametrize("common", [True, False])
+def test_wind_and_noise_are_those_that_jax_draws(common):
+    wind = ech.Disturbance(
+        constant={"vx": 0.1},
+        rms={"velocity": 0.3},
+        input_rms={"thrust": 0.1},
+        hold=0.05,
+        common=common,
+    )
+    # Normal draws are of single precision, and round by how XLA arranges them.
+    world = ech.World(disturbance=wind)
+    check_alike(flock(ech.Graph.ring(5), world=world), run_settings(), tolerance=3e-8)
+
+
+def test_a_plant_that_is_not_the_model_moves():
+    heavy = ech.models.Quadrotor(mass=0.031)
+    check_alike(flock(ech.Graph.ring(5), world=ech.World(plant=heavy)), run_settings())
+
+
+def test_limits_that_act_are_counted_and_kept_as_by_jax():
+    parts = flock(ech.Graph.ring(5), initial={"position": 30.0, "attitude": 0.5})
+    ours, _ = check_alike(parts, run_settings(), (40,), 1e-11)
+    assert ours.sums.limited.max() > 10
+
+
+class Remembers(ech.laws.Law):
+    """Feeds back a sum of what it saw, in a memory that is a tree."""
+
+    def init(self):
+        return {"sum": jnp.zeros(2), "steps": jnp.zeros(())}
+
+    def update(self, model, view, memory):
+        total = memory["sum"] + view.disagreement
+        after = {"sum": total, "steps": memory["steps"] + 1.0}
+        return -0.3 * total[:1] - view.disagreement[1:] - 0.01 * memory["steps"], after
+
+
+def test_a_law_with_memory_remembers_the_same():
+    model, graph = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(4)
+    formation = ech.Formation(np.zeros((4, 2)))
+    drive = ech.Laws(ech.laws.TrimInput(), Remembers())
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    check_alike(parts, run_settings(dt=0.01))
+
+
+@pytest.mark.parametrize("integrator", ["euler", "printed"])
+def test_other_integrators_step_as_by_jax(integrator):
+    model, graph = ech.models.DoubleIntegrator(dimension=2), ech.Graph.ring(4)
+    parts = flock(graph, model, ech.laws.TrimInput())
+    check_alike(parts, run_settings(integrator=integrator, dt=0.01), (3, 4), 1e-12)
+
+
+def test_single_precision_is_that_of_jax_to_its_own_rounding():
+    check_alike(flock(ech.Graph.ring(20)), run_settings(precision="float32"), (1, 30), 2e-5)
+
+
+# ---- the same bits, however it is cut ----
+
+
+@given(cuts=st.lists(st.integers(0, 30), min_size=1, max_size=6))
+@settings(max_examples=8)
+def test_bits_do_not_depend_on_where_a_run_is_cut(cuts):
+    parts, chosen = flock(ech.Graph.path(6)), run_settings()
+    whole, _ = stepped(parts, chosen, [sum(cuts)], "native")
+    cut, stepper = stepped(parts, chosen, cuts, "native")
+    assert cut.now.states.tobytes() == whole.now.states.tobytes()
+    with jax.enable_x64(True):
+        kept = stepper.recall(numbers(cut.now))
+        more = stepper.advance(kept, np.array([2]), np.zeros((3, 12)))
+        again = stepper.advance(cut.now, np.array([2]), np.zeros((3, 12)))
+    assert more.now.states.tobytes() == again.now.states.tobytes()
+
+
+def test_bits_do_not_depend_on_how_wide_a_vector_is(monkeypatch):
+    parts, chosen = flock(ech.Graph.ring(13)), run_settings()
+    wide, _ = stepped(parts, chosen, (5, 40), "native")
+    monkeypatch.setattr(native, "_LANES", {64: 4, 32: 4})
+    narrow, _ = stepped(parts, chosen, (5, 40), "native")
+    assert wide.states.tobytes() == narrow.states.tobytes()
+    assert wide.sums.errors.tobytes() == narrow.sums.errors.tobytes()
+
+
+# ---- what is told ----
+
+
+def test_long_runs_are_native_and_short_ones_are_not():
+    model = ech.models.DoubleIntegrator(dimension=2)
+    parts = flock(ech.Graph.ring(30), model, ech.laws.TrimInput(), initial={"position": 0.01})
+    long = ech.simulate(parts, run_settings(horizon=20.0, dt=0.005, store_every=100))
+    assert long.engine == "native" and long.outcome is ech.Outcome.COMPLETED
+    short = ech.simulate(parts, run_settings(horizon=0.05))
+    assert short.engine == "jax" and not short.warnings
+
+
+class Sorts(ech.laws.Law):
+    """Uses what has no native code."""
+
+    def update(self, model, view, memory):
+        return jnp.sort(view.disagreement)[:1] * 0.0, memory
+
+
+def test_what_has_no_native_code_runs_by_jax_and_says_why():
+    model, graph = ech.models.Pendulum(), ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), Sorts())
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 2))), drive)
+    told = r"there is no native code for `sort` in .*test_native\.py, line \d+"
+    with pytest.raises(ech.errors.SimulationError, match=rf"^`engine` is `native`, and {told}\.$"):
+        ech.simulate(parts, run_settings(engine="native"))
+    found = ech.simulate(parts, run_settings(horizon=600.0, dt=0.01, store_every=1000))
+    assert found.engine == "jax"
+    [warning] = [w for w in found.warnings if w.startswith("JAX steps the agents")]
+    assert "`sort`" in warning
+
+
+def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():
+    model = ech.models.SingleIntegrator(dimension=1)
+    graph = ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    parts = ech.Parts(
+        model, graph, ech.Formation(np.zeros((2, 1))), drive, initial=np.array([[0.0], [1e6]])
+    )
+    (ours, stepper), (theirs, _) = (
+        stepped(parts, run_settings(), (10,), name) for name in ("native", "jax")
+    )
+    assert stepper.engine == "native"
+    assert ours.states.tobytes() == theirs.states.tobytes()
+
+
+def test_an_agent_that_is_lost_is_told_as_by_jax():
+    class Cubic(ech.ControlAffine):
+        state_names, input_names = ("x",), ("push",)
+
+        def drift(self, x):
+            return x**3
+
+        def input_map(self, x):
+            return jnp.ones((1, 1), x.dtype)
+
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    parts = ech.Parts(
+        Cubic(),
+        ech.Graph.path(2),
+        ech.Formation(np.zeros((2, 1))),
+        drive,
+        initial=np.array([[0.0], [3.0]]),
+    )
+    found = [
+        ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.01, engine=name))
+        for name in ("native", "jax")
+    ]
+    assert found[0].message == found[1].message and "follower 1" in found[0].message
