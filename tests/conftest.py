@@ -56,7 +56,14 @@ settings.load_profile("echelon")
 
 
 @pytest.fixture
-def echelon(monkeypatch, capsys):
+def here(tmp_path, monkeypatch):
+    """An empty folder, in which the test works."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def echelon(here, monkeypatch, capsys):
     """Run the command line in this process: exit code, standard output, standard error."""
     from echelon.cli.app import main
 

@@ -16,6 +16,12 @@ def rotation(zeta):
     return Rotation.from_euler("ZYX", np.asarray(zeta)[..., ::-1]).as_matrix()
 
 
+def spd(rng, size):
+    """A random symmetric positive definite matrix."""
+    root = rng.normal(size=(size, size))
+    return root @ root.T + 0.05 * np.eye(size)
+
+
 def skew(w):
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 

@@ -449,12 +449,6 @@ def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
 # ---- bad input ----
 
 
-@pytest.fixture
-def echelon(echelon, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return echelon
-
-
 def written(gain, model="planar-quadrotor"):
     with open("mine.yaml", "w") as mine:
         mine.write(

@@ -30,11 +30,10 @@ simulation: {horizon: 1.0, dt: 0.01}
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pendulum.py").write_text(OWN_PENDULUM + FILE)
-    (tmp_path / "mine.yaml").write_text(SCENARIO)
-    return tmp_path
+def here(here):
+    (here / "pendulum.py").write_text(OWN_PENDULUM + FILE)
+    (here / "mine.yaml").write_text(SCENARIO)
+    return here
 
 
 def test_run_writes_what_it_says(here, echelon):

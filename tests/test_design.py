@@ -40,9 +40,8 @@ simulation: {horizon: 1.0, dt: 0.01}
 
 
 @pytest.fixture
-def echelon(echelon, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text(SCENARIO)
+def echelon(echelon, here):
+    (here / "mine.yaml").write_text(SCENARIO)
     return echelon
 
 
@@ -62,6 +61,13 @@ def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go():
     advice = reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
     gain = ech.load_scenario("van-der-pol", [advice]).follower.gain
     assert gain.method == "robust-lqr" and gain.domain == {"position": 0.5}
+
+
+def test_a_law_without_a_gain_is_advised_one_that_takes_it():
+    rows = {row.method: row for row in ech.design(ech.load_scenario("integrators")).designs}
+    advice = rows["robust-lqr"].reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
+    follower = ech.load_scenario("integrators", [advice]).follower
+    assert follower.law == "consensus" and follower.gain.method == "robust-lqr"
 
 
 def test_a_scenario_whose_own_gain_cannot_be_made_has_the_other_methods_tried():

@@ -1,5 +1,6 @@
 """How a command ends: one exit code for each way, one sentence, and never a bare traceback."""
 
+import json
 import re
 import subprocess
 import sys
@@ -36,10 +37,9 @@ simulation: {horizon: 0.1, dt: 0.1}
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text(SCENARIO)
-    return tmp_path
+def here(here):
+    (here / "mine.yaml").write_text(SCENARIO)
+    return here
 
 
 def test_each_outcome_has_its_code():
@@ -52,7 +52,7 @@ def test_help_names_every_code(echelon):
     code, out, _ = echelon("--help")
     assert code == 0
     told = " ".join(out.split()).partition("Exit codes: ")[2]
-    assert [int(x) for x in re.findall(r"\b(\d+)\b", told)] == [0, 1, 2, 3, 4, 5, 70, 130, 143]
+    assert [int(x) for x in re.findall(r"\b(\d+)\b", told)] == [0, 1, 2, 3, 4, 5, 70, 130, 143, 141]
 
 
 @pytest.mark.parametrize("where", ["top", "inside"])
@@ -95,22 +95,85 @@ def test_details_that_no_disk_takes_are_shown(monkeypatch, capsys):
     assert "ValueError: odd" in capsys.readouterr().err
 
 
-def listed(**options):
-    command = [sys.executable, "-m", "echelon", "list"]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
+def started(*arguments, **options):
+    command = [sys.executable, "-m", "echelon", *arguments]
+    return subprocess.Popen(command, text=True, **options)
 
 
 def test_a_screen_that_takes_no_more_is_told():
-    with open("/dev/full", "w") as full, listed(stdout=full) as process:
+    with (
+        open("/dev/full", "w") as full,
+        started("list", stdout=full, stderr=subprocess.PIPE) as process,
+    ):
         assert process.communicate()[1].startswith("echelon: nothing more can be written: ")
     assert process.returncode == 2
 
 
-def test_a_reader_that_has_left_is_no_verdict():
-    with listed(stdout=subprocess.PIPE) as process:
+def left_by_reader(here, *arguments):
+    """The exit code of a command whose reader takes nothing, and what it says elsewhere."""
+    with started(*arguments, cwd=here, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
-        assert process.stderr.read() == ""
+        said = process.stderr.read()
+    return process.returncode, said
+
+
+def test_a_reader_that_has_left_is_no_fault(tmp_path):
+    assert left_by_reader(tmp_path, "list") == (141, "")
+    assert left_by_reader(tmp_path, "check", "integrators") == (141, "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["check", "integrators", "--json"],
+        ["design", "integrators", "--out", "again.json"],
+        ["verify", "gain.json"],
+        ["compare", "integrators", "--horizon", "0.5", "--no-figures", "--out", "compared"],
+        ["schema"],
+        ["doctor"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_every_command_goes_on_without_its_reader(tmp_path, echelon, arguments):
+    assert echelon("design", "integrators", "--out", tmp_path / "gain.json")[0] == 0
+    assert left_by_reader(tmp_path, *arguments) == (141, "")
+    if "--out" in arguments:
+        assert (tmp_path / arguments[-1]).exists()
+
+
+def test_a_run_is_written_whole_whoever_reads(tmp_path):
+    """Both streams go to one pipe, as with `2>&1 | head -0`."""
+    words = [
+        "run",
+        "integrators",
+        "--set",
+        "simulation.horizon=0.1",
+        "--no-figures",
+        "--out",
+        "kept",
+    ]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with started(*words, cwd=tmp_path, **pipes) as process:
+        process.stdout.close()
     assert process.returncode == 141
+    summary = json.loads((tmp_path / "kept/summary.json").read_text())
+    assert summary["outcome"]["name"] == "completed"
+    assert not (tmp_path / "kept/chunks").exists()
+
+
+def test_a_screen_that_was_never_there_is_no_fault():
+    """As for a program that the system starts with its standard output closed."""
+    close = "import os, sys; os.close(1); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    command = [sys.executable, "-c", close, "-m", "echelon", "list"]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_verdict_stands_whoever_reads(tmp_path):
+    """What was found is told by the exit code, which needs no pipe."""
+    assert left_by_reader(tmp_path, "check", "integrators", "--set", "follower.law=passive")[0] == 1
 
 
 def test_numbers_beyond_all_squares_say_nothing_on_the_screen(recwarn):

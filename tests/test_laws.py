@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map
+from oracles import adjacency, connected, disagreements, laplacian, quadrotor_input_map, spd
 from runs import simulate
 
 from echelon.certificates.domain import Domain
@@ -35,11 +35,6 @@ from echelon.scenario.sections import FollowerSpec
 
 LINE = Graph.path(4)
 QUAD = Quadrotor()
-
-
-def spd(rng, size):
-    root = rng.normal(size=(size, size))
-    return root @ root.T + 0.1 * np.eye(size)
 
 
 def input_of(law, model, *, x, z=None, offset=None, said=None, t=0.0):

@@ -51,12 +51,11 @@ main()
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "swing.py").write_text(OWN_PENDULUM)
-    (tmp_path / "mine.yaml").write_text(SCENARIO)
-    return tmp_path
+def here(here):
+    (here / "models").mkdir()
+    (here / "models" / "swing.py").write_text(OWN_PENDULUM)
+    (here / "mine.yaml").write_text(SCENARIO)
+    return here
 
 
 @contextlib.contextmanager

@@ -125,6 +125,12 @@ SENTENCES = {
         "reference",
         "`Pull` in `{folder}/mine.py` is no `Reference` class; it has `Ray`.",
     ),
+    "a key that a law of one's own does not take": (
+        {"follower": {"law": {"python": "mine.py:Pull"}, "gain": {"method": "riccati"}}},
+        "follower.gain",
+        "got a key that the law `mine.py:Pull` does not take, allowed are those that its class "
+        "names.",
+    ),
     "a file that is not there": (
         {"follower": {"gain": {"python": "yours.py:Heavy"}}},
         "follower.gain",
@@ -220,6 +226,17 @@ def test_a_model_of_ones_own_takes_the_place_of_a_named_one(folder, monkeypatch)
     scenario = ech.load_scenario("integrators", ["model.python=line.py:Line"])
     assert scenario.model.name is None
     assert type(ech.build(scenario).parts.model).__name__ == "Line"
+
+
+def test_keys_that_only_another_law_takes_give_way_to_a_law_on_the_command_line():
+    scenario = ech.load_scenario("paper", ["follower.law=passive"])
+    assert scenario.data["follower"] == {"law": "passive"}
+    with pytest.raises(ech.EchelonError) as caught:
+        ech.load_scenario("paper", ["follower.law=passive", "follower.gain.coupling=2"])
+    assert str(caught.value) == (
+        "--set follower.gain.coupling=2: follower.gain: got a key that `passive` does not take, "
+        "allowed beside it is no other key."
+    )
 
 
 def test_some_agents_start_by_the_spread_and_others_where_they_are_told(folder):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import laplacian, skew
+from oracles import laplacian, skew, spd
 from runs import simulate
 
 from echelon.core import numerics
@@ -31,11 +31,6 @@ TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 LINE = Graph.path(4)
 QUAD = Quadrotor()
 OFFSETS = {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
-
-
-def spd(rng, size):
-    root = rng.normal(size=(size, size))
-    return root @ root.T + 0.05 * np.eye(size)
 
 
 def symmetric(matrix):
@@ -296,11 +291,10 @@ def test_where_the_offset_is_no_symmetry_some_state_breaks_lemma_4(seed):
     rng = np.random.default_rng(seed)
     A = -spd(rng, 2)
     P, d, y = np.eye(2), rng.normal(size=2), rng.normal(size=2)
-    if np.abs(A @ d).max() > 1e-6:
-        # Step from y by a little against A d: the linear term wins over the quadratic one.
-        step = 0.1 * (A @ d) / np.linalg.norm(A, 2)
-        s = 0.5 * (d @ A @ step) / abs(step @ A @ step)
-        assert rise_of_a_pair(lambda v: A @ v, P, d, y + s * step, y) > 0.0
+    # Step from y by a little against A d, which is not 0: the linear term wins over the quadratic.
+    step = 0.1 * (A @ d) / np.linalg.norm(A, 2)
+    s = 0.5 * (d @ A @ step) / abs(step @ A @ step)
+    assert rise_of_a_pair(lambda v: A @ v, P, d, y + s * step, y) > 0.0
 
 
 def test_theorem_2_fails_a_follower_settles_at_half_its_offset():

@@ -393,12 +393,6 @@ def test_a_weak_input_weakens_the_trim_thrust_too():
     assert lines["input scaling"].number == pytest.approx(-0.094, abs=6e-4)
 
 
-@pytest.fixture
-def echelon(echelon, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    return echelon
-
-
 def test_check_exits_by_what_is_promised(echelon):
     code, out, err = echelon("check", "paper")
     assert (code, err) == (0, "") and "Promised, by linearization" in out

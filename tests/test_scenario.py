@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import echelon.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
 from echelon.scenario import registry
-from echelon.scenario.part import resolve
+from echelon.scenario.part import accepted, resolve
 from echelon.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.scenario.scenario import (
     Fault,
@@ -232,6 +232,14 @@ def test_the_table_of_methods_says_what_their_classes_say(name):
     assert method.name == name and method.needs == entry.needs
     assert sorted([*entry.needs, *entry.takes]) == sorted(arguments)
     assert {*method.usual} <= {*method.needs}
+
+
+@pytest.mark.parametrize("role", ["leader", "follower"])
+def test_the_table_of_laws_says_what_their_classes_say(role):
+    for name, entry in getattr(registry, f"{role.upper()}_LAWS").items():
+        offered = {"leader": ("gain",), "follower": ("gain", "feedforward", "trim")}[role]
+        taken = set(accepted(resolve(entry))) & {*offered}
+        assert {*entry.needs, *entry.takes} == taken, name
 
 
 def test_yaml_1_2_decides_what_a_word_is(load, refused):

@@ -94,6 +94,8 @@ class Chunks:
         files = [self.folder / KEPT, *sorted((self.folder / INPUTS).rglob("*"))]
         digest = hashlib.sha256()
         for file in (file for file in files if file.is_file()):
+            # Names too, each ended by a byte that no name has: the same bytes under other names are
+            # other inputs.
             digest.update(file.relative_to(self.folder).as_posix().encode() + b"\0")
             digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
@@ -104,6 +106,7 @@ class Chunks:
         Raises:
             OSError: it cannot be written.
         """
+        # In memory first, since a file is written whole or not at all.
         content = io.BytesIO()
         np.savez(content, allow_pickle=False, **_arrays(stretch))
         write_whole(self.place / f"{stretch.first}.npz", content.getvalue())
@@ -117,6 +120,7 @@ class Chunks:
         while first != done:
             first = done
             try:
+                # A pickle would run what it holds, and a folder may come from others.
                 with np.load(self.place / f"{first}.npz", allow_pickle=False) as stored:
                     stretch = _stretch(first, dict(stored))
             except _DAMAGED:
@@ -134,6 +138,7 @@ class Chunks:
             return
         self.remove()
         shutil.rmtree(self.folder / INPUTS, ignore_errors=True)
+        # A folder in which a person has put something meanwhile is not empty, and stays.
         with contextlib.suppress(OSError):
             (self.folder / KEPT).unlink(missing_ok=True)
             self.folder.rmdir()

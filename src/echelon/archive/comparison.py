@@ -32,6 +32,7 @@ class Flights:
             (self.folder / RUNS).mkdir(parents=True, exist_ok=True)
             save_dataset(row.flight.result, self.folder / RUNS / f"{row.label}.nc")
         except OSError as error:
+            # The first: what fails after it mostly fails of the same.
             self.error = self.error or error
 
     def check(self) -> None:

@@ -8,7 +8,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import typer
 
@@ -22,6 +22,7 @@ from echelon.cli.doctor import doctor
 from echelon.cli.listing import list_, schema
 from echelon.cli.run import run
 from echelon.cli.stop import STOP, Ended
+from echelon.cli.streams import outlive_readers
 from echelon.cli.verify import verify
 from echelon.core.errors import EchelonError, ModelError
 
@@ -29,11 +30,10 @@ _EPILOG = (
     "Exit codes: 0 done, or promised; 1 not promised, refused by verify or doctor, or an agent "
     "left the chart of its equations; 2 bad input, or a file that cannot be written; 3 diverged; "
     "4 an optional part is not installed; 5 verified as far as it could be checked; 70 a fault of "
-    "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept. "
+    "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept; "
+    "141 done, and the reader of the output left before its end. "
     "ECHELON_CACHE names the folder where compiled code is kept between runs; `off` keeps none."
 )
-_PIPE_CLOSED: Final = 141
-"""128 + SIGPIPE, what shells report of a program whose reader has left."""
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -50,7 +50,7 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
     keep_compiled_code(os.environ)
-    with STOP.listen():
+    with outlive_readers(), STOP.listen():
         try:
             _call()
         except EchelonError as error:
@@ -65,20 +65,10 @@ def main() -> None:
 
 def _call() -> None:
     try:
-        try:
-            app()
-        finally:
-            # Here, since what fails after `main` has no exit code of ours.
-            sys.stdout.flush()
-    except SystemExit as left:
-        # What typer makes of it is 1, which means that nothing is promised.
-        if isinstance(left.__context__, BrokenPipeError):
-            raise SystemExit(_PIPE_CLOSED) from None
-        raise
-    except BrokenPipeError:
-        # Python would flush it once more.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(_PIPE_CLOSED) from None
+        app()
+    finally:
+        # Here, since what fails after `main` has no exit code of ours.
+        sys.stdout.flush()
 
 
 def _leave(sentence: str, code: int) -> None:

@@ -21,6 +21,7 @@ def check(
     from echelon.scenario.scenario import load_scenario
 
     checked = load_scenario(scenario, set_ or [])
+    # Not above: a typing error in the file is told without the wait for JAX.
     from echelon.scenario.build import build
     from echelon.studies.check import check as examine
 

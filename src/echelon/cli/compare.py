@@ -41,6 +41,7 @@ def compare(
     """Fly the consensus laws and an optimization-based method from the same starts."""
     from echelon.scenario.scenario import load_scenario
 
+    # First, so that `--set simulation.horizon` wins over it.
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
     checked = [load_scenario(each, changes) for each in scenarios]
     from echelon.archive.folder import claim_folders

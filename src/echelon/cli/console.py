@@ -38,6 +38,7 @@ def show_progress(quiet: bool) -> "Iterator[Progress | None]":
         TextColumn("steps, left"),
         TimeRemainingColumn(),
     )
+    # Standard error, so that the bar is seen while the report goes into a file.
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("simulating", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -40,6 +40,7 @@ def design(
     from echelon.archive.folder import claim_design
     from echelon.scenario.kept import files_of
 
+    # Before the study, which takes seconds: a name that is taken must not cost them.
     claim_design(out, figures, force, files_of(checked))
     from echelon.gains.file import save_gain
     from echelon.studies.design import design as study

@@ -16,6 +16,7 @@ def console() -> "Console":
     """Return a console that keeps tables whole where the output is no terminal."""
     from rich.console import Console
 
+    # Wider than any table here: a row that is folded is none to `grep` or `awk`.
     return Console() if sys.stdout.isatty() else Console(width=200)
 
 

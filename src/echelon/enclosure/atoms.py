@@ -93,6 +93,7 @@ class Atoms:
 
         The same `key` gives the same variable; a range of one point gives a number.
         """
+        # A number keeps polynomials short, and doubles no corners of a hull.
         if interval.lo == interval.hi:
             return constant(interval.lo)
         sources = frozenset().union(*(self.sources(p) for p in behind))
@@ -106,6 +107,8 @@ class Atoms:
         The same for each positive multiple of a border, and what is left of 1 for each negative
         one: where the border is 0, it may be anything between.
         """
+        # Scaled by one coefficient, all multiples of a border are one polynomial and have one
+        # unknown: that is how two `max` of one pair are known to bend together.
         lead = border.terms[max(border.terms, key=order)]
         if lead < 0:
             return constant(1) - self.side(-border)
@@ -131,6 +134,8 @@ class Atoms:
         # The lead times s is s d, which is settled, less s times the rest of d.
         rest = chosen * (border - Polynomial({lead: Fraction(1)}))
         settled = constant(_HALF) * (border + self.elementary("abs", border)) - rest
+        # What is put in place of a term holds the side beside smaller monomials alone, so this
+        # ends.
         done, left = constant(0), p
         while left.terms:
             top = max(left.terms, key=order)

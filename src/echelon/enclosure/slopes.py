@@ -115,6 +115,8 @@ _ONE = constant(1)
 
 _DERIVATIVES: dict[str, Callable[[_Made, Polynomial], Polynomial]] = {
     "reciprocal": lambda made, p: -made("reciprocal", p).power(2),
+    # Slopes are written in the function itself where they can be: its value is an unknown already,
+    # and a second one would widen the hull.
     "exp": lambda made, p: made("exp", p),
     "expm1": lambda made, p: made("exp", p),
     "log": lambda made, p: made("reciprocal", p),
@@ -123,6 +125,7 @@ _DERIVATIVES: dict[str, Callable[[_Made, Polynomial], Polynomial]] = {
     "sqrt": lambda made, p: constant(Fraction(1, 2)) * made("rsqrt", p),
     "rsqrt": lambda made, p: constant(Fraction(-1, 2)) * made("rsqrt", p).power(3),
     "tan": lambda made, p: _ONE + made("tan", p).power(2),
+    # At the ends of their range these have no slope, which `rsqrt` refuses.
     "asin": lambda made, p: made("rsqrt", _ONE - p * p),
     "acos": lambda made, p: -made("rsqrt", _ONE - p * p),
     "atan": lambda made, p: made("reciprocal", _ONE + p * p),
@@ -149,6 +152,7 @@ def _elementary(atoms: Atoms, name: str, p: Sloped) -> Sloped:
 
 
 def _quotient(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
+    # So all that is divided by b shares one unknown 1/b, and their ratios are not lost.
     return a * _reciprocal(atoms, b)
 
 
@@ -158,6 +162,7 @@ def _reciprocal(atoms: Atoms, p: Sloped) -> Sloped:
 
 
 def _whole_power(atoms: Atoms, p: Sloped, k: int) -> Sloped:
+    # Without the case 0 x^-1 would refuse a box that holds 0.
     slope = constant(k) * rules.whole_power(atoms, p.value, k - 1) if k else constant(0)
     return chain(rules.whole_power(atoms, p.value, k), (p, slope))
 
@@ -204,6 +209,7 @@ def _larger(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
 
 
 def _smaller(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
+    # Not a rule of its own: so the min of a pair has the same unknown side as its max.
     return -_larger(atoms, -a, -b)
 
 
@@ -281,6 +287,7 @@ def _and(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
 
 
 def _or(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
+    # By De Morgan, so that one rule alone says what two undecided answers make.
     return _not(atoms, _and(atoms, _not(atoms, a), _not(atoms, b)))
 
 

@@ -66,6 +66,7 @@ def _lag(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
     if worst is None or worst <= _LAG or not matched.fails or result.reference is None:
         return
     unit = "" if result.unit == "state" else f" {result.unit}"
+    # Behind a leader at rest nobody lags; what is left then has another cause.
     if np.ptp(result.reference, axis=0).max() > 0.0:
         yield Cause(
             "without feed-forward the followers do not know the leader's motion and lag: "
@@ -140,4 +141,6 @@ def grows(result: Result) -> bool:
     if result.outcome is Outcome.DIVERGED:
         return True
     first, last = sizes(result)
+    # Twice, since a last frame may catch an overshoot; and a start on the goals has rounding alone
+    # to grow from.
     return last > 2.0 * first + 1e-9

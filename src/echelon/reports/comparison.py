@@ -224,6 +224,7 @@ def _closest(rows: Sequence[Row]) -> str:
 
 def _best(rows: Sequence[Row], what: str, of: Callable[[Row], float | None], unit: str) -> str:
     """Tell who has the least of a number, and how far the next is behind."""
+    # Of NaN `>=` says no, and it would break the order.
     known = sorted(
         (value, row.label) for row in rows if (value := of(row)) is not None and value >= 0.0
     )
@@ -242,6 +243,7 @@ def _leader(rows: Sequence[Row]) -> str:
     if not values:
         return ""
     least, most = min(values, key=values.__getitem__), max(values, key=values.__getitem__)
+    # Most methods leave the leader's law as it is, and then rounding alone parts its runs.
     if values[most] <= 1.001 * values[least]:
         return f"The leader does alike under all, {values[least]:.3g} m."
     return (
@@ -255,6 +257,7 @@ def _cheapest(rows: Sequence[Row]) -> str:
     if len(known) < 2:
         return ""
     least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
+    # A run of one chunk is all compilation to the watch, and its computing time is 0.
     ratio = known[most] / max(known[least], 1e-12)
     if ratio < _ALIKE:
         return "All take about as long to compute."

@@ -85,6 +85,7 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
     if v is None or len(v.value) < 2 or not np.isfinite(v.value).all():
         return
     rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
+    # V' <= 0 is proved of the undisturbed loop that decays, and forbids nothing to others.
     excused = result.world.disturbance or found.hypotheses[Hypothesis.DECAYS].fails
     if forbidden and not excused:
         when = result.times[int(np.argmax(v.forbidden()))]
@@ -105,6 +106,7 @@ def _excuse(v: Lyapunov, found: Promise) -> str:
     coupled = found.hypotheses[Hypothesis.COUPLED]
     if coupled.fails:
         return coupled.text
+    # Drifts cancel within V', so that rounding leaves some 1e-16 of its largest value.
     broken = float(np.mean(v.drift > 1e-9 * np.abs(v.rate).max()))
     if broken:
         return f"Assumption 5 fails on {100.0 * broken:.0f} % of the frames"

@@ -109,6 +109,7 @@ def _labelled(
 
 def _representatives(all_: Sequence[_Row]) -> list[_Row]:
     def key(each: _Row) -> float:
+        # Whoever has no steady error has not come so far, and stands with the worst.
         return float("inf") if each.steady_rmse is None else each.steady_rmse
 
     ordered = sorted(all_, key=key)

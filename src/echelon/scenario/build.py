@@ -36,6 +36,7 @@ from echelon.network.graph import Graph
 from echelon.references.guide import Guide
 from echelon.references.reference import Reference, check_reference
 from echelon.scenario import registry
+from echelon.scenario.checks import section
 from echelon.scenario.own import own_code
 from echelon.scenario.part import Part, accepted, known, law_part, offered, part_of
 from echelon.scenario.scenario import Fault, Scenario, refuse
@@ -84,6 +85,7 @@ def build(scenario: Scenario) -> Built:
     """
     _check_scenario(scenario)
     faults = _Faults(scenario)
+    # Gains are computed here, and would keep 7 digits under another precision.
     with precision("float64"):
         model = graph = None
         with faults.at("simulation"):
@@ -96,6 +98,7 @@ def build(scenario: Scenario) -> Built:
         reference = None
         with faults.at("reference"):
             reference = _reference(scenario, model)
+        # Before the laws: without a model and a graph each would be blamed for theirs.
         faults.settle()
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
@@ -124,12 +127,12 @@ def _with_laws(
     with faults.at("leader"):
         reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
         leader = _leader(scenario, faults, model, graph, reference, reaction)
-    for section, named in (
+    for place, named in (
         (("initial", "spread"), scenario.initial.spread or {}),
         (("leader", "start_error"), scenario.leader.start_error),
     ):
         for name in named:
-            with faults.at(*section, name):
+            with faults.at(*place, name):
                 model.states_called(name)
     faults.settle()
     parts = Parts(
@@ -149,6 +152,7 @@ def _with_laws(
 
 def _initial(scenario: Scenario) -> Any:
     """Return spreads by state or group, and states by agent, in one mapping."""
+    # States have names and agents numbers, so that no key meets another.
     return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
 
 
@@ -234,6 +238,7 @@ def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> D
         return None
     for key in ("constant", "rms", "input_rms"):
         with faults.at("disturbance", key):
+            # Each alone, so that its fault is told at its own line.
             Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
     return Disturbance(**spec.model_dump())
 
@@ -294,6 +299,7 @@ def _follower(
 ) -> Law | None:
     spec = scenario.follower
     part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
+    _check_keys(scenario, faults, "follower", part)
     offers: dict[str, Any] = {"feedforward": spec.feedforward, "trim": spec.trim}
     if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
@@ -301,6 +307,17 @@ def _follower(
         if "gain" not in offers:
             return None
     return _law(part, offers, model, graph)
+
+
+def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:
+    """Note the keys of a role that its law does not take, which of one's own its class knows."""
+    for key in section(scenario.data, role):
+        if key in ("gain", "feedforward", "trim") and key not in accepted(part.cls):
+            with faults.at(role, str(key)):
+                raise ScenarioError(
+                    f"got a key that the law `{part.what}` does not take, allowed are those that "
+                    "its class names."
+                )
 
 
 def _law(part: Part, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
@@ -320,6 +337,7 @@ def _leader(
 ) -> Law | None:
     spec = scenario.leader
     part = law_part(scenario, registry.LEADER_LAWS, spec.law)
+    _check_keys(scenario, faults, "leader", part)
     if spec.reacts and "reaction" not in accepted(part.cls):
         raise ScenarioError(
             f"`reacts` is true, and the law `{part.what}` cannot be told to react; use `tracking`."

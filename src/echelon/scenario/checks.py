@@ -40,6 +40,16 @@ _FORMATION_KEYS: _Taken = dict.fromkeys(registry.FORMATIONS, ((), ("spacing",)))
 }
 _GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in registry.METHODS.items()}
 _GAIN_KEYS["file"] = ((), ())
+_LAW_KEYS: dict[str, _Taken] = {
+    "leader": {
+        # Where a leader starts is the run's, and who cannot react is told so by the builder.
+        name: (entry.needs, ("reacts", "start_error", *entry.takes))
+        for name, entry in registry.LEADER_LAWS.items()
+    },
+    "follower": {
+        name: (entry.needs, entry.takes) for name, entry in registry.FOLLOWER_LAWS.items()
+    },
+}
 
 
 def section(data: Part, *path: str) -> Part:
@@ -50,6 +60,20 @@ def section(data: Part, *path: str) -> Part:
     return data
 
 
+def law_of(data: Part, role: str) -> object:
+    """Return the law of a role, as the file names it or by default."""
+    default = "consensus"
+    if role == "leader":
+        default = "passive" if data.get("reference") is None else "tracking"
+    return section(data, role).get("law", default)
+
+
+def surplus_keys(role: str, law: object) -> list[str]:
+    """Return the keys of a role that a law does not take; none of a law that no table has."""
+    table = _LAW_KEYS.get(role, {})
+    return [] if not isinstance(law, str) or law not in table else _foreign(law, table)
+
+
 def number_of(value: object) -> float | None:
     """Return a real number as a float, anything else (a truth value too) as None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -57,10 +81,12 @@ def number_of(value: object) -> float | None:
     try:
         return float(value)
     except OverflowError:
+        # A whole number of 400 digits has no float.
         return math.inf
 
 
 def _whole(value: object) -> int | None:
+    # To `isinstance` a truth value is an int.
     return value if type(value) is int else None
 
 
@@ -101,14 +127,20 @@ def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator
     for key in needed:
         if part.get(key) is None:
             yield (*path, key), f"got nothing, `{choice}` needs this key."
-    foreign = {key for pair in table.values() for keys in pair for key in keys}
+    foreign = _foreign(choice, table)
     allowed = are(needed + optional) if needed + optional else "is no other key"
     for key in part:
-        if key in foreign - {*needed, *optional}:
+        if key in foreign:
             yield (
                 (*path, str(key)),
                 f"got a key that `{choice}` does not take, allowed beside it {allowed}.",
             )
+
+
+def _foreign(choice: str, table: _Taken) -> list[str]:
+    """Return the keys that other choices take, and this one does not."""
+    keys = dict.fromkeys(key for pair in table.values() for keys in pair for key in keys)
+    return [key for key in keys if key not in (*table[choice][0], *table[choice][1])]
 
 
 def _choices(data: Part) -> Iterator[Finding]:
@@ -116,6 +148,7 @@ def _choices(data: Part) -> Iterator[Finding]:
     yield from _taken(("graph",), graph, _choice(graph, "edges"), _GRAPH_KEYS)
     yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
     for role in ("leader", "follower"):
+        yield from _taken((role,), section(data, role), law_of(data, role), _LAW_KEYS[role])
         gain = section(data, role, "gain")
         sources = [key for key in ("file", "method", "python") if gain.get(key) is not None]
         if len(sources) > 1:
@@ -225,7 +258,7 @@ def _members(data: Part) -> Iterator[Finding]:
 
 def _following(data: Part) -> Iterator[Finding]:
     """Yield a leader that tracks nothing, and a reference that nobody tracks."""
-    law, given = section(data, "leader").get("law"), data.get("reference") is not None
+    law, given = law_of(data, "leader"), data.get("reference") is not None
     if law in _TRACKS and not given:
         yield (
             ("leader", "law"),

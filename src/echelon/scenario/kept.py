@@ -1,10 +1,10 @@
 """A scenario with all the files that it names, so that its folder alone repeats the run."""
 
 import copy
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from echelon.scenario.override import named_files
 from echelon.scenario.scenario import Scenario
 from echelon.scenario.yaml import KeyPath, dump_yaml
 
@@ -17,7 +17,7 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
     """
     data = copy.deepcopy(scenario.data)
     files: dict[str, Path] = {}
-    for path, (file, rest) in list(_named(data, ())):
+    for path, file, rest in list(named_files(data, ())):
         source = (scenario.folder / file).resolve()
         name = _free(f"{place}/{source.name}", source, files)
         files[name] = source
@@ -28,18 +28,6 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
 def files_of(scenario: Scenario) -> list[Path]:
     """Return the file of a scenario and all that it names."""
     return [scenario.file, *self_contained(scenario, "")[1].values()]
-
-
-def _named(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, tuple[str, str]]]:
-    """Yield the place of every file in plain data, its name, and what stands after that."""
-    if isinstance(value, dict | list):
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _named(item, (*path, key))
-    elif isinstance(value, str) and path[-1] == "file":
-        yield path, (value, "")
-    elif isinstance(value, str) and path[-1] == "python":
-        file, colon, name = value.rpartition(":")
-        yield path, (file, colon + name)
 
 
 def _free(name: str, source: Path, taken: dict[str, Path]) -> str:

@@ -10,9 +10,13 @@ from echelon.scenario.scenario import json_schema
 
 _HEAD = """# Scenario keys
 
-All keys of a scenario file, made by `echelon.scenario.keys` from the schema that checks it.
+All keys of a scenario file; a first one, line by line, is in the [tutorial](tutorial.md), and words
+such as *trim* and *gain* in the [glossary](glossary.md). A *section* is a mapping with the keys of
+its own table below; where no default stands, a key may be left out. *By state or group* means a
+mapping from names of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates.
 Numbers are in SI units and angles in rad; *1* marks a number without a unit. `python:
-file.py:Class` stands for a class of [your own](extending.md).
+file.py:Class` stands for a class of [your own](extending.md). The page is made by
+`echelon.scenario.keys` from the schema that checks the file.
 """
 _COLUMNS = ("key", "what", "unit", "default", "meaning")
 

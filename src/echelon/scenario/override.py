@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from echelon.scenario.checks import SOURCES
+from echelon.scenario.checks import SOURCES, surplus_keys
 from echelon.scenario.yaml import Document, KeyPath
 
 
@@ -14,22 +14,26 @@ def settle_overrides(document: Document) -> Document:
 
     A path that the command line sets is relative to the working folder, and becomes absolute.
     """
+    # The document that was read stays what the file says.
     data = copy.deepcopy(document.data)
     set_ = [path for path, _ in document.overrides]
     for path in set_:
         _make_absolute(data, path)
         part = _at(data, path[:-1])
         for rival in _rivals(path, part):
+            beside = (*path[:-1], rival)
             # What the command line sets too is for the checks to refuse.
-            if (*path[:-1], rival) not in set_:
+            if not any(each[: len(beside)] == beside for each in set_):
                 del part[rival]
     return document._replace(data=data)
 
 
 def _rivals(path: KeyPath, part: Any) -> list[Any]:
-    """Return the keys beside a path that mean the same thing in another way."""
+    """Return the keys beside a path that mean the same in another way, or nothing beside it."""
     if not isinstance(part, dict) or part.get(path[-1]) is None:
         return []
+    if path[1:] == ("law",):
+        return [key for key in surplus_keys(str(path[0]), part["law"]) if key in part]
     if path[-2:-1] == ("gain",):
         # A file holds all that the other keys say.
         names = [*part] if path[-1] == "file" else ["file", "method", "python"]

@@ -48,10 +48,13 @@ def _is_own(value: object, kind: type) -> bool:
 
 def _imported(file: Path) -> Any:
     """Return the module in a file, run anew."""
+    # By its place and not by `import`: the folder need not be on the path, and a file that was
+    # changed since must be read again.
     spec = importlib.util.spec_from_file_location(f"echelon_user_{file.stem}", file)
     if spec is None or spec.loader is None:
         raise ScenarioError(f"the file `{file}` is no Python file.")
     module = importlib.util.module_from_spec(spec)
+    # Before it runs, as `import` does: dataclasses look up their own module there.
     sys.modules[spec.name] = module
     with own_code(f"the file `{file}` does not import"):
         spec.loader.exec_module(module)

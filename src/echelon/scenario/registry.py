@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """Where a named part lives and what it is, in one line; of a gain method also its keys.
+    """Where a named part lives and what it is, in one line; of methods and laws also their keys.
 
     Attributes:
         target: `module:Attribute`.
@@ -65,7 +65,8 @@ REFERENCES = {
     ),
 }
 
-# The keys are the arguments of the class; they stand here too since the class needs JAX.
+# The keys of methods and laws are the arguments of the class; they stand here too since the class
+# needs JAX.
 METHODS = {
     "riccati": Entry(
         "echelon.gains:Riccati",
@@ -108,7 +109,11 @@ GAIN_KEYS = tuple(dict.fromkeys(("method", *_ARGUMENTS, "python", "file")))
 """All keys of a gain, each once."""
 
 FOLLOWER_LAWS = {
-    "consensus": Entry("echelon.laws:Consensus", "u = u_ff - c R^-1 g(x)^T P (e + d)"),
+    "consensus": Entry(
+        "echelon.laws:Consensus",
+        "u = u_ff - c R^-1 g(x)^T P (e + d)",
+        takes=("gain", "feedforward", "trim"),
+    ),
     "agreement": Entry(
         "echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"
     ),
@@ -117,12 +122,15 @@ FOLLOWER_LAWS = {
 
 LEADER_LAWS = {
     "tracking": Entry(
-        "echelon.laws:Tracking", "flatness feed-forward and Riccati feedback on the reference"
+        "echelon.laws:Tracking",
+        "flatness feed-forward and Riccati feedback on the reference",
+        takes=("gain",),
     ),
     "lqr": Entry("echelon.laws:PathLQR", "time-varying LQR along the reference, of any model"),
     "optimal-tracking": Entry(
         "echelon.optimal.leader:OptimalTracking",
         "a plan of least tracking error, and feedback about it",
+        takes=("gain",),
     ),
     "agreement": FOLLOWER_LAWS["agreement"],
     "passive": FOLLOWER_LAWS["passive"],

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.scenario import sections
-from echelon.scenario.checks import cross_faults, number_of, section
+from echelon.scenario.checks import cross_faults, law_of, number_of, section
 from echelon.scenario.override import settle_overrides
 from echelon.scenario.values import FolderName, Seed
 from echelon.scenario.yaml import (
@@ -130,8 +130,7 @@ def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
     filled = {key: value for key, value in data.items() if value is not None}
     leader, report = filled.get("leader", {}), filled.get("report", {})
     if isinstance(leader, dict):
-        law = "tracking" if "reference" in filled else "passive"
-        filled["leader"] = {"law": law, **leader}
+        filled["leader"] = {**leader, "law": law_of(filled, "leader")}
     horizon = number_of(section(data, "simulation").get("horizon")) or 0.0
     window = number_of(section(data, "report").get("steady_window", math.inf))
     # A window as long as the run would count its transient as steady.
@@ -222,6 +221,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     """
     file, name = _found(source)
     try:
+        # Some editors begin a file with a byte order mark, which is no part of its first key.
         text = file.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name}: this file cannot be read as UTF-8 text: {error}.") from error

@@ -40,7 +40,7 @@ def _either(*keys: str) -> ConfigDict:
 
 @final
 class ModelSpec(BaseModel, **_either("name", "python")):
-    """The agents' model: a name of the registry, or a class in a file of the user's."""
+    """What all agents are: a bundled model by its name, or a class in a file of yours."""
 
     name: Annotated[str, OneOf(registry.MODELS)] | None = None
     """Name of a model."""
@@ -65,24 +65,28 @@ class PlantSpec(BaseModel, **STRICT):
 
 @final
 class GraphSpec(BaseModel, **_either("edges", "name")):
-    """Who hears whom: an edge list, or a generator; undirected."""
+    """Who hears whom, both ways: a list of edges, or the name of a graph that is made.
+
+    Agents are numbered from 0.
+    """
 
     edges: Edges | None = None
     """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1."""
     name: Annotated[str, OneOf(registry.GRAPHS)] | None = None
-    """Name of a generator."""
+    """Name of a graph that is made, from the keys below."""
     agents: Count | None = None
-    """Number of agents; with `edges` the default is the largest number + 1."""
+    """Number of agents, leaders included; with `edges` the default is the largest number + 1."""
     rows: Count | None = None
-    """Rows of the generator `grid`."""
+    """Rows of the graph `grid`."""
     columns: Count | None = None
-    """Columns of the generator `grid`."""
+    """Columns of the graph `grid`."""
     radius: Annotated[Positive | None, Unit("sides of the square")] = None
-    """Reach in the generator `geometric`, in sides of its unit square."""
+    """Of the graph `geometric`: agents at random places of a unit square hear each other up to this
+    distance, in sides of the square."""
     seed: Seed = 0
-    """Seed of the generator `geometric`."""
+    """Seed of the places in the graph `geometric`."""
     leaders: Agents = Field(default=(0,), min_length=1)
-    """Numbers of the leaders."""
+    """Numbers of the agents that lead; all others follow."""
 
 
 @final
@@ -90,7 +94,8 @@ class FormationSpec(BaseModel, **STRICT):
     """Each agent's goal relative to the leader's: offsets or a named shape; none means zero."""
 
     offsets: Annotated[dict[int, Numbers] | None, Unit("the position's, mostly m")] = None
-    """Offset of an agent, in the model's units of position, usually m."""
+    """Offset of each agent, as in `{1: [1, 0, 0]}`: a number for each coordinate of the position,
+    usually m, or for each state; 0 for an agent that is not named."""
     name: Annotated[str, OneOf(registry.FORMATIONS)] | None = None
     """Name of a shape."""
     spacing: Annotated[Positive, Unit("m")] = 1.0
@@ -118,9 +123,9 @@ class OwnClass(BaseModel):
 
 @final
 class ReferenceSpec(BaseModel):
-    """What the leader tracks: a name of the registry or a class in a file of the user's.
+    """What the leader tracks: a bundled reference by its name, or a class in a file of yours.
 
-    That reference's own keys stand beside it.
+    That reference's own keys stand beside it, such as `radius` beside `name: circle`.
     """
 
     model_config = _either("name", "python") | ConfigDict(extra="allow")
@@ -170,7 +175,8 @@ class GainSpec(BaseModel):
     coupling: Annotated[Positive | None, Unit("1")] = None
     """Coupling strength, without unit; default what the method finds."""
     domain: Annotated[dict[str, Numeric] | None, Unit("the states'")] = None
-    """Half-width, or `[lower, upper]`, by state, group or normalised input."""
+    """States about the trim on which a rate is proved: a half-width, or `[lower, upper]`, by state,
+    group or normalised input."""
     rate: Annotated[Positive | None, Unit("1/s")] = None
     """Rate that the method `contraction` is asked for, 1/s."""
     exact: bool | None = None
@@ -207,11 +213,13 @@ class LeaderSpec(BaseModel, **STRICT):
     """Name of a law, or one of one's own, `{python: file.py:Class}` with its own keys; default
     `tracking` with a reference, `passive` without."""
     reacts: bool = False
-    """Whether the leader answers to its neighbours."""
+    """Whether the leader answers to its neighbours too; with the law `tracking`."""
     start_error: Annotated[dict[str, float], Unit("the states'")] = {}
-    """Error of the start, by state or group of states, in the states' units."""
+    """How far the leader starts from its reference, or from its trim without one, by state or group
+    of states, in the states' units."""
     gain: GainSpec | None = None
-    """Gain of the leader's own tracking."""
+    """Gain of the leader's own tracking, under `tracking` and `optimal-tracking`; default the
+    model's Riccati gain."""
 
 
 @final
@@ -223,11 +231,12 @@ class FollowerSpec(BaseModel, **STRICT):
     gain: GainSpec = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
     feedforward: Annotated[str, OneOf(map(str, Feedforward))] = str(DEFAULT_FEEDFORWARD)
-    """What every follower is sent of the same step: `relay`, the leader's input; `relay-velocity`,
-    the velocity that it makes; `parent`, the input of the neighbour nearer to the leader, on a
-    tree."""
+    """What every follower is sent of the same step: `none`, nothing; `relay`, the leader's input;
+    `relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer to the
+    leader, on a tree."""
     trim: bool = True
-    """Whether the law starts from the trim input, or from zero."""
+    """Whether the law starts from the trim input, such as a quadrotor's weight, or from zero, as
+    the paper prints it."""
 
 
 @final
@@ -268,13 +277,14 @@ class SimulationSpec(BaseModel, **STRICT):
     dt: Annotated[Positive, Unit("s")]
     """Length of a step, s; at most the horizon."""
     integrator: Annotated[str, OneOf(registry.INTEGRATORS)] = "rk4"
-    """Name of the method."""
+    """How a step is computed, the input held over it: `rk4`, Runge-Kutta of order 4; `euler`,
+    x + dt (f + g u); `printed`, the paper's Algorithm 1 to the letter, without dt."""
     limits: bool = True
-    """Whether the actuators' limits hold."""
+    """Whether the actuators' limits act; else any input is delivered."""
     store_every: Annotated[Count, Unit("steps")] = 1
-    """Steps from one stored sample to the next."""
+    """Steps from one stored frame to the next; means are over all steps."""
     precision: Annotated[str, OneOf(("float64", "float32"))] = "float64"
-    """Arithmetic used."""
+    """Arithmetic of the run; gains and promises are always in float64."""
     engine: Annotated[str, OneOf(ENGINES)] = "auto"
     """What steps the agents: `jax`, or `native` code for this machine's vectors, which differs by
     rounding; `auto` takes that for long runs where it can."""

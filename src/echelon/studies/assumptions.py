@@ -21,6 +21,8 @@ from echelon.promises.statement import Hypothesis, Line, Statement
 from echelon.references.demand import Asked, asked, infeasible, too_fast
 from echelon.studies.finite_condition import finite_condition
 
+# Far above what rounding makes of an eigenvalue 0, and far below any rate of use: at 1e-9 1/s an
+# error takes 30 years to fall to 1/e.
 ZERO = 1e-9
 _HOLDS, _PROOF = Verdict.HOLDS, Kind.PROOF
 _BENT = "the model bends at the trim, and has no linearization there"
@@ -30,8 +32,10 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     """Yield what the paper asks of agents and graph: Assumptions 1, 2 and 6, Lemmas 1 to 3."""
     graph = parts.graph
     low, high = graph.spectrum().low, graph.spectrum().high
+    # A model is asked for f and g without a time, so that none can break it.
     text = "f and g depend on x alone"
     yield Statement(Line.AUTONOMOUS, _HOLDS, _PROOF, text=text)
+    # The paper has unit weights; its lemmas need only that they are positive.
     unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
     text = "connected and static" + ("" if unit else "; weights need not be 1")
     shown = f"{shown}, {len(graph.edges)} edges"
@@ -45,6 +49,8 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     yield Statement(Line.POSITIVE, _HOLDS, _PROOF, low, f"{low:.6g}", "grounded Laplacian")
     text = "the LMI is not used"
     yield Statement(Line.SCHUR, Verdict.NOT_NEEDED, _PROOF, text=text)
+    # A follower beside a leader keeps the weight of that edge on its diagonal and loses the
+    # leader's column, so its row sums to that weight.
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
@@ -81,6 +87,7 @@ def _leader_line(promise: Promise) -> Statement:
     if not promise.linear:
         return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
     text, remedy = "at the trim", ""
+    # So asked that NaN counts as not damped.
     if not slow < -ZERO:
         text, remedy = "the tracking error is not damped at the trim", "give `leader.gain` another "
         remedy += "method"
@@ -115,6 +122,8 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     A, P = promise.loop.linear.A, promise.loop.closed.P
     slope = P @ A + A.T @ P
     worst = float(np.linalg.eigvalsh(slope)[-1])
+    # Where a position does not enter the drift, A e = 0 and e'(P A + A'P) e = 0: the largest
+    # eigenvalue is then 0 at best, and rounding must not make it fail.
     holds = worst <= ZERO * max(1.0, float(np.abs(slope).max()))
     found = None if holds else obstacle(A[None])
     text, remedy = "the drift does not expand P", ""
@@ -131,6 +140,9 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
 
 def _printed_lmi(parts: Parts, promise: Promise) -> float:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
+    # It fails at any size for one reason: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
+    # 2 s |X v|^2 + O(s^2) > 0. Four followers show it, and eigenvalues cost the cube of their
+    # number.
     few = list(parts.graph.followers[:4])
     goals = np.asarray(parts.model.trim[0]) + parts.formation.offsets[few]
     drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[few]

@@ -22,8 +22,10 @@ from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
 from echelon.promises.promise import promise
 
+# Odd, so that the middle of a grid is the goal; two starts lie 1/20 of its half-width apart.
 SIDE = 41
 _AGENTS = 6000  # followers of all starts together; a slice of larger graphs is coarser
+# Slower loops are not run for longer: what a start must fall to grows with the time that it has.
 _STEPS = 3000
 _FARTHEST = 30.0  # in the states' units, and a half turn for angles
 
@@ -43,6 +45,7 @@ class Slice(NamedTuple):
 
     def extents(self, radius: float) -> Array:
         """Return how far the ellipse s'form s = radius^2 reaches along both axes."""
+        # The largest s_k on s'form s = r^2 is r sqrt((form^-1)_kk), by Lagrange's multipliers.
         return radius * np.sqrt(np.diag(np.linalg.inv(self.form)))
 
     @property
@@ -52,6 +55,7 @@ class Slice(NamedTuple):
 
     def ellipse(self, radius: float, points: int) -> Array:
         """Return points (points, 2) of the ellipse of a radius."""
+        # With form = L L', s = L'^-1 y takes the circle |y| = r to s'form s = r^2.
         angles = 2.0 * np.pi * np.arange(points) / points
         round_ = np.column_stack([np.cos(angles), np.sin(angles)])
         return radius * np.linalg.solve(np.linalg.cholesky(self.form).T, round_.T).T
@@ -87,10 +91,14 @@ def trial(parts: Parts, settings: Settings) -> Trial:
     assert isinstance(parts.drive, Laws)
     rest = np.tile(np.asarray(model.trim[0], float), (graph.agents, 1))
     laws = Laws(TrimInput(), parts.drive.follower)
+    # Offsets that are symmetries move errors as none do, and a leader that rests excites nobody:
+    # what is left to see is the loop.
     alone = Parts(model, graph, Formation(np.zeros_like(rest)), laws, initial=rest)
     prepared = prepare(alone, settings)
     loop = assemble(prepared.problem, laws.leader, laws.follower)
     slow = -promise(parts, settings).loop.slowest
+    # After six time constants the slowest mode is at e^-6 = 1/400, and e^-3 = 1/20 is asked for:
+    # the transient before it may cost the rest.
     steps = int(np.clip(np.ceil(6.0 / (slow * dt)), 1, _STEPS))
     return Trial(prepared.parts, loop, dt, steps, float(np.exp(-0.5 * slow * steps * dt)))
 
@@ -103,13 +111,16 @@ def slice_of(parts: Parts, states: tuple[int, int]) -> Slice:
     for k in states:
         angle = model.state_units[k] == "rad"
         low, high = model.chart.get(model.state_names[k], (-np.inf, np.inf))
+        # On the border of a chart f need not be finite, as at a pitch of 90 degrees.
         room = 0.98 * min(high - trim[k], trim[k] - low)
         reach.append(min(room, np.pi if angle else _FARTHEST))
+    # All deviate alike, so the sum over followers is one's form times their number.
     return Slice(states, followers * gain.P[np.ix_(states, states)], np.array(reach))
 
 
 def side_of(followers: int) -> int:
     """Return how many starts a side of the grid has, an odd number."""
+    # All starts run as one batch: side^2 times the followers is what memory and time depend on.
     return int(np.clip(np.sqrt(_AGENTS / followers), 11, SIDE)) // 2 * 2 + 1
 
 
@@ -123,6 +134,8 @@ def observed_radius(run: Trial, plane: Slice) -> float:
     radii = np.geomspace(1e-3 * plane.largest, plane.largest, side)
     rings = np.stack([plane.ellipse(r, side) for r in radii])
     tried = np.all(np.abs(rings) <= plane.reach, axis=2)
+    # A start beyond reach becomes the goal, which converges: rings keep their shape, and what was
+    # not tried counts against none.
     starts = np.where(tried[..., None], rings, 0.0).reshape(-1, 2)
     held = np.all(converged(run, plane, starts).reshape(side, side), axis=1)
     count = side if bool(held.all()) else int(np.argmin(held))
@@ -212,6 +225,8 @@ def _telling(model: ControlAffine) -> tuple[int, int]:
     groups = model.state_groups
     if "velocity" in groups and "attitude" in groups:
         moved, turned = model.states_called("velocity"), model.states_called("attitude")
+        # A tilt turns the thrust aside: the angle with the largest entry of A is the one that
+        # drives a velocity.
         push = np.abs(linearize(model).A[np.ix_(moved, turned)])
         row, column = np.unravel_index(int(push.argmax()), push.shape)
         return moved[row], turned[column]

@@ -70,6 +70,7 @@ class Row(NamedTuple):
         """When the last follower came within 1 cm for good, s; None where one did not."""
         times = [each.settling_time for each in self.numbers.followers] if self.numbers else []
         known = [time for time in times if time is not None]
+        # The swarm has settled when all have; those that did say nothing for one that did not.
         return max(known) if known and len(known) == len(times) else None
 
     @property
@@ -87,6 +88,7 @@ class Row(NamedTuple):
         """Root mean square of the followers' normalized inputs about the trim."""
         values = [each.effort for each in self.numbers.followers] if self.numbers else []
         known = [value for value in values if value is not None]
+        # The mean of squares and not of their roots, so that it is that of all inputs together.
         return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
     def _worst(self, name: str) -> float | None:
@@ -198,6 +200,7 @@ def _with_starts(parts: Parts, settings: Settings) -> Parts:
     with precision("float64"):
         drive = parts.drive.prepare(parts.model, parts.graph)
         states = initial_states(parts.replace(drive=drive), settings.seed)
+    # The leader's error is in the states already, and would be added once more.
     return parts.replace(initial=states, start_error={})
 
 
@@ -253,6 +256,7 @@ def _own_label(parts: Parts, rows: list[Row]) -> str | None:
     """Return what to call the scenario's own drive; None where a row has flown it already."""
     drive = parts.drive.prepare(parts.model, parts.graph)
     flown = (row.flight.result.drive for row in rows if row.flight is not None)
+    # By value, gains included: a scenario that says by hand what a method is would else fly twice.
     if any(eqx.tree_equal(drive, each) for each in flown):
         return None
     gain, feedforward = drive.gain, drive.feedforward
@@ -282,6 +286,7 @@ def _reference(parts: Parts) -> Any:
 
 
 _DRIVES: Mapping[str, DriveOf] = {
+    # The printed law has neither the leader's input nor a trim input.
     "literal": _consensus(_synthesized(FixedGain()), Feedforward.NONE, trim=False),
     "riccati-relay": _consensus(_riccati, Feedforward.RELAY),
     "riccati": _consensus(_riccati, Feedforward.NONE),

@@ -222,6 +222,7 @@ def _tried(method: type[Method], arguments: dict[str, Any], built: Built) -> Des
         gain = synthesize(parts.model, parts.graph, method(**arguments))
     except EchelonError as error:
         return Design(name, None, reason=str(error), seconds=time.perf_counter() - began)
+    # Of the synthesis alone; what is promised is computed alike for all.
     seconds = time.perf_counter() - began
     parts = with_gain(parts, gain)
     found = promise(parts, settings)
@@ -235,7 +236,11 @@ def _wish(method: str, missing: list[str], parts: Parts) -> str:
     state = [*model.state_groups, *model.state_names][0]
     shown = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
     keys = ", ".join(shown.get(key, f"{key}: ...") for key in missing)
-    return f"give `follower.gain={{method: {method}, {keys}}}` to try it"
+    gain = f"{{method: {method}, {keys}}}"
+    if parts.drive.gain is None:
+        # The scenario's own law takes none, so that a gain beside it would be refused.
+        return f"give `follower={{law: consensus, gain: {gain}}}` to try it"
+    return f"give `follower.gain={gain}` to try it"
 
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
@@ -269,6 +274,7 @@ def _advice(gain: Gain, parts: Parts) -> str:
     followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
     if gain.inner is None or followers > _ADVISED:
         return ""
+    # The last follower must stay one, and a complete graph has no pair left to link.
     more = int(followers > 1), int(len(graph.edges) < pairs)
     return speedup(parts.model, graph, gain, *more).sentence()
 

@@ -64,6 +64,7 @@ def checks() -> Iterator[Check]:
 
 
 def _double_precision() -> Check:
+    # In float32 it would be off by 1e-8.
     third = float(jnp.asarray(1.0) / 3.0)
     return Check(
         "computing is in float64 without a flag",
@@ -106,6 +107,7 @@ def _models() -> Check:
 
 
 def _spectra() -> Check:
+    # The paper's tree. By hand: det(L - x) = (1 - x) (x^2 - 4 x + 1).
     tree = Graph.from_edges([(0, 1), (1, 2), (1, 3)]).spectrum().eigenvalues
     off = float(np.abs(tree - np.array([2.0 - np.sqrt(3.0), 1.0, 2.0 + np.sqrt(3.0)])).max())
     return Check(
@@ -124,6 +126,8 @@ def _order() -> Check:
         return jax.lax.fori_loop(0, steps, step, x)
 
     coarse, fine, finest = (end(steps) for steps in (20, 40, 80))
+    # Halving a step divides the error by 2^4, but for its next order: 3.8 leaves room for that and
+    # none for order 3.
     order = float(np.log2(jnp.linalg.norm(coarse - fine) / jnp.linalg.norm(fine - finest)))
     return Check("the Runge-Kutta step has order 4", order > 3.8, f"measured {order:.2f}")
 
@@ -134,6 +138,7 @@ def _flatness() -> Check:
 
     t = jnp.asarray(1.3)
     (x, u), (rate, _) = jax.jvp(partial(reference.follow, model), (t,), (jnp.ones_like(t),))
+    # An identity of the exact map, so that nothing but rounding may be left.
     off = float(jnp.abs(rate - model.velocity(x, u)).max())
     return Check(
         "the quadrotor's flatness map solves its equations", off < 1e-9, f"residual {off:.1g}"

@@ -64,11 +64,14 @@ def finite_condition(
     check_definite("P", P)
     offsets = formation.offsets
     drifts = goal_drifts(model, offsets, law)
+    # Relative to f; absolute where f is near 0, since it may be the difference of larger terms.
     size = max(1.0, float(np.abs(drifts).max()))
     least = float(np.linalg.eigvalsh(P)[0])
     if float(np.ptp(drifts, axis=0).max()) <= _ZERO * size:
         verdict = Verdict.VACUOUS if least >= 1.0 - _ZERO else Verdict.FAILS
         return FiniteCondition(verdict, 0.0, (0, 0), least, len(offsets))
+    # Spread over all: agents next to each other in number mostly are in space, and the first
+    # thousand would be one corner of the formation.
     some = np.unique(np.linspace(0, len(offsets) - 1, min(_MOST, len(offsets))).astype(int))
     largest, (i, j) = _largest(P, offsets[some], drifts[some])
     holds = largest <= _ZERO * size * float(np.abs(P).max()) and least >= 1.0 - _ZERO

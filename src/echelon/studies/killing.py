@@ -48,7 +48,9 @@ def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[fl
     # A hull takes a second, and one slope that is not zero says what it would.
     if not slopes.any() and has_constant_input_map(model, domain):
         return 0.0, Kind.PROOF
+    # P is symmetric, so that dg'P is the transpose of P dg.
     weighted = P @ np.moveaxis(slopes, 2, 1)
+    # Any root of P^-1 gives the eigenvalues of P^-1 (P dg + dg'P), and Cholesky's costs least.
     root = np.linalg.inv(np.linalg.cholesky(P))
     values = np.linalg.eigvalsh(root @ (weighted + weighted.swapaxes(-1, -2)) @ root.T)
     return 0.5 * float(np.abs(values).max()), Kind.SAMPLES
@@ -66,5 +68,6 @@ def _near(model: ControlAffine) -> Domain:
     reach, trim = np.full(n, _NEAR), np.asarray(model.trim[0], float)
     for name, (low, high) in model.chart.items():
         k = model.state_names.index(name)
+        # Half way to the border of the chart, near which slopes may grow without bound.
         reach[k] = min(_NEAR, 0.5 * (trim[k] - low), 0.5 * (high - trim[k]))
     return Domain(-reach, reach, np.zeros(m), np.zeros(m))

@@ -73,6 +73,7 @@ class _Push(NamedTuple):
 def _push(model: ControlAffine) -> _Push:
     """Return accelerations of a vehicle, or else of all states; positions, or else all states."""
     n, groups = len(model.state_names), model.state_groups
+    # Wind is a force, and enters a vehicle's equations as an acceleration alone.
     pushed = model.states_called("velocity") if "velocity" in groups else tuple(range(n))
     names = ", ".join(f"`{model.state_names[k]}`" for k in pushed)
     units = {model.state_units[k] for k in pushed}

@@ -59,6 +59,7 @@ def speedup(
     now = time_constant(model, graph, gain)
     with_leaders = time_constant(model, graph.with_leaders(led), gain)
     with_edges = time_constant(model, graph.with_edges(linked), gain)
+    # Infinity is not below infinity: what stays unstable is no speedup.
     if not with_leaders < now:
         led, with_leaders = (), now
     if not with_edges < now:
