@@ -3,7 +3,7 @@
 from echelon.kernels.drivers import program
 from echelon.kernels.frame import SLOTS, Body, Plan, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
-from echelon.kernels.native import Code, aligned, is_installed
+from echelon.kernels.native import Code, aligned, is_installed, vectors
 from echelon.kernels.scalar import Graph, Node
 
 __all__ = [
@@ -20,4 +20,5 @@ __all__ = [
     "nodes",
     "program",
     "stride",
+    "vectors",
 ]

@@ -43,6 +43,20 @@ def is_installed() -> bool:
     return True
 
 
+_MODEL = "jitdefault"
+_WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256}
+
+
+def vectors() -> str:
+    """Return what native code computes with on this machine, in words."""
+    if not is_installed():
+        return "none; install `echelon-formation[fast]`"
+    has = set(features().split(","))
+    width = next((bits for name, bits in _WIDTHS.items() if f"+{name}" in has), 128)
+    fused = "with" if has & {"+fma", "+neon", "+fp-armv8"} else "without"
+    return f"{llvm().get_host_cpu_name()}, vectors of {width} bits, {fused} fused multiply-add"
+
+
 @cache
 def features() -> str:
     """Return what this machine's processor has, as LLVM writes it."""
@@ -57,12 +71,10 @@ class Code:
         """Compile a text, or take what was compiled of it before."""
         binding = llvm()
         target = binding.Target.from_default_triple()
+        # Constants may lie anywhere in memory: code that reaches only 2 GiB far, as the small
+        # model's does, would end the process where they lie farther.
         self._machine = target.create_target_machine(
-            cpu=binding.get_host_cpu_name(),
-            features=features(),
-            opt=3,
-            reloc="pic",
-            codemodel="small",
+            cpu=binding.get_host_cpu_name(), features=features(), opt=3, codemodel=_MODEL
         )
         stored = _stored(text, binding, cache_folder)
         made = None if stored is None else _read(stored)
@@ -96,7 +108,7 @@ def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
         return None
     import llvmlite
 
-    parts = [text, features(), binding.get_host_cpu_name(), llvmlite.__version__]
+    parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
     parts += [platform.system(), platform.machine()]
     return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
 

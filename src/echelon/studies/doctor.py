@@ -18,6 +18,7 @@ from echelon.engine.settings import Settings
 from echelon.engine.simulate import simulate
 from echelon.gains.gain import synthesize
 from echelon.gains.riccati import Riccati
+from echelon.kernels import vectors
 from echelon.laws.consensus import Consensus
 from echelon.laws.tracking import Tracking
 from echelon.models import ControlAffine, Pendulum, Quadrotor
@@ -43,7 +44,7 @@ def facts() -> dict[str, str]:
     devices = ", ".join(
         f"{device.platform}:{device.id} ({device.device_kind})" for device in jax.devices()
     )
-    return {**versions(), "devices": devices}
+    return {**versions(), "devices": devices, "native code": vectors()}
 
 
 def checks() -> Iterator[Check]:
