@@ -191,7 +191,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     said = "got a key that `decay` does not take, allowed beside it are `weight`, `coupling`."
     assert refused.stderr.strip().endswith(f"--set follower.gain.Q=[1, 1]: {said}")
     refused = call("--set", "follower.gain.wait=1")
-    assert "follower.gain.wait: got an unknown key" in refused.stderr
+    assert "follower.gain.wait=1: got an unknown key" in refused.stderr
     assert refused.stderr.strip().endswith("(did you mean `weight`?).")
 
 

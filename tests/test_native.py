@@ -187,7 +187,7 @@ def test_long_runs_are_native_and_short_ones_are_not():
     parts = flock(ech.Graph.ring(30), model, ech.laws.TrimInput(), initial={"position": 0.01})
     long = ech.simulate(parts, run_settings(horizon=20.0, dt=0.005, store_every=100))
     assert long.engine == "native" and long.outcome is ech.Outcome.COMPLETED
-    short = ech.simulate(parts, run_settings(horizon=0.05))
+    short = ech.simulate(parts, run_settings(horizon=0.05, steady_window=0.01))
     assert short.engine == "jax" and not short.warnings
 
 

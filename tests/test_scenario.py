@@ -149,6 +149,7 @@ def test_defaults():
             "limits": True,
             "store_every": 1,
             "precision": "float64",
+            "engine": "auto",
         },
         "report": {"steady_window": 6.0},
         "seed": 0,

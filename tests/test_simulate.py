@@ -22,7 +22,7 @@ from runs import simulate
 from scipy.integrate import solve_ivp
 
 from echelon.core.errors import Outcome
-from echelon.engine import laws as engine_laws
+from echelon.engine import by_jax
 from echelon.engine.settings import Settings
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
@@ -656,7 +656,7 @@ def test_an_interrupt_before_the_first_frame_leaves_an_empty_run(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(engine_laws, "advance", stop)
+    monkeypatch.setattr(by_jax, "advance", stop)
     run = carts()
     assert run.outcome is Outcome.INTERRUPTED
     assert run.states.shape == (0, 4, 4) == run.errors.shape and run.inputs.shape == (0, 4, 2)
