@@ -245,12 +245,35 @@ def ends_by_itself(v):
         (lambda v: jnp.sort(v), "`sort`"),
         (lambda v: jax.lax.fori_loop(0, 999, lambda k, x: jnp.sin(x), v), "a loop of 999 rounds"),
         (lambda v: jnp.linalg.eigvalsh(jnp.outer(v, v)), "`eigh`"),
+        (lambda v: v[jnp.argmax(v)], "`argmax`"),
     ],
 )
 def test_what_has_no_code_is_told_with_file_and_line(function, told):
     with pytest.raises(Unsupported, match=told) as caught:
         text_of(function, 3)
     assert "test_kernels.py, line" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: jnp.interp(v[0], jnp.arange(3.0), jnp.array([0.0, 1.0, 5.0])),
+        lambda v: jnp.searchsorted(jnp.arange(3.0), v[0]) * 1.0,
+        lambda v: jnp.arange(3.0)[v[0].astype(int)],
+        lambda v: jax.lax.switch(v[0].astype(int), [jnp.sin, jnp.cos, jnp.tan], v),
+        lambda v: jax.random.normal(jax.random.key(0), (3,)) * v,
+        lambda v: jnp.fft.fft(v).real,
+        lambda v: jax.pure_callback(np.sin, v, v),
+    ],
+)
+def test_whatever_is_traced_has_code_or_is_refused_in_words(function):
+    columns = np.abs(rng.normal(size=(3, 16)))
+    try:
+        found = run(function, columns)
+    except Unsupported as refused:
+        assert str(refused)
+    else:
+        np.testing.assert_allclose(found, by_jax(function, columns), rtol=1e-12)
 
 
 def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):

@@ -16,6 +16,7 @@ import numpy as np
 from echelon.core.errors import EchelonError
 from echelon.core.jaxpr import Algebra, Rule, dot, each, entrywise, reduction, walk
 from echelon.core.numerics import precision
+from echelon.core.trace import in_short
 from echelon.kernels import elementary
 from echelon.kernels.scalar import Entry, Graph, Node
 
@@ -64,7 +65,11 @@ def lower(function: Callable[..., Any], graph: Graph, arguments: Sequence[Any]) 
 
     with precision("float64"):
         closed = jax.make_jaxpr(flat)(*shaped)
-        return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
+        try:
+            return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
+        except (TypeError, ValueError, IndexError, KeyError, AttributeError) as error:
+            # A trace is anyone's: what no rule was written for must end no run that JAX can make.
+            raise Unsupported(f"a trace that no rule fits ({in_short(error)})") from error
 
 
 def _shape(leaf: np.ndarray) -> jax.ShapeDtypeStruct:

@@ -12,6 +12,8 @@ from typing import Any, final
 import numpy as np
 
 from echelon.core.errors import MissingExtraError
+from echelon.core.trace import in_short
+from echelon.kernels.lowering import Unsupported
 
 
 @cache
@@ -93,8 +95,11 @@ class Code:
         self._run(slots.ctypes.data)
 
     def _compile(self, binding: Any, text: str) -> bytes:
-        module = binding.parse_assembly(text)
-        module.verify()
+        try:
+            module = binding.parse_assembly(text)
+            module.verify()
+        except RuntimeError as error:
+            raise Unsupported(f"what LLVM refuses ({in_short(error)})") from error
         options = binding.create_pipeline_tuning_options(speed_level=2)
         options.loop_vectorization = options.slp_vectorization = False
         passes = binding.create_pass_builder(self._machine, options)
