@@ -196,21 +196,24 @@ def trees(depth):
     return st.one_of(leaf, one, two, two)
 
 
+def off_from_jax(tree, rtol, atol):
+    """The largest difference of a tree's two values, in units of what it may be."""
+    columns = np.random.default_rng(3).normal(size=(3, 16))
+    found, wanted = run(lambda v: jnp.asarray(tree(v)) + 0.0 * v[0], columns), by_jax(tree, columns)
+    return (np.abs(found - wanted) / (atol + rtol * np.abs(wanted))).max()
+
+
 @given(tree=trees(4))
 @settings(max_examples=25)
 def test_drawn_functions_are_what_jax_makes_of_them(tree):
-    columns = np.random.default_rng(3).normal(size=(3, 16))
-    found = run(lambda v: jnp.asarray(tree(v)) + 0.0 * v[0], columns)
-    np.testing.assert_allclose(found, by_jax(tree, columns), rtol=1e-12, atol=1e-13)
+    assert off_from_jax(tree, rtol=1e-12, atol=1e-13) <= 1.0
 
 
 @pytest.mark.slow
 @given(tree=trees(6))
 @settings(max_examples=200)
 def test_two_hundred_drawn_functions_are_what_jax_makes_of_them(tree):
-    columns = np.random.default_rng(4).normal(size=(3, 16))
-    found = run(lambda v: jnp.asarray(tree(v)) + 0.0 * v[0], columns)
-    np.testing.assert_allclose(found, by_jax(tree, columns), rtol=1e-11, atol=1e-12)
+    assert off_from_jax(tree, rtol=1e-11, atol=1e-12) <= 1.0
 
 
 def test_what_is_lost_is_never_brought_back_by_a_limit():

@@ -159,3 +159,13 @@ def test_no_failing_line_and_no_cause_is_without_a_remedy():
         Statement(Hypothesis.STEP, Verdict.FAILS, Kind.PROOF)
     with pytest.raises(TypeError):
         Cause("it fails")
+
+
+def test_wind_is_not_blamed_where_the_loop_grows_by_itself():
+    wind = "disturbance={rms: {position: 0.01}}"
+    told = [
+        ech.report(ech.simulate(*ech.build(ech.load_scenario("integrators", [wind, *more]))))
+        for more in ([], ["simulation.dt=1.0", "simulation.horizon=20"])
+    ]
+    assert "the disturbance pushes it up" in told[0]
+    assert "the loop grows by itself" in told[1] and "pushes it up" not in told[1]

@@ -51,7 +51,7 @@ class NativeStepper(Stepper):
         cache = getattr(jax.config, "jax_compilation_cache_dir", None)
         self.code = Code(program(self.plan), Path(cache) if cache else None)
         self._reserve(starts, positions, weights)
-        # What is in the blocks, and the inputs of a step that was looked at and not taken.
+        # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
         self._drawn = -1
 

@@ -94,7 +94,9 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
             "s) although V' <= 0 where they begin; the step `dt` is too long: halve it."
         )
     elif rises:
-        excuse = "the disturbance pushes it up"
+        grows = any(found.hypotheses[h].fails for h in (Hypothesis.DECAYS, Hypothesis.STEP))
+        # Of a loop that grows by itself nobody can tell what part the wind has.
+        excuse = "the loop grows by itself" if grows else "the disturbance pushes it up"
         if result.world.disturbance is None:
             excuse = f"theory allows it, since {_excuse(v, found)}"
         yield f"V rises at {rises} of {len(v.value) - 1} frames; {excuse}."
