@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.types import Array, Inputs, States
+from echelon.core.types import Array, Input, Inputs, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Problem
 from echelon.engine.motion import Motion
@@ -199,11 +199,15 @@ def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) 
 
 def _broadcast(loop: Loop, x: States, u: Inputs) -> jax.Array:
     """Return what agents at x (K, n) with delivered inputs u (K, m) send to followers."""
-    if loop.follower.feedforward is Feedforward.NONE:
-        return jnp.zeros_like(u)
     # After the limits: what a leader could not do its followers must not copy (theory page).
-    v = loop.model.normalized(u)
-    return jax.vmap(loop.follower.broadcast, in_axes=(None, 0, 0))(loop.model, x, v)
+    return jax.vmap(lambda x, v: tell(loop, x, v))(x, loop.model.normalized(u))
+
+
+def tell(loop: Loop, x: State, v: Input) -> jax.Array:
+    """Return what an agent at x with normalized input v sends to followers."""
+    if loop.follower.feedforward is Feedforward.NONE:
+        return jnp.zeros_like(v)
+    return loop.follower.broadcast(loop.model, x, v)
 
 
 def step(loop: Loop, now: Moment, acted: Control) -> Moment:

@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.words import Feedforward
-from echelon.engine.loop import Loop, what_limits_did
+from echelon.engine.loop import Loop, tell, what_limits_did
 from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes
 from echelon.laws.law import Law, LocalView, Memory
 
@@ -83,14 +82,7 @@ def memory_size(law: Law) -> int:
 def told_by(loop: Loop) -> int:
     """Return how many numbers an agent sends besides its state."""
     n, m = len(loop.model.state_names), len(loop.model.input_names)
-    return jax.eval_shape(lambda x, v: _tell(loop, x, v), jnp.zeros(n), jnp.zeros(m)).shape[0]
-
-
-def _tell(loop: Loop, x: Any, v: Any) -> Any:
-    """Return what an agent at x with normalized input v sends to followers."""
-    if loop.follower.feedforward is Feedforward.NONE:
-        return jnp.zeros_like(v)
-    return loop.follower.broadcast(loop.model, x, v)
+    return jax.eval_shape(lambda x, v: tell(loop, x, v), jnp.zeros(n), jnp.zeros(m)).shape[0]
 
 
 class _Known(NamedTuple):
@@ -147,7 +139,7 @@ def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
             state=motion.move(x, u, known.push, known.noise),
             memory=memory,
             cut=cut,
-            tell=_tell(loop, x, model.normalized(u)),
+            tell=tell(loop, x, model.normalized(u)),
             input=u,
             errors=read.errors,
             tracking=tracking,
