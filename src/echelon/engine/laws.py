@@ -72,6 +72,7 @@ class Laws(Drive):
             LawError: one does not fit the model or the graph.
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
+        follower = follower.following(leader, model)
         same = leader is self.leader and follower is self.follower
         return self if same else Laws(leader, follower)
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin
+from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.places import Places, edge_blocks, heard
-from echelon.engine.scalars import Rows, body_of
+from echelon.engine.scalars import Rows, body_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.kernels import SLOTS, Code, Plan, aligned, program, stride
 from echelon.laws.law import Law, Memory
@@ -62,7 +62,7 @@ class NativeStepper(Stepper):
             bits=self.bits,
             lanes=self.places.lanes,
             rows=rows.total,
-            width=n,
+            width=n + signals_of(loop),
             first=body_of(loop, self.bits, rows, True, self.follows),
             others=body_of(loop, self.bits, rows, False, self.follows),
             tell=rows.tell.start,
@@ -92,7 +92,7 @@ class NativeStepper(Stepper):
         held = of[sender]
         heavy = aligned(weights.shape, self.dtype)
         heavy[:] = weights
-        self.edges, ends = edge_blocks(loop, places, self.dtype)
+        self.edges, ends = edge_blocks(loop, places, self.dtype, plan.width)
         self.fixed = {
             "segments": places.segments,
             "neighbour_starts": starts,
@@ -216,7 +216,10 @@ class NativeStepper(Stepper):
         self._write(rows.state, x)
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
-        self.mirrors[0][:, : x.shape[1]] = (x - offsets)[self.places.agents]
+        said = x - offsets
+        if signals_of(loop):
+            said = np.concatenate([said, signals(loop, now, jnp.asarray(offsets))], axis=1)
+        self.mirrors[0][:, : said.shape[1]] = said[self.places.agents]
         memory = np.zeros((len(x), len(rows.memory)))
         for who, tree in ((loop.leaders, now.leader_memory), (loop.followers, now.follower_memory)):
             leaves = [np.asarray(leaf).reshape(len(who), -1) for leaf in jax.tree.leaves(tree)]
