@@ -79,7 +79,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         meter=problem.meter,
         leader=without_certificates(leader),
         follower=without_certificates(follower),
-        exchange=graph.exchange(),
+        exchange=graph.exchange(follower.leaderward),
         offsets=np.asarray(problem.formation.offsets),
         leaders=leaders,
         followers=followers,

@@ -65,9 +65,11 @@ class Law(eqx.Module):
     Attributes:
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
+        leaderward: whether followers hear those neighbours alone that are nearer to a leader.
     """
 
     feedforward = Feedforward.NONE
+    leaderward = False
 
     @property
     def information(self) -> tuple[str, ...]:

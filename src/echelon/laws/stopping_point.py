@@ -16,7 +16,7 @@ import numpy as np
 
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, Hears
 from echelon.laws.flat_loop import FlatLoop, Held
 from echelon.laws.law import Law, LocalView
 from echelon.models.chains import chains_of, switch_on
@@ -55,6 +55,8 @@ class StoppingPoint(Law):
         observer: whether what the model lacks is estimated and opposed.
         feedforward: `relay`, the leader's zeta' forwarded to all; `parent`, that of the one agent
             that each hears.
+        hears: `all` neighbours, or `leaderward` those alone that are nearer to the leader; with
+            `parent` it is that one.
     """
 
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
@@ -65,6 +67,7 @@ class StoppingPoint(Law):
     feedforward: Feedforward = eqx.field(
         default=Feedforward.RELAY, static=True, converter=Feedforward.named
     )
+    hears: Hears = eqx.field(default=Hears.ALL, static=True, converter=Hears.named)
     loop: FlatLoop | None = None
     reach: "Reach | None" = None
     ahead: Array | None = None
@@ -80,6 +83,11 @@ class StoppingPoint(Law):
             )
 
     @property
+    def leaderward(self) -> bool:
+        """Whether only neighbours nearer to the leader are heard."""
+        return self.hears is Hears.LEADERWARD or self.feedforward is Feedforward.PARENT
+
+    @property
     def information(self) -> tuple[str, ...]:
         """Neighbours' stopping points, and whose rate is told."""
         parent = self.feedforward is Feedforward.PARENT
@@ -92,9 +100,10 @@ class StoppingPoint(Law):
             return self
         if self.feedforward is Feedforward.PARENT:
             graph.parents()
-        loop, reach = loop_for(self, model), Reach.of(graph)
-        parts = (self.roots, self.rate, self.coupling, self.speed, self.observer, self.feedforward)
-        return StoppingPoint(*parts, loop, reach, np.zeros_like(loop.weights))
+        loop, reach = loop_for(self, model), Reach.of(graph, self.leaderward)
+        parts = (self.roots, self.rate, self.coupling, self.speed, self.observer)
+        told = (self.feedforward, self.hears)
+        return StoppingPoint(*parts, *told, loop, reach, np.zeros_like(loop.weights))
 
     def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":
         """Take over how the leader begins, which tells how high a thrust is level."""
@@ -258,7 +267,7 @@ class Reach(eqx.Module):
     """What the graph asks of the coupling.
 
     Attributes:
-        slowest: lambda_min of the followers' Laplacian.
+        slowest: the smallest eigenvalue of the followers' Laplacian.
         heaviest: d_max, the largest sum of weights that one follower hears.
     """
 
@@ -266,10 +275,15 @@ class Reach(eqx.Module):
     heaviest: float
 
     @classmethod
-    def of(cls, graph: Graph) -> "Reach":
+    def of(cls, graph: Graph, leaderward: bool) -> "Reach":
         """Return it of a graph."""
-        degrees = graph.grounded_laplacian().diagonal()
-        return cls(graph.spectrum().low, float(degrees.max()))
+        heard = graph.exchange(leaderward)
+        sums = np.zeros(graph.agents)
+        np.add.at(sums, heard.receivers, heard.weights)
+        own = sums[list(graph.followers)]
+        # Heard one way the Laplacian is triangular, and its eigenvalues are on its diagonal.
+        slowest = float(own.min()) if leaderward else graph.spectrum().low
+        return cls(slowest, float(own.max()))
 
     def coupling(self, law: StoppingPoint, period: Scalar | float) -> Scalar | float:
         """Return c of a law whose inputs are held for a period (s)."""
