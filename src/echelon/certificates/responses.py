@@ -96,7 +96,8 @@ class Chain(NamedTuple):
         if not self.powers:
             return Fraction(0)
         direct = self.stiffness if order == len(self.powers) else Fraction(0)
-        return direct + variation(self.derivative(self.impulse(), order - 1))
+        kernel = self.derivative(self.impulse(), order - 1)
+        return direct + spread_between(kernel, Fraction(0), Fraction(1))
 
 
 def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
@@ -126,10 +127,10 @@ def add(*some: Poly) -> Poly:
     return {n: sum((p.get(n, Fraction(0)) for p in some), Fraction(0)) for p in some for n in p}
 
 
-def largest(p: Poly, negative: bool = False) -> Fraction:
-    """Return a bound that p is not above on [0, 1], too high by 1e-9 of it at most; of -p if so."""
+def largest_between(p: Poly, low: Fraction, high: Fraction, negative: bool = False) -> Fraction:
+    """Return a bound that p, or -p, is not above on [low, high], too high by 1e-9 of it at most."""
     sign = -1 if negative else 1
-    start = [sign * c for c in _bernstein(p)]
+    start = [sign * c for c in _bernstein(_moved(p, low, high))]
     best = max(start[0], start[-1])
     bound, pieces = best, [start]
     while pieces:
@@ -142,13 +143,9 @@ def largest(p: Poly, negative: bool = False) -> Fraction:
     return bound
 
 
-def peak(p: Poly) -> Fraction:
-    """Return a bound of |p| on [0, 1]."""
-    return max(largest(p), largest(p, negative=True), Fraction(0))
-
-
-def variation(p: Poly) -> Fraction:
-    """Return a bound of the total variation of p on [0, 1]: how far it goes up and down."""
+def spread_between(p: Poly, low: Fraction, high: Fraction) -> Fraction:
+    """Return a bound of the total variation of p on [low, high]: how far it goes up and down."""
+    p = _moved(p, low, high)
     slope = {n - 1: n * c for n, c in p.items() if n}
     total, pieces = Fraction(0), [(_bernstein(slope), Fraction(0), Fraction(1))]
     while pieces:
@@ -159,10 +156,27 @@ def variation(p: Poly) -> Fraction:
         elif width <= _FINE:
             total += width * max(map(abs, piece))
         else:
-            low, high = _halved(piece)
+            left, right = _halved(piece)
             half = width / 2
-            pieces += [(low, a, half), (high, a + half, half)]
+            pieces += [(left, a, half), (right, a + half, half)]
     return total
+
+
+def peak(p: Poly) -> Fraction:
+    """Return a bound of |p| on [0, 1]."""
+    return max(largest_between(p, Fraction(0), Fraction(1), sign) for sign in (False, True))
+
+
+def _moved(p: Poly, low: Fraction, high: Fraction) -> Poly:
+    """Return p(low + (high - low) x)."""
+    if (low, high) == (0, 1):
+        return p
+    found, width = dict[int, Fraction](), high - low
+    for n, c in p.items():
+        for k in range(n + 1):
+            more = c * math.comb(n, k) * low ** (n - k) * width**k
+            found[k] = found.get(k, Fraction(0)) + more
+    return found
 
 
 def _bernstein(p: Poly) -> list[Fraction]:

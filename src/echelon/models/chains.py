@@ -155,7 +155,8 @@ def chains_of(model: ControlAffine) -> Chains:
         ModelError: nothing was found; it says which output misses what.
     """
     if model.flat_chains is not None:
-        return Chains(tuple(model.flat_outputs), *model.flat_chains, sampled=False)
+        outputs = model.flat_outputs or model.output_names[: len(model.input_names)]
+        return Chains(tuple(outputs), *model.flat_chains, sampled=False)
     with precision("float64"):
         failures = list[str]()
         for outputs in _candidates(model):

@@ -78,11 +78,15 @@ class FlatChains(NamedTuple):
 
 
 class FlatBound(NamedTuple):
-    """A border of the flat coordinates: a derivative of a flat output stays above a value."""
+    """A border of the flat coordinates: a derivative of a flat output stays above a value.
+
+    `within` says in words what else of the state that bounds.
+    """
 
     output: str
     derivative: int
     above: float
+    within: str
 
 
 class Flattened(NamedTuple):
@@ -166,8 +170,9 @@ class ControlAffine(eqx.Module):
     flat_chains: ClassVar[FlatChains | None] = None
     """The chains of integrators that feedback makes of the agent; found at samples where None."""
 
-    flat_bounds: ClassVar[tuple[FlatBound, ...]] = ()
-    """Where flat coordinates end: each holds on all of the rest, by the model's own word."""
+    flat_bounds: ClassVar[tuple[FlatBound, ...] | None] = None
+    """Where the flat coordinates of `flat_chains` end: nowhere where there are none, by the model's
+    own word; None where it does not say."""
 
     @abc.abstractmethod
     def drift(self, x: State) -> State:

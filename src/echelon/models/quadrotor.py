@@ -242,7 +242,7 @@ class Quadrotor(ControlAffine):
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
         # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three can pass 0 unless it does.
-        return (FlatBound("z", 2, -self.gravity),)
+        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def flatten(self, x: State, e: jax.Array) -> Flattened:
         """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""

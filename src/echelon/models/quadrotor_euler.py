@@ -70,7 +70,7 @@ class QuadrotorEuler(ControlAffine):
     @property
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        return (FlatBound("z", 2, -self.gravity),)
+        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
@@ -128,7 +128,7 @@ class QuadrotorThrust(ControlAffine):
     @property
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        return (FlatBound("z", 2, -self.gravity),)
+        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

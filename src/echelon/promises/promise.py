@@ -22,10 +22,18 @@ from echelon.promises.case import Case
 from echelon.promises.certified_set import CertifiedSet, certified_set, set_lines
 from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
-from echelon.promises.hypotheses import hypotheses
+from echelon.promises.hypotheses import agent_lines, hypotheses
 from echelon.promises.leaders import leaders_of
 from echelon.promises.path import Frozen, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
+from echelon.promises.stopping import (
+    Stopping,
+    Tube,
+    condition_lines,
+    drift_reason,
+    stopping_of,
+    tube_of,
+)
 from echelon.promises.statement import Cause, Hypothesis, Statement
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
@@ -46,6 +54,7 @@ class Promise:
         without: what acts on the agents that is left out, in words; empty without any.
         own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         frozen: the laws away from the trim; None where they are not looked at.
+        tube: what T5 promises; None under other laws, or where it promises nothing.
     """
 
     loop: Loop
@@ -57,6 +66,7 @@ class Promise:
     without: str
     own: float | None
     frozen: Frozen | None
+    tube: Tube | None = None
 
     @property
     def linear(self) -> bool:
@@ -75,15 +85,19 @@ class Promise:
         return not self.reasons
 
     @property
+    def _ground(self) -> RegionCertificate | Tube | None:
+        return (self.tube or self.region) if self.promised else None
+
+    @property
     def theorem(self) -> Theorem | None:
         """The theorem behind the promise; None where it is the linearization alone, or nothing."""
-        region = self.region if self.promised else None
+        region = self._ground
         return None if region is None else region.theorem
 
     @property
     def kind(self) -> Kind:
         """The kind of argument behind the promise."""
-        region = self.region if self.promised else None
+        region = self._ground
         return Kind.LINEARIZATION if region is None else region.kind
 
     @property
@@ -94,7 +108,8 @@ class Promise:
         """
         if not self.promised:
             return None
-        return -self.loop.slowest if self.region is None else self.region.rate
+        ground = self._ground
+        return -self.loop.slowest if ground is None else ground.rate
 
     @property
     def edge(self) -> float | None:
@@ -104,6 +119,8 @@ class Promise:
     @property
     def slowest(self) -> float | None:
         """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
+        if self.tube is not None:
+            return -self.tube.rate
         return self.loop.slowest if self.linear else None
 
     @property
@@ -142,6 +159,10 @@ class Promise:
 
     def _promised(self) -> str:
         region = self.region
+        if self.tube is not None:
+            text = self.tube.sentence()
+            without = f" This is said without what the scenario adds: {self.without}."
+            return text + without if self.without else text
         if self.linear:
             text = "by linearization: followers that start near enough to their goals, with the "
             text += f"leader near enough to the trim, converge to them{self.condition}"
@@ -194,6 +215,7 @@ class Promise:
                 "kind": str(found.kind),
                 "why": found.why,
             },
+            "anywhere": None if self.tube is None else self.tube.as_mapping(),
             "hypotheses": [each.as_mapping() for each in self.hypotheses.values()],
         }
 
@@ -223,6 +245,9 @@ def promise(parts: Parts, settings: Settings) -> Promise:
 def _compute(prepared: Prepared, settings: Settings) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
+    run = stopping_of(parts, settings, states)
+    if run is not None:
+        return _anywhere(run, Case(parts, settings, loop, leaders, None, None, None))
     region = region_of(parts, leaders)
     # What does not decay at the trim has nothing to lose elsewhere.
     asked = loop.every and parts.drive.metric(parts.model) is not None
@@ -252,3 +277,14 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         own=None if leaders.rest else leaders.slowest,
         frozen=case.frozen,
     )
+
+
+def _anywhere(run: Stopping, case: Case) -> Promise:
+    """Return what is promised under the law `stopping-point`."""
+    found, drifts = tube_of(run), drift_reason(run)
+    lines = [*agent_lines(case), *condition_lines(run), *found.lines]
+    lines += [drifts] if drifts is not None else []
+    kept = MappingProxyType({cast(Hypothesis, x.statement): x for x in lines})
+    tube = None if any(line.reason for line in kept.values() if line.fails) else found.tube
+    own = case.leaders.slowest
+    return Promise(case.loop, None, None, kept, "", "", case.disturbed, own, None, tube)
