@@ -1,9 +1,9 @@
 """What a chain of integrators under q(D) v = -k0 w does at most, in rationals.
 
 The roots of q are whole multiples of a unit, so that with x = exp(-unit t) every response is a
-polynomial in x on (0, 1], and what it is at most is found by Bernstein's coefficients, which enclose
-a polynomial and are halved until the enclosure is tight. Upper bounds all, and near ones (theory
-page, T5).
+polynomial in x on (0, 1], and what it is at most is found by Bernstein's coefficients, which
+enclose a polynomial and are halved until the enclosure is tight. Upper bounds all, and near ones
+(theory page, T5).
 """
 
 import math
@@ -51,8 +51,7 @@ class Chain(NamedTuple):
         if powers[-1] > _HIGHEST:
             raise GainError(
                 f"`roots` {list(map(float, exact))} are multiples of {float(unit):.3g} alone, and "
-                f"must be at most {_HIGHEST} times their common unit for a proof; choose rounder "
-                "ones."
+                f"must be at most {_HIGHEST} times their common unit for a proof."
             )
         return cls(powers, unit)
 
@@ -182,9 +181,9 @@ def _moved(p: Poly, low: Fraction, high: Fraction) -> Poly:
 def _bernstein(p: Poly) -> list[Fraction]:
     """Return Bernstein's coefficients on [0, 1], between whose ends p lies."""
     degree = max(p, default=0)
-    c = [p.get(n, Fraction(0)) for n in range(degree + 1)]
+    share = [p.get(n, Fraction(0)) / math.comb(degree, n) for n in range(degree + 1)]
     return [
-        sum((c[i] * Fraction(math.comb(k, i), math.comb(degree, i)) for i in range(k + 1)), Fraction(0))
+        sum((math.comb(k, i) * share[i] for i in range(k + 1)), Fraction(0))
         for k in range(degree + 1)
     ]
 

@@ -46,7 +46,9 @@ def room_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction)
     left = [chain.derivative(chain.free(push.start), order) for push in pushes if push.start]
     free = add(*left) if left else Poly()
     kernel = chain.derivative(chain.impulse(), order - 1)
-    unit = chain.derivative(chain.free([Fraction(1), *[Fraction(0)] * (len(chain.powers) - 1)]), order)
+    unit = chain.derivative(
+        chain.free([Fraction(1), *[Fraction(0)] * (len(chain.powers) - 1)]), order
+    )
     speed = sum((push.speed for push in pushes), Fraction(0))
     fall, steepest, moved = Fraction(0), None, Fraction(0)
     for k in range(_SLICES, 0, -1):

@@ -217,8 +217,9 @@ class NativeStepper(Stepper):
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
         said = x - offsets
-        if signals_of(loop):
-            said = np.concatenate([said, signals(loop, now, jnp.asarray(offsets))], axis=1)
+        heard = signals(loop, now, jnp.asarray(offsets))
+        if heard is not None:
+            said = np.concatenate([said, np.asarray(heard)], axis=1)
         self.mirrors[0][:, : said.shape[1]] = said[self.places.agents]
         memory = np.zeros((len(x), len(rows.memory)))
         for who, tree in ((loop.leaders, now.leader_memory), (loop.followers, now.follower_memory)):

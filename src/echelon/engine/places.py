@@ -65,9 +65,7 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     return first, positions, np.where(there, weights[edge], 0.0)
 
 
-def edge_blocks(
-    loop: Loop, places: Places, dtype: np.dtype, width: int
-) -> tuple[Array, Array]:
+def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, width: int) -> tuple[Array, Array]:
     """Return the edges in blocks for the sums of how far distances are off.
 
     Neighbours read `width` numbers of each agent.

@@ -8,4 +8,14 @@ from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.laws.tracking import Tracking
 from echelon.laws.trim_input import TrimInput
 
-__all__ = ["Agreement", "Consensus", "Law", "LocalView", "PathLQR", "StoppingLeader", "StoppingPoint", "Tracking", "TrimInput"]
+__all__ = [
+    "Agreement",
+    "Consensus",
+    "Law",
+    "LocalView",
+    "PathLQR",
+    "StoppingLeader",
+    "StoppingPoint",
+    "Tracking",
+    "TrimInput",
+]

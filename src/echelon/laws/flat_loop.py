@@ -1,10 +1,11 @@
 """What each agent does alone under the law `stopping-point`: an inner loop that feels no position.
 
-In flat coordinates q(D) y' = k0 zeta', where zeta = q(D) y / k0 is where the agent would come to rest
-if nobody spoke (theory page, T5). Integrators before inputs are part of the loop's memory.
+In flat coordinates q(D) y' = k0 zeta', where zeta = q(D) y / k0 is where the agent would come to
+rest if nobody spoke (theory page, T5). Integrators before inputs are part of the loop's memory.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, final
 
 import equinox as eqx
@@ -75,7 +76,8 @@ class FlatLoop(eqx.Module):
 
     def begun(self, model: ControlAffine, x: State, chain: jax.Array) -> Held:
         """Return the memory of an agent that begins at x, the model being right."""
-        held = Held(chain, *[jnp.zeros(len(self.stiffness), x.dtype)] * 4, jnp.zeros((), x.dtype))
+        zero = jnp.zeros(len(self.stiffness), x.dtype)
+        held = Held(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
         return held._replace(base=self._watched(model, x, held.got)[0])
 
     # ---- coordinates ----
@@ -91,7 +93,7 @@ class FlatLoop(eqx.Module):
         return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
 
     def _seen(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
-        """Return the flat coordinates (r, m), with what the model lacks of acceleration and jerk."""
+        """Return the flat coordinates (r, m), and what the model lacks in them."""
         values = flatten(model, self.chains, x, held.chain).values
         if not self.observer:
             return values
@@ -119,18 +121,14 @@ class FlatLoop(eqx.Module):
         chain, mean = self._integrate(held.chain, w, period)
         return model.physical(mean), held._replace(chain=chain, rate=rate)
 
-    def _integrate(
-        self, e: jax.Array, w: Input, period: Scalar | float
-    ) -> tuple[jax.Array, Input]:
+    def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
         """Return the integrators after a hold, and the mean (m,) of what they give during it."""
         after, mean = list[jax.Array](), list[jax.Array]()
         for k, at in enumerate(self.chains.places):
             tower = [*(e[i] for i in at), w[k]]
             # Polynomials of time; the actuator holds one value, and their mean moves as far.
-            mean.append(sum(y * (period**i / math.factorial(i + 1)) for i, y in enumerate(tower)))
-            for start in range(len(at)):
-                rest = tower[start:]
-                after.append(sum(y * (period**i / math.factorial(i)) for i, y in enumerate(rest)))
+            mean.append(_moved(tower, period, 1))
+            after += [_moved(tower[start:], period, 0) for start in range(len(at))]
         return (jnp.stack(after) if after else e), jnp.stack(mean)
 
     def settle(
@@ -190,3 +188,11 @@ class FlatLoop(eqx.Module):
         first, second = jax.jvp(speed, (x,), (velocity(x),))
         at_once = np.array(self.chains.degrees) == 1
         return jnp.where(at_once, output(x), first), jnp.where(at_once, first, second)
+
+
+def _moved(tower: Sequence[jax.Array], period: Scalar | float, more: int) -> jax.Array:
+    """Return sum_i y_i T^i / (i + more)!, after a time T; for more = 1 the mean until then."""
+    total = jnp.zeros_like(tower[0])
+    for i, y in enumerate(tower):
+        total = total + y * (period**i / math.factorial(i + more))
+    return total

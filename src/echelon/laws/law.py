@@ -1,6 +1,7 @@
 """The interface of a control law, and all that one agent may know when it runs one."""
 
 import abc
+from collections.abc import Iterator
 from typing import Any, TypeAlias, final
 
 import equinox as eqx
@@ -146,6 +147,10 @@ class Law(eqx.Module):
         beyond that loop.
         """
         return v
+
+    def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
+        """Yield which of some starts (K, n) the law cannot take, by row, and why in words."""
+        yield from ()
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Return what is allowed but probably not meant, a sentence each."""

@@ -117,9 +117,7 @@ def _derivatives(
     return values, alphas, jax.vmap(lambda w: pushed(w)[1] - alphas)(jnp.eye(len(nothing)))
 
 
-def switch_on(
-    model: ControlAffine, chains: Chains, x: State, ahead: jax.Array
-) -> jax.Array:
+def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) -> jax.Array:
     """Return what the integrators hold first, so that agents begin level.
 
     Where the model has a bound on a flat output, the derivatives of it that the integrators decide
@@ -183,15 +181,14 @@ def _extend(model: ControlAffine, outputs: tuple[str, ...]) -> Chains | str:
     """Return the chains of outputs behind integrators, or what is missing in words."""
     m = len(model.input_names)
     counts = [0] * m
-    for _ in range(_MOST + 1):
+    while True:
         found = look_for_chains(model, outputs, tuple(counts))
         if not isinstance(found, Stuck):
             return found
         # The input that alone reaches what others should reach too is made to wait for them.
-        if len(found.early) != 1:
+        if len(found.early) != 1 or sum(counts) == _MOST:
             return found.why
         counts[found.early[0]] += 1
-    return found.why
 
 
 class Stuck(NamedTuple):

@@ -2,8 +2,8 @@
 
 With w = L_g^-1 1 the largest |zeta_i| / w_i falls as m' = -sigma(c m) / max w or faster. For
 sigma(x) = x / sqrt(1 + (x/s)^2) that is solved by F(c m / s) = F(c m(0) / s) - c t / max w with
-F(v) = sqrt(1 + v^2) - arsinh(1 / v). Behind it comes the inner loop, delta y = h * zeta and what the
-start leaves, where h is positive.
+F(v) = sqrt(1 + v^2) - arsinh(1 / v). Behind it comes the inner loop, delta y = h * zeta and what
+the start leaves, where h is positive.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,8 @@ import scipy.sparse.linalg as spla
 
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
-from echelon.laws.stopping_point import StoppingPoint, roots_of, the_loop
+from echelon.laws.stopping_point import StoppingPoint
 from echelon.network.graph import Graph
-
 
 _WITHIN = 0.01  # m
 _CELL, _MOST = 0.01, 20_000
@@ -47,20 +46,18 @@ def arrival_of(
     """
     if not position or law.feedforward is Feedforward.PARENT:
         return None
-    loop, followers = the_loop(law), list(graph.followers)
+    loop, followers = law.ready, list(graph.followers)
     weights = _weights(graph, law.leaderward)
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]
     times = _CELL * np.arange(_MOST + 1)
     square = np.zeros((len(followers), _MOST))
-    roots = roots_of(law, len(loop.weights) - 1)
     for k in position:
-        own = roots[: loop.chains.degrees[k] - 1]
+        own = np.array(law.roots_for(loop.chains.degrees[k] - 1))
         stops = np.abs(away[:, :, k] @ loop.weights[:, k])
-        speeds = law.speed if isinstance(law.speed, Sequence) else [law.speed] * flat.shape[2]
-        m = _falling((stops / weights).max(), coupling, weights.max(), float(speeds[k]), times)
-        driven = _behind(np.array(own), m, times)
+        m = _falling((stops / weights).max(), coupling, weights.max(), law.speed_of(k), times)
+        driven = _behind(own, m, times)
         # Agents start in few ways in number; all at once would be (N, cells) anyway.
-        square += (weights[:, None] * driven + _left(np.array(own), away[:, :, k], times)) ** 2
+        square += (weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
     outside = np.flatnonzero((np.sqrt(square) + _SLACK >= _WITHIN).any(axis=0))
     if not len(outside):
         return Arrival(0.0)
@@ -74,7 +71,7 @@ def _weights(graph: Graph, leaderward: bool) -> Array:
     adjacency = sp.coo_array((heard.weights, (heard.receivers, heard.senders)), shape=(n, n))
     rows = list(graph.followers)
     whole = sp.csr_array(sp.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency)
-    return np.atleast_1d(spla.spsolve(sp.csc_array(whole[rows][:, rows]), np.ones(len(rows))))
+    return spla.splu(sp.csc_array(whole[rows][:, rows])).solve(np.ones(len(rows)))
 
 
 def _falling(start: float, c: float, heaviest: float, speed: float, times: Array) -> Array:

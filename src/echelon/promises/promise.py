@@ -26,6 +26,7 @@ from echelon.promises.hypotheses import agent_lines, hypotheses
 from echelon.promises.leaders import leaders_of
 from echelon.promises.path import Frozen, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
+from echelon.promises.statement import Cause, Hypothesis, Statement
 from echelon.promises.stopping import (
     Stopping,
     Tube,
@@ -34,7 +35,6 @@ from echelon.promises.stopping import (
     stopping_of,
     tube_of,
 )
-from echelon.promises.statement import Cause, Hypothesis, Statement
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -55,6 +55,7 @@ class Promise:
         own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         frozen: the laws away from the trim; None where they are not looked at.
         tube: what T5 promises; None under other laws, or where it promises nothing.
+        hold: the longest step that T5 allows, s; None under other laws.
     """
 
     loop: Loop
@@ -67,6 +68,7 @@ class Promise:
     own: float | None
     frozen: Frozen | None
     tube: Tube | None = None
+    hold: float | None = None
 
     @property
     def linear(self) -> bool:
@@ -130,6 +132,8 @@ class Promise:
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
+        if self.hold is not None:
+            return self.hold
         return longest_step(self.loop, self.frozen, settings)
 
     @property
@@ -287,4 +291,6 @@ def _anywhere(run: Stopping, case: Case) -> Promise:
     kept = MappingProxyType({cast(Hypothesis, x.statement): x for x in lines})
     tube = None if any(line.reason for line in kept.values() if line.fails) else found.tube
     own = case.leaders.slowest
-    return Promise(case.loop, None, None, kept, "", "", case.disturbed, own, None, tube)
+    return Promise(
+        case.loop, None, None, kept, "", "", case.disturbed, own, None, tube, run.longest_step
+    )

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -19,7 +19,8 @@ from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
-from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, roots_of, slowest_root, the_loop
+from echelon.laws.flat_loop import FlatLoop
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.chains import flat_output, flatten
 from echelon.models.model import ControlAffine, FlatBound
 from echelon.promises.arrival import Arrival, arrival_of
@@ -62,7 +63,11 @@ class Tube(NamedTuple):
 
     def sentence(self) -> str:
         """Return what is promised, in one sentence."""
-        when = "" if self.arrival is None else f"; these are within 1 cm from {self.arrival.time:.3g} s on"
+        when = (
+            ""
+            if self.arrival is None
+            else f"; these are within 1 cm from {self.arrival.time:.3g} s on"
+        )
         return (
             f"{self.kind.value}: from {self.who}, errors go to zero, in the end at {self.rate:.3g} "
             "1/s or faster, for any number of agents and any graph in which the leader reaches "
@@ -106,17 +111,16 @@ class Stopping(NamedTuple):
 
     @property
     def coupling(self) -> float:
-        """c."""
-        assert self.law.reach is not None
-        return float(self.law.reach.coupling(self.law, self.settings.dt))
+        """C."""
+        return float(self.law.strength(self.settings.dt))
 
     @property
     def rate(self) -> float:
         """The slowest mode of the formation, 1/s, as a positive number."""
         assert self.law.reach is not None
         agreement = self.coupling * self.law.reach.slowest
-        moves = max(the_loop(self.law).chains.degrees) > 1
-        return min(slowest_root(self.law), agreement) if moves else agreement
+        moves = max(self.law.ready.chains.degrees) > 1
+        return min(self.law.slowest_root, agreement) if moves else agreement
 
     def chain(self, output: int) -> Chain:
         """Return the chain of an output.
@@ -124,28 +128,33 @@ class Stopping(NamedTuple):
         Raises:
             GainError: its roots have no common unit.
         """
-        degree = the_loop(self.law).chains.degrees[output]
-        return Chain.of(roots_of(self.law, max(the_loop(self.law).chains.degrees) - 1)[: degree - 1])
+        degree = self.law.ready.chains.degrees[output]
+        return Chain.of(self.law.roots_for(degree - 1))
 
     def speed(self, output: int) -> float:
         """Return s of a follower against the leader: of each link on the way, told by parents."""
-        links = 1
-        if self.law.feedforward is Feedforward.PARENT:
-            links = int(self.parts.graph.depths().max())
-        return links * _of(self.law.speed, output)
+        return self.links * self.law.speed_of(output)
+
+    @property
+    def links(self) -> int:
+        """How many speeds add up on the way from a leader."""
+        told = self.law.feedforward is Feedforward.PARENT
+        return int(self.parts.graph.depths().max()) if told else 1
+
+    @property
+    def longest_step(self) -> float:
+        """The longest step (s) that keeps the largest stopping point from growing."""
+        assert self.law.reach is not None
+        return 1.0 / (self.coupling * self.law.reach.heaviest)
 
     def own_speed(self, output: int) -> float:
         """Return the speed against its path that a leader may have: what it starts off, or s_0."""
         leads = list(self.parts.graph.leaders)
-        weights = the_loop(self.leader).weights[:, output]
+        weights = self.leader.ready.weights[:, output]
         away = np.abs(weights @ (self.flat[leads] - self.ahead)[:, :, output].T).max()
-        c = self.leader.coupling or 2.0 * slowest_root(self.leader)
+        c = float(self.leader.strength(self.settings.dt))
         # Its distance never grows, and sigma(c zeta) is below c zeta.
-        return min(_of(self.leader.speed, output), c * float(away))
-
-
-def _of(speed: float | Sequence[float], output: int) -> float:
-    return float(speed[output] if isinstance(speed, Sequence) else speed)
+        return min(self.leader.speed_of(output), c * float(away))
 
 
 def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | None:
@@ -163,7 +172,7 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | N
 def _flat(
     model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
 ) -> jax.Array:
-    chains = the_loop(law).chains
+    chains = law.ready.chains
 
     def one(x: jax.Array, offset: jax.Array) -> jax.Array:
         values = flatten(model, chains, x, law.begin(model, x).chain).values
@@ -185,7 +194,7 @@ class _Found(NamedTuple):
 
 def tube_of(run: Stopping) -> _Found:
     """Return what T5 promises, and its lines: the inner gains, the set, and the starts."""
-    model, chains = run.parts.model, the_loop(run.law).chains
+    model, chains = run.parts.model, run.law.ready.chains
     longest = int(np.argmax(chains.degrees))
     try:
         found = run.chain(longest)
@@ -215,10 +224,13 @@ def tube_of(run: Stopping) -> _Found:
 def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
     """Return that no tube is known, and why."""
     reason = f"{text}, so no tube is known"
-    lines = [] if before else [Statement(Hypothesis.REGION, Verdict.FAILS, _PROOF, None, "none", text, remedy, reason)]
-    more = Statement(Hypothesis.SET, Verdict.FAILS, _PROOF, None, "none", text, remedy, reason)
-    starts = Statement(Hypothesis.STARTS, Verdict.NOT_NEEDED, _PROOF, text="needs a set")
-    return _Found(None, (*before, *lines, more, starts))
+    name = Hypothesis.SET if before else Hypothesis.REGION
+    lines = [Statement(name, Verdict.FAILS, _PROOF, None, "none", text, remedy, reason)]
+    rest = {Hypothesis.REGION, Hypothesis.SET, Hypothesis.STARTS} - {name}
+    rest -= {cast(Hypothesis, line.statement) for line in before}
+    text = "needs a tube"
+    lines += [Statement(each, Verdict.NOT_NEEDED, _PROOF, text=text) for each in rest]
+    return _Found(None, (*before, *lines))
 
 
 class _Border(NamedTuple):
@@ -233,14 +245,15 @@ class _Border(NamedTuple):
 
 def _room(run: Stopping, bound: FlatBound) -> _Border:
     """Return how near to a border the agents of a run may come."""
-    chains = the_loop(run.law).chains
+    chains = run.law.ready.chains
     k, order = chains.outputs.index(bound.output), bound.derivative - 1
     chain = run.chain(k)
     least = least_on_path(run.leader, run.parts.model, run.settings.horizon, k, bound.derivative)
     allowed = Fraction(least.value) - Fraction(bound.above) - _ROUNDED
     own, s = run.own_speed(k), run.speed(k)
+    fastest = float(allowed / chain.gain(order)) if order else math.inf
     if math.isinf(s) or math.isinf(own):
-        return _Border(bound, Fraction(-1), 0.0, least.kind, 0.0)
+        return _Border(bound, Fraction(-1), 0.0, least.kind, fastest)
     leads, p = list(run.parts.graph.leaders), len(chain.powers)
     led = run.flat[leads, :, k] - run.ahead[:, k]
     away = run.flat[:, :, k] - run.flat[list(run.parts.graph.nearest_leader()), :, k]
@@ -253,7 +266,6 @@ def _room(run: Stopping, bound: FlatBound) -> _Border:
     left = min(allowed - room.fall for room in rooms)
     # Said of agents behind a leader that keeps to the height and the climb of its path.
     quiet = room_of(chain, order, (Push((), Fraction(0)), Push((), Fraction(s))), allowed)
-    fastest = float(allowed / chain.gain(order)) if order else math.inf
     return _Border(bound, left, float(quiet.steepest), least.kind, fastest)
 
 
@@ -276,7 +288,9 @@ def _few(starts: Array) -> Array:
         return starts[sorted({int(low), int(high)})]
     found = np.unique(starts, axis=0)
     if len(found) > _STARTS:
-        raise GainError(f"{len(found)} starts differ in more than a speed, and {_STARTS} are tried.")
+        raise GainError(
+            f"{len(found)} starts differ in more than a speed, and {_STARTS} are tried."
+        )
     return found
 
 
@@ -291,8 +305,8 @@ def _set_lines(run: Stopping, borders: Sequence[_Border], kind: Kind) -> Iterato
     bound = nearest.bound
     name, s = f"`{bound.output}`", run.speed(_index(run, bound.output))
     prime = "'" * bound.derivative
-    text = f"any place; {bound.within} and `{bound.output}'` within {nearest.steepest:.3g} of the "
-    text, remedy, reason = f"leader's, if that keeps to its path there: {text}leader's", "", ""
+    text = f"any place, with {bound.within}, and `{bound.output}'` so far off that of the leader, "
+    text, remedy, reason = f"which keeps to its path in {name}", "", ""
     if not nearest.steepest > 0.0:
         text = f"at a `speed` of {s:.3g} agreement alone may take {bound.output}{prime} to "
         text = f"{text}{bound.above:.3g}, where the chart ends"
@@ -300,11 +314,18 @@ def _set_lines(run: Stopping, borders: Sequence[_Border], kind: Kind) -> Iterato
         reason = text
     holds, shown = Verdict.of(nearest.steepest > 0.0), f"{nearest.steepest:.3g} off"
     yield Statement(Hypothesis.SET, holds, kind, nearest.steepest, shown, text, remedy, reason)
+    if not nearest.steepest > 0.0:
+        yield Statement(Hypothesis.STARTS, Verdict.NOT_NEEDED, kind, text="there is no set")
+        return
     far, remedy, reason = float(nearest.left), "", ""
-    text = f"{bound.output}{prime} stays {far:.3g} above {bound.above:.4g}, so that {bound.within}"
+    text = f"{bound.output}{prime} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
     if not nearest.left > 0:
-        text = f"from these starts {bound.output}{prime} is not proved to stay above {bound.above:.4g}"
-        remedy = f"start nearer to the leader's speed in {name}, start the leader on its path there, "
+        text = (
+            f"from these starts {bound.output}{prime} is not proved to stay above {bound.above:.4g}"
+        )
+        remedy = (
+            f"start nearer to the leader's speed in {name}, start the leader on its path there, "
+        )
         remedy += f"or lower `speed` of {name}, of the leader and the followers"
         reason = text
     shown, holds = f"{far:.3g} left", Verdict.of(nearest.left > 0)
@@ -313,11 +334,11 @@ def _set_lines(run: Stopping, borders: Sequence[_Border], kind: Kind) -> Iterato
 
 def _each(run: Stopping, total: float) -> float:
     """Return what speed of one link a speed against the leader leaves."""
-    return total / (run.speed(0) / _of(run.law.speed, 0)) if math.isfinite(run.speed(0)) else total
+    return total / run.links
 
 
 def _index(run: Stopping, output: str) -> int:
-    return the_loop(run.law).chains.outputs.index(output)
+    return run.law.ready.chains.outputs.index(output)
 
 
 def _who(run: Stopping, borders: Sequence[_Border]) -> str:
@@ -336,7 +357,7 @@ def _who(run: Stopping, borders: Sequence[_Border]) -> str:
 
 def _positions(run: Stopping) -> tuple[int, ...]:
     """Return which outputs are a position."""
-    outputs, position = the_loop(run.law).chains.outputs, run.parts.model.position
+    outputs, position = run.law.ready.chains.outputs, run.parts.model.position
     return tuple(k for k, name in enumerate(outputs) if name in position)
 
 
@@ -350,7 +371,10 @@ def condition_lines(run: Stopping) -> Iterator[Statement]:
     broken = _moves_others(run)
     remedy, reason = "", ""
     if broken:
-        text, remedy = f"the offset of `{broken}` is none of a flat output", "offset flat outputs only"
+        text, remedy = (
+            f"the offset of `{broken}` is none of a flat output",
+            "offset flat outputs only",
+        )
         reason = "an offset is no symmetry of the law"
     verdict = Verdict.of(not broken)
     yield Statement(Hypothesis.SYMMETRY, verdict, _PROOF, None, "", text, remedy, reason)
@@ -373,7 +397,7 @@ def condition_lines(run: Stopping) -> Iterator[Statement]:
 
 def _moves_others(run: Stopping) -> str:
     """Return the first state with an offset that is no flat output; empty without one."""
-    outputs, model = the_loop(run.law).chains.outputs, run.parts.model
+    outputs, model = run.law.ready.chains.outputs, run.parts.model
     for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0)):
         if model.state_names[k] not in outputs:
             return model.state_names[k]
@@ -401,7 +425,7 @@ def _step_line(run: Stopping) -> Statement:
 def _radius(run: Stopping) -> float:
     """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
     assert run.law.reach is not None
-    loop, found = the_loop(run.law), 0.0
+    loop, found = run.law.ready, 0.0
     for k, degree in enumerate(loop.chains.degrees):
         A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
         stop = loop.stiffness[k] * loop.weights[:degree, k]
@@ -418,27 +442,31 @@ def drift_reason(run: Stopping) -> Statement | None:
     world, model = run.parts.world, run.parts.model
     if run.leader.observer or world.ideal:
         return None
-    loop = the_loop(run.leader)
+    loop = run.leader.ready
     push = np.zeros(len(model.state_names))
     if world.disturbance is not None:
         push = model.per_state(world.disturbance.constant)
     found = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
     for k, d in enumerate(np.abs(np.asarray(found)).tolist()):
-        s, degree = _of(run.leader.speed, k), loop.chains.degrees[k]
+        s, degree = run.leader.speed_of(k), loop.chains.degrees[k]
         asked = d * float(loop.weights[1, k]) if degree > 1 else d
         if asked >= s:
             name = loop.chains.outputs[k]
             text = f"a push of {d:.3g} along `{name}` asks agreement for {asked:.3g} of speed, the "
             text += f"leader's is {s:.3g}, and it can drift away for ever"
             remedy = f"set `observer: true`, or `speed` above {asked:.3g}"
-            return Statement(Hypothesis.EXACT, Verdict.FAILS, _PROOF, asked, f"{asked:.3g}", text, remedy, text)
+            return Statement(
+                Hypothesis.EXACT, Verdict.FAILS, _PROOF, asked, f"{asked:.3g}", text, remedy, text
+            )
     return None
 
 
 @eqx.filter_jit
-def _pushed(model: ControlAffine, plant: ControlAffine, loop: object, push: jax.Array) -> jax.Array:
+def _pushed(
+    model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
+) -> jax.Array:
     """Return what outputs' accelerations differ by at the trim (m,), as an agent is pushed."""
-    chains = loop.chains  # pyright: ignore
+    chains = loop.chains
     x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
 
     def output(x: jax.Array) -> jax.Array:

@@ -313,13 +313,13 @@ def _follower(
 
 def _stopping(spec: LeaderSpec | FollowerSpec) -> dict[str, Any]:
     """Return the keys of the law `stopping-point` that a role gives."""
-    names = ("roots", "rate", "coupling", "speed", "observer", "hears")
-    given = {name: getattr(spec, name, None) for name in names}
+    given = {name: getattr(spec, name, None) for name in _STOPPING_KEYS}
     given = {name: value for name, value in given.items() if value is not None}
     return given | ({"speed": math.inf} if given.get("speed") == "inf" else {})
 
 
-_LAW_KEYS = ("gain", "feedforward", "trim", "roots", "rate", "coupling", "speed", "observer", "hears")
+_STOPPING_KEYS = ("roots", "rate", "coupling", "speed", "observer", "hears")
+_LAW_KEYS = ("gain", "feedforward", "trim", *_STOPPING_KEYS)
 
 
 def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:

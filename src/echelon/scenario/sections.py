@@ -224,8 +224,8 @@ class LeaderSpec(BaseModel, **STRICT):
     rate: Annotated[Positive | None, Unit("1/s")] = None
     """Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."""
     coupling: Annotated[Positive | None, Unit("1/s")] = None
-    """Of the law `stopping-point`: how fast the leader comes to its reference; default twice the slowest root, or
-    what the step holds."""
+    """Of the law `stopping-point`: how fast the leader comes to its reference; default
+    twice the slowest root, or what the step holds."""
     speed: Annotated[Speed | None, Unit("the outputs' per s")] = None
     """Of the law `stopping-point`: the speed that agreement may ask for, of each flat output or of
     all, such as m/s; `inf` for none."""
@@ -250,8 +250,8 @@ class FollowerSpec(BaseModel, **STRICT):
     rate: Annotated[Positive | None, Unit("1/s")] = None
     """Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."""
     coupling: Annotated[Positive | None, Unit("1/s")] = None
-    """Of the law `stopping-point`: strength of the agreement, 1/s over the graph's weights; default twice the slowest root over lambda_min, or
-    what the step holds."""
+    """Of the law `stopping-point`: strength of the agreement, 1/s over the graph's
+    weights; default twice the slowest root over lambda_min, or what the step holds."""
     speed: Annotated[Speed | None, Unit("the outputs' per s")] = None
     """Of the law `stopping-point`: the speed that agreement may ask for, of each flat output or of
     all, such as m/s; `inf` for none."""
