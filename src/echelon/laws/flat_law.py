@@ -88,6 +88,11 @@ class FlatLaw(Law):
         return self.roots_for(1)[0]
 
     @property
+    def fastest(self) -> float:
+        """The sum of all roots, 1/s, of the longest chain."""
+        return sum(self.roots_for(max(self.ready.chains.degrees) - 1))
+
+    @property
     def ready(self) -> FlatLoop:
         """The loop of a prepared law.
 

@@ -58,8 +58,8 @@ class StoppingPoint(FlatLaw):
 
     zeta = q(D) y / q(0) is where an agent's flat outputs y would come to rest if nobody spoke, and
     sigma(x) = x / sqrt(1 + (x/s)^2) bounds the speed that agreement asks for. Where `coupling` is
-    left out, c is twice the slowest root over lambda_min, or what the step holds, 1 / (d_max dt),
-    where that is less.
+    left out, c is twice the slowest root over lambda_min, or what the step holds, a little below
+    1 / (d_max dt), where that is less.
 
     Args:
         feedforward: `relay`, the leader's zeta' forwarded to all; `parent`, that of the one agent
@@ -139,7 +139,10 @@ class StoppingPoint(FlatLaw):
         assert self.reach is not None
         if self.coupling is not None:
             return self.coupling
-        most = 1.0 / (self.reach.heaviest * jnp.maximum(period, _INSTANT))
+        period = jnp.maximum(period, _INSTANT)
+        # While the highest derivatives are held the inner loop goes on, and zeta moves farther than
+        # Euler's step by half the sum of the roots times the period; twice that is kept free.
+        most = 1.0 / (self.reach.heaviest * period * (1.0 + period * self.fastest))
         return jnp.minimum(2.0 * self.slowest_root / self.reach.slowest, most)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Held) -> tuple[Input, Held]:

@@ -417,8 +417,9 @@ def _step_line(run: Stopping) -> Statement:
     remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
     remedy += f"`simulation.dt` to {1.0 / (c * run.law.reach.heaviest):.3g} s"
     if share <= 1.0:
-        text = f"the step `dt` = {dt:g} s is too long for the roots: spectral radius {radius:.4g}"
-        remedy = "lower `roots`, or shorten `simulation.dt`"
+        text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
+        text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
+        remedy += "`simulation.dt`"
     return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, share, shown, text, remedy, text)
 
 
@@ -430,7 +431,9 @@ def _radius(run: Stopping) -> float:
         A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
         stop = loop.stiffness[k] * loop.weights[:degree, k]
         inner = np.append(0.0, stop[:-1])
-        ends = np.array([run.law.reach.slowest, run.law.reach.heaviest])
+        # By Gershgorin none is larger than 2 d_max; heard one way none than d_max.
+        most = (1.0 if run.law.leaderward else 2.0) * run.law.reach.heaviest
+        ends = np.array([run.law.reach.slowest, most])
         gains = inner + run.coupling * ends[:, None] * stop
         dt, how = run.settings.dt, run.settings.integrator
         found = max(found, held_radius(A, B, gains[:, None], dt, how))
