@@ -1,6 +1,7 @@
 """The law `stopping-point` and theorem T5: numbers by a second way, and attacks on the proof."""
 
 import itertools
+import json
 from fractions import Fraction
 
 import jax
@@ -24,6 +25,7 @@ from echelon.promises.arrival import _falling
 from echelon.promises.promise import promise
 from echelon.promises.statement import Hypothesis
 from echelon.promises.stopping import stopping_of, tube_of
+from echelon.verifier.verify import verify
 
 SLOW_ROOTS, FAST_ROOTS = (2.0, 2.5, 3.0), (4.0, 4.5, 5.0)
 QUADROTOR = ech.models.Quadrotor()
@@ -413,6 +415,23 @@ def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches():
     assert found.tube.gains == pytest.approx((1.0, 2.4159, 12.3925, 221.2039), rel=1e-4)
     assert found.tube.arrival.time < 3.3
     assert "roll and pitch within 90 deg" in found.sentence()
+
+
+def test_verify_recomputes_a_tube_and_refuses_a_false_one(tmp_path):
+    told = promise(*ech.build(ech.load_scenario("paper-global"))).as_mapping()
+    file = tmp_path / "summary.json"
+    file.write_text(json.dumps({"promise": told}))
+    found = verify(file)
+    assert found.holds and len(found.findings) == 6, found.sentence
+    [border] = told["anywhere"]["borders"]
+    for key, factor in (("left", 1.01), ("steepest", 1.2), ("speed", 1.6)):
+        was, border[key] = border[key], border[key] * factor
+        file.write_text(json.dumps({"promise": told}))
+        assert verify(file).verdict == "refused"
+        border[key] = was
+    border["gains"][2] *= 1.0001
+    file.write_text(json.dumps({"promise": told}))
+    assert verify(file).verdict == "refused"
 
 
 def override(*changes):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -46,6 +46,7 @@ class Tube(NamedTuple):
         steepest: how far the bounded output's speed may be off the leader's at the start.
         arrival: when all are within 1 cm, if it can be told.
         who: which starts are meant, in words.
+        borders: what is claimed of each border, and of what it was computed; ready for JSON.
     """
 
     kind: Kind
@@ -55,6 +56,7 @@ class Tube(NamedTuple):
     steepest: float
     arrival: Arrival | None
     who: str
+    borders: tuple[dict[str, Any], ...]
 
     @property
     def theorem(self) -> Theorem:
@@ -79,7 +81,14 @@ class Tube(NamedTuple):
         finite = {name: getattr(self, name) for name in ("left", "steepest")}
         finite = {name: None if math.isinf(x) else x for name, x in finite.items()}
         when = None if self.arrival is None else self.arrival.time
-        return {"who": self.who, "gains": list(self.gains), **finite, "within_1_cm_from": when}
+        return {
+            "format": "echelon tube 1",
+            "who": self.who,
+            "gains": list(self.gains),
+            **finite,
+            "within_1_cm_from": when,
+            "borders": list(self.borders),
+        }
 
 
 class Stopping(NamedTuple):
@@ -218,7 +227,8 @@ def tube_of(run: Stopping) -> _Found:
     who = _who(run, borders)
     arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
     far = math.inf if not borders else float(left)
-    return _Found(Tube(kind, run.rate, gains, far, steepest, arrival, who), tuple(lines))
+    told = tuple(border.told for border in borders)
+    return _Found(Tube(kind, run.rate, gains, far, steepest, arrival, who, told), tuple(lines))
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
@@ -241,6 +251,7 @@ class _Border(NamedTuple):
     steepest: float
     kind: Kind
     fastest: float
+    told: dict[str, Any]
 
 
 def _room(run: Stopping, bound: FlatBound) -> _Border:
@@ -253,7 +264,7 @@ def _room(run: Stopping, bound: FlatBound) -> _Border:
     own, s = run.own_speed(k), run.speed(k)
     fastest = float(allowed / chain.gain(order)) if order else math.inf
     if math.isinf(s) or math.isinf(own):
-        return _Border(bound, Fraction(-1), 0.0, least.kind, fastest)
+        return _Border(bound, Fraction(-1), 0.0, least.kind, fastest, {})
     leads, p = list(run.parts.graph.leaders), len(chain.powers)
     led = run.flat[leads, :, k] - run.ahead[:, k]
     away = run.flat[:, :, k] - run.flat[list(run.parts.graph.nearest_leader()), :, k]
@@ -266,7 +277,21 @@ def _room(run: Stopping, bound: FlatBound) -> _Border:
     left = min(allowed - room.fall for room in rooms)
     # Said of agents behind a leader that keeps to the height and the climb of its path.
     quiet = room_of(chain, order, (Push((), Fraction(0)), Push((), Fraction(s))), allowed)
-    return _Border(bound, left, float(quiet.steepest), least.kind, fastest)
+    told = {
+        "output": bound.output,
+        "derivative": bound.derivative,
+        "above": bound.above,
+        "path": least.value,
+        "roots": list(run.law.roots_for(p)),
+        "speed": s,
+        "leader_speed": own,
+        "starts": [start[1 : p + 1].tolist() for start in _few(away)],
+        "leader_starts": [start[1 : p + 1].tolist() for start in _few(led)],
+        "gains": [float(chain.gain(order)) for order in range(p + 1)],
+        "left": float(left),
+        "steepest": float(quiet.steepest),
+    }
+    return _Border(bound, left, float(quiet.steepest), least.kind, fastest, told)
 
 
 def _exact(values: Array) -> tuple[Fraction, ...]:
