@@ -24,7 +24,8 @@ from echelon.models.chains import Chains, chains_of, differentiate, flatten, loo
 from echelon.promises.arrival import _falling
 from echelon.promises.promise import promise
 from echelon.promises.statement import Hypothesis
-from echelon.promises.stopping import stopping_of, tube_of
+from echelon.promises.stopping import stopping_of
+from echelon.promises.tube import tube_of
 from echelon.verifier.verify import verify
 
 SLOW_ROOTS, FAST_ROOTS = (2.0, 2.5, 3.0), (4.0, 4.5, 5.0)

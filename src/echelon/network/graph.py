@@ -298,10 +298,7 @@ class Graph:
         return tuple(parents.tolist())
 
     def exchange(self, leaderward: bool = False) -> "Exchange":
-        """Return the computation of the disagreement on this graph, ready for JAX.
-
-        If leaderward, every agent hears those alone that fewer edges part from a leader.
-        """
+        """Return the computation of the disagreement; leaderward, of those nearer a leader."""
         (i, j), weights = self.edges.T, self.weights
         receivers, senders = np.concatenate([i, j]), np.concatenate([j, i])
         weights = np.concatenate([weights, weights])

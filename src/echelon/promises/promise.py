@@ -27,14 +27,8 @@ from echelon.promises.leaders import leaders_of
 from echelon.promises.path import Frozen, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
 from echelon.promises.statement import Cause, Hypothesis, Statement
-from echelon.promises.stopping import (
-    Stopping,
-    Tube,
-    condition_lines,
-    drift_reason,
-    stopping_of,
-    tube_of,
-)
+from echelon.promises.stopping import Stopping, condition_lines, drift_reason, stopping_of
+from echelon.promises.tube import Tube, tube_of
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 

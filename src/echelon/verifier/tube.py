@@ -25,7 +25,7 @@ _CELLS = 6000
 
 
 def read_tube(path: PathLike) -> Mapping[str, Any] | None:
-    """Return the tube that a file tells of: of a run's summary, or a check's JSON; None for none."""
+    """Return the tube that a file tells of: a run's summary or a check's JSON; else None."""
     try:
         told = json.loads(Path(path).read_text("utf-8"))
     except (OSError, ValueError):
