@@ -43,7 +43,8 @@ TESTS = {
     "verifier": ["verify", "false_claims"],
     "gains": ["gains", "inner_loop", "regional", "paper"],
     "laws": ["laws", "feedforward", "inner_loop", "bad_input", "paper", "attack"],
-    "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans"],
+    "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans", "native"],
+    "kernels": ["kernels", "native"],
 }
 LIMIT = 4.0, 30.0
 """A change may make its tests take so many times as long, and so many seconds more."""
