@@ -386,3 +386,11 @@ def test_a_contraction_is_coupled_as_weakly_as_its_inequality_allows(exact):
     method = ech.gains.Contraction({"angle": 0.5}, rate=0.3, exact=exact)
     gain = ech.synthesize(model, graph, method)
     assert gain.coupling == gain.certificate.edge
+
+
+def test_all_states_that_a_lost_mode_lies_along_are_named_and_none_of_rounding_s_size():
+    w = np.array([1.0, 1.0, 1.0, 0.13, 0.0])
+    along = np.outer(w, w) / (w @ w)
+    A, B = 0.5 * along - (np.eye(5) - along), [[1.0], [-1.0], [0.0], [0.0], [1.0]]
+    with pytest.raises(GainError, match="0.5 1/s, which lies along `a`, `b`, `c`, `d`;"):
+        synthesize(Linear(A, B, names=list("abcde")), LINE, Riccati())
