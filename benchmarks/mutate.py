@@ -31,7 +31,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 # Which tests concern a room, or a file that has tests of its own.
 TESTS = {
-    "core": ["jaxpr", "linearization", "lyapunov", "bad_input", "limits", "gains"],
+    "core": ["jaxpr", "linearization", "lyapunov", "bad_input", "limits", "gains", "doctor"],
     "enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
     "network": ["graph", "formation", "recommend", "limits"],
     "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
