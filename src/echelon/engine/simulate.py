@@ -142,7 +142,7 @@ class _Flight:
         first, grid = self.recorder.done, self.recorder.grid
         # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
         # last chunks, which have fewer steps, keep them from compiling anew.
-        reference = _sample_reference(self.prepared, first, grid.longest + 1)
+        reference = sample_reference(self.prepared, first, grid.longest + 1)
         made = self.stepper.advance(self.now, grid.counts(first), reference)
         self.recorder.keep(made, reference, time.perf_counter() - self.began)
         self.now = made.now
@@ -155,7 +155,7 @@ class _Flight:
         self.given, self.gave = len(self.recorder.stretches), time.perf_counter()
 
 
-def _sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:
+def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:
     """Return what the leaders follow from a step on, (steps, n) in float64."""
     with precision("float64"):
         # In float64: after three hours float32 has a millisecond between two times.

@@ -247,7 +247,10 @@ class Meter(eqx.Module):
     def _spacing(self, states: States) -> jax.Array:
         """Return the squared errors of the distances along the edges, (E,)."""
         i, j = self.edges.T
-        distance = jnp.sqrt(jax.vmap(self._length)(states[i] - states[j]))
+        square = jax.vmap(self._length)(states[i] - states[j])
+        # A root has no slope at 0, where two agents meet, and one choice alone would still ask it.
+        apart = square > 0.0
+        distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
         return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
 
 
