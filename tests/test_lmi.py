@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from echelon.certificates import lmi
 from echelon.certificates.lmi import contraction, monotone, rate_of, robust_lqr
-from echelon.certificates.modes import obstacle
+from echelon.certificates.modes import axis_modes, obstacle
 from echelon.core.errors import GainError, MissingExtraError
 from echelon.models import Quadrotor
 
@@ -115,6 +115,15 @@ def test_jordan_blocks_on_the_axis_are_found_in_any_coordinates(seed, size, freq
     found = obstacle((T @ A @ np.linalg.inv(T))[None])
     assert found is not None and found.defective
     assert found.eigenvalue == pytest.approx(1j * frequency, abs=1e-6)
+
+
+@pytest.mark.parametrize("pace", [1e-7, 1.0, 1e7])
+def test_modes_on_the_axis_are_as_many_at_any_pace(pace):
+    T = well_conditioned(np.random.default_rng(0), 3)
+    A = T @ np.diag([0.0, -1.0, -0.3]) @ np.linalg.inv(T)
+    [(where, right, left)] = axis_modes(pace * A)
+    assert where == pytest.approx(0.0, abs=1e-9 * pace) and right.shape == left.shape == (3, 1)
+    assert abs(right[:, 0] @ T[:, 0]) == pytest.approx(np.linalg.norm(T[:, 0]))
 
 
 @given(st.integers(0, 10**6), st.integers(1, 3), st.sampled_from([0.0, 0.7]))
