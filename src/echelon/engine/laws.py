@@ -111,7 +111,7 @@ class Laws(Drive):
         if settings.engine == "jax" or settings.engine == "auto" and not _worth_it(problem):
             return by_jax
         try:
-            return NativeStepper(loop, problem.states, int(settings.precision[5:]), by_jax)
+            return NativeStepper([loop], problem.states, int(settings.precision[5:]), by_jax)
         except (Unsupported, MissingExtraError) as error:
             if settings.engine == "native":
                 raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
