@@ -146,7 +146,7 @@ def _finish(
     if not quiet:
         print(text, flush=True)
     write_sweep(data, text, batches.folder, figures)
-    whole = sum(batch.count for batch in done) == plan.count
+    whole = sum(batch.runs for batch in done) == plan.count
     if whole:
         batches.chunks.remove()
     if quiet:

@@ -1,9 +1,9 @@
 """The closed loop stepped by code for this machine: agents in the lanes of vectors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,8 @@ _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some tenths of a second."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
+_KEPT = 8
+"""Kernels that are kept for other runs."""
 
 
 def follows(loop: Loop) -> bool:
@@ -33,7 +35,15 @@ def follows(loop: Loop) -> bool:
     return loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
 
 
-def kernel(own: Own, bits: int, together: bool) -> tuple[Code, Rows, Plan]:
+class _Kernel(NamedTuple):
+    """The code that steps some loops, the rows that it works on, and its plan."""
+
+    code: Code
+    rows: Rows
+    plan: Plan
+
+
+def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
     """Return the code that steps some loops, the rows that it works on, and its plan.
 
     Raises:
@@ -60,7 +70,35 @@ def kernel(own: Own, bits: int, together: bool) -> tuple[Code, Rows, Plan]:
     )
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    return Code(program(plan), Path(cache) if cache else None), rows, plan
+    return _Kernel(Code(program(plan), Path(cache) if cache else None), rows, plan)
+
+
+@final
+class Kernels:
+    """Those that were made, so that loops alike but for their own numbers share one."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._made: dict[Hashable, _Kernel] = {}
+
+    def of(self, own: Own, bits: int, together: bool) -> _Kernel:
+        """Return what steps some loops.
+
+        Raises:
+            Unsupported: a law or the model uses what has no scalar operations.
+        """
+        key = (own.signature, bits, together)
+        if key not in self._made:
+            # The oldest goes: a sweep over models has one after the other.
+            while len(self._made) >= _KEPT:
+                self._made.pop(next(iter(self._made)))
+            self._made[key] = _kernel(own, bits, together)
+        return self._made[key]
+
+
+def beyond(states: Array, bits: int) -> Array:
+    """Return which states are beyond the range of the kernels' sines; NaN is not."""
+    return np.abs(states) > _LARGEST[bits]
 
 
 @final
@@ -71,8 +109,10 @@ class NativeStepper(Stepper):
         loops: of the run, or of each formation.
         states: (N, n) at its beginning, formation by formation.
         bits: 64 or 32, the precision.
-        far: what goes on where a state is beyond the range of the kernels' sines.
+        far: what goes on where a state is beyond the range of the kernels' sines; None where the
+            caller looks.
         pool: threads that step formations; None for the caller's alone.
+        kernels: those that were made before.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -83,8 +123,9 @@ class NativeStepper(Stepper):
         loops: Sequence[Loop],
         states: Array,
         bits: int,
-        far: Stepper,
+        far: Stepper | None,
         pool: Executor | None = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Write and compile the step."""
         self.pool = pool
@@ -98,7 +139,7 @@ class NativeStepper(Stepper):
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
-        self.code, self.rows, self.plan = kernel(self.own, bits, together)
+        self.code, self.rows, self.plan = (kernels or Kernels()).of(self.own, bits, together)
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
@@ -149,8 +190,7 @@ class NativeStepper(Stepper):
         if now is not self._held:
             self._load(now)
         made = self._fly(int(now.step), counts, reference)
-        # NaN is beyond nothing, and is lost in either way.
-        if not (np.abs(made.states) > _LARGEST[self.bits]).any():
+        if self.far is None or not beyond(made.states, self.bits).any():
             return made
         self._held = None
         return self.far.advance(now, counts, reference)

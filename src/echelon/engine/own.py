@@ -1,6 +1,6 @@
 """What differs between formations that are stepped together, beside their states and offsets."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -21,7 +21,8 @@ def bare(loop: Loop) -> Loop:
     return eqx.tree_at(_apart, loop, [None] * 4, is_leaf=lambda x: x is None)
 
 
-def _is_number(leaf: Any) -> bool:
+def is_number(leaf: Any) -> bool:
+    """Tell whether a leaf of a loop is made of real numbers."""
     return isinstance(leaf, float) or (
         isinstance(leaf, np.ndarray | jax.Array) and np.issubdtype(leaf.dtype, np.floating)
     )
@@ -60,6 +61,21 @@ class Own:
         """How many numbers differ."""
         return self.values.shape[1]
 
+    @property
+    def signature(self) -> Hashable:
+        """What decides the program, the same for other values; None where it cannot be told."""
+        leaves, tree = jax.tree.flatten(bare(self.loop))
+        fixed = (
+            (np.where(mask, 0.0, leaf).tobytes() if mask.any() else np.asarray(leaf).tobytes())
+            for leaf, mask in zip(leaves, self._masks, strict=True)
+        )
+        key = (tree, *fixed, *(mask.tobytes() for mask in self._masks))
+        try:
+            hash(key)
+        except TypeError:
+            return None
+        return key
+
     def leaves(self, entries: Array) -> list[Array]:
         """Return the leaves in which something differs, of these entries where it does."""
         found, at = list[Array](), 0
@@ -84,7 +100,7 @@ class Own:
 
 def _differing(leaves: Sequence[Any]) -> Array:
     """Return which entries of a leaf are not the same in all loops."""
-    if not _is_number(leaves[0]) or len(leaves) == 1:
+    if not is_number(leaves[0]) or len(leaves) == 1:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])
     return (stacked != stacked[0]).any(axis=0)

@@ -141,9 +141,9 @@ def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) 
             store_row(w, start, k, lanes, value)
         return
     padded = [*values, *["zeroinitializer"] * (far - len(values))]
-    for block in range(0, far, lanes):
-        for lane, column in enumerate(_transposed(w, padded[block : block + lanes])):
-            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + block}")
+    for piece in range(0, far, lanes):
+        for lane, column in enumerate(_transposed(w, padded[piece : piece + lanes])):
+            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + piece}")
             w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * bytes_of(w)}")
 
 

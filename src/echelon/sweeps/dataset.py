@@ -51,7 +51,7 @@ def dataset_of(plan: Sweep, batches: "Sequence[Batch]") -> "xr.Dataset":
         whole = np.full((plan.count, agents) if inner else plan.count, fill)
         whole = whole.astype(np.int8 if name in _CODES else object if name in WORDS else float)
         for batch in batches:
-            part, rows = batch.columns[name], slice(batch.first, batch.first + batch.count)
+            part, rows = batch.columns[name], slice(batch.first, batch.first + batch.runs)
             whole[(rows, slice(part.shape[1])) if inner else rows] = part
         dims = (*keys, "agent") if inner else keys
         variables[name] = (dims, _arranged(plan, whole), _attributes(name))

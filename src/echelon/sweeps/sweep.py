@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from echelon.core.errors import EchelonError, Outcome
-from echelon.engine.many import simulate_many
+from echelon.engine.many import Fleet
 from echelon.promises.promise import promise
 from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
@@ -29,7 +29,7 @@ class Batch(NamedTuple):
     columns: Columns
 
     @property
-    def count(self) -> int:
+    def runs(self) -> int:
         """How many runs there are."""
         return len(self.columns["outcome"])
 
@@ -84,8 +84,8 @@ def compute(
     Raises:
         KeyboardInterrupt: Ctrl-C; all batches that were kept are whole.
     """
-    done = sum(batch.count for batch in before)
-    cases = _Cases(plan)
+    cases, fleet = _Cases(plan), Fleet(threads)
+    done = sum(batch.runs for batch in before)
 
     def told(_: int = 0, __: int = 0) -> None:
         if progress is not None:
@@ -93,7 +93,7 @@ def compute(
 
     told()
     for first, count in _missing(plan.count, before, cases.size):
-        keep(Batch(first, columns_of(_rows(cases, first, count, told, threads))))
+        keep(Batch(first, columns_of(_rows(fleet, cases, first, count, told))))
         done += count
         told()
 
@@ -101,7 +101,7 @@ def compute(
 def _missing(runs: int, before: Sequence[Batch], size: int) -> Iterator[tuple[int, int]]:
     """Yield the batches (first, count) that are to do."""
     at = 0
-    for first, end in [*sorted((b.first, b.first + b.count) for b in before), (runs, runs)]:
+    for first, end in [*sorted((b.first, b.first + b.runs) for b in before), (runs, runs)]:
         while at < first:
             # Cut where batches begin, so that the same runs are computed together as without a
             # break, to the same bits.
@@ -138,12 +138,12 @@ class _Cases:
 
 
 def _rows(
-    cases: _Cases, first: int, count: int, told: Callable[..., None], threads: int | None
+    fleet: Fleet, cases: _Cases, first: int, count: int, told: Callable[..., None]
 ) -> list[dict[str, Any]]:
     """Return what some runs came to."""
     built = [cases.built(run) for run in cases.plan.runs(first, count)]
     flown = [each for each in built if not isinstance(each, str)]
-    results = iter(simulate_many(flown, told, threads))
+    results = fleet.fly(flown, told)
     rows = list[dict[str, Any]]()
     for each in built:
         if isinstance(each, str):
