@@ -88,3 +88,4 @@ from .world.disturbance import Disturbance as Disturbance
 from .world.world import World as World
 
 __version__: str
+from .sweeps.sweep import sweep as sweep
