@@ -20,15 +20,16 @@ Speed: TypeAlias = float | tuple[float, ...]
 
 RATE = 4.0
 """Of the slowest root, 1/s, unless it is given."""
-SPEED = 2.5
-"""m/s and rad/s, unless it is given."""
+SPEED, LEAD_SPEED = 2.5, 1.5
+"""Of followers and leaders, m/s and rad/s, unless given: with the default roots both together leave
+a vehicle its thrust, from any place (9.81 / 2.416 m/s; theory page, T5)."""
 _SPREAD = 0.125
 """Roots of a rate r are r, 1.125 r, 1.25 r, ..: apart, as the certificate wants them."""
 _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
 
 
-def _speeds(given: float | Sequence[float]) -> Speed:
+def plain_speeds(given: float | Sequence[float]) -> Speed:
     """Return speeds as plain numbers, which a compiled step takes for constants."""
     return tuple(map(float, given)) if isinstance(given, Sequence | np.ndarray) else given
 
@@ -48,7 +49,7 @@ class FlatLaw(Law):
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
     rate: float | None = eqx.field(default=None, static=True)
     coupling: float | None = None
-    speed: Speed = eqx.field(default=SPEED, converter=_speeds)
+    speed: Speed = eqx.field(default=SPEED, converter=plain_speeds)
     observer: bool = eqx.field(default=True, static=True)
     loop: FlatLoop | None = None
 

@@ -15,7 +15,7 @@ import numpy as np
 from echelon.core.errors import LawError, listing
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, Hears
-from echelon.laws.flat_law import FlatLaw
+from echelon.laws.flat_law import LEAD_SPEED, FlatLaw, Speed, plain_speeds
 from echelon.laws.flat_loop import Held
 from echelon.laws.law import Law, LocalView
 from echelon.models.model import ControlAffine
@@ -161,6 +161,7 @@ class StoppingLeader(FlatLaw):
         reference: the path to follow; without one the trim's flat outputs are held.
     """
 
+    speed: Speed = eqx.field(default=LEAD_SPEED, converter=plain_speeds)
     reference: Guide | None = None
 
     @property
