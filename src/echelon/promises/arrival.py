@@ -44,7 +44,8 @@ def arrival_of(
         coupling: c.
         position: which outputs are one.
     """
-    if not position or law.feedforward is Feedforward.PARENT:
+    apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
+    if not position or law.feedforward is Feedforward.PARENT or apart > _SLACK:
         return None
     loop, followers = law.ready, list(graph.followers)
     weights = _weights(graph, law.leaderward)

@@ -58,12 +58,13 @@ class Tube(NamedTuple):
         when = (
             ""
             if self.arrival is None
-            else f"; these are within 1 cm from {self.arrival.time:.3g} s on"
+            else f"; these starts are within 1 cm from {self.arrival.time:.3g} s on"
         )
         return (
-            f"{self.kind.value}: from {self.who}, errors go to zero, in the end at {self.rate:.3g} "
-            "1/s or faster, for any number of agents and any graph in which the leader reaches "
-            f"everybody, where the model is exact and zeta' is told at all times (T5){when}."
+            f"{self.kind.value}: from {self.who}, errors go to zero for any number of agents and "
+            "any graph in which the leader reaches everybody, where the model is exact and zeta' "
+            "is told at all times (T5); on this graph in the end at "
+            f"{self.rate:.3g} 1/s or faster{when}."
         )
 
     def as_mapping(self) -> dict[str, object]:
@@ -257,14 +258,14 @@ def _who(run: Stopping, borders: Sequence[_Border]) -> str:
     """Return which starts are meant, in words."""
     if not borders:
         return "any state of any agent"
-    told = [
-        f"{b.bound.within}, `{b.bound.output}'` within {b.steepest:.3g} of the leader's"
-        for b in borders
-    ]
     on = all(run.own_speed(_index(run, b.bound.output)) < 1e-9 for b in borders)
     outputs = listing(b.bound.output for b in borders)
-    keeps = f"while the leader keeps to its path in {outputs}" if on else "for these starts"
-    return f"any position, heading, sideways speed and turning, with {' and '.join(told)}, {keeps}"
+    within = " and ".join(b.bound.within for b in borders)
+    told = f"any position, heading, sideways speed and turning, with {within}"
+    if not on:
+        return f"{told}, and speeds in {outputs} as at these starts"
+    off = f"within {min(b.steepest for b in borders):.3g} of the leader's"
+    return f"{told}, a speed in {outputs} {off}, which keeps to its path there"
 
 
 def _positions(run: Stopping) -> tuple[int, ...]:
