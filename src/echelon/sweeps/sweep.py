@@ -1,11 +1,13 @@
 """The verb: all runs of a sweep, batch by batch."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 
 from echelon.core.errors import EchelonError, Outcome
 from echelon.engine.many import Fleet
-from echelon.promises.promise import promise
+from echelon.engine.result import Result
+from echelon.promises.promise import Promise, promises
 from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
 from echelon.sweeps.axes import axes_of
@@ -111,6 +113,7 @@ def _missing(runs: int, before: Sequence[Batch], size: int) -> Iterator[tuple[in
         at = max(at, end)
 
 
+@final
 class _Cases:
     """The scenarios of a sweep but for their seeds, each built once."""
 
@@ -143,18 +146,26 @@ def _rows(
     """Return what some runs came to."""
     built = [cases.built(run) for run in cases.plan.runs(first, count)]
     flown = [each for each in built if not isinstance(each, str)]
-    results = fleet.fly(flown, told)
+    results, told_of = fleet.fly(flown, told), _promised(flown)
     rows = list[dict[str, Any]]()
     for each in built:
-        if isinstance(each, str):
-            rows.append(refused(each))
-            continue
-        result = next(results)
-        if isinstance(result, EchelonError):
-            rows.append(refused(str(result)))
-            continue
-        if result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
-            raise KeyboardInterrupt
-        rows.append(numbers_of(result, promise(*each)))
+        found = each if isinstance(each, str) else next(results)
+        before = None if isinstance(each, str) else next(told_of)
+        if isinstance(found, Result) and isinstance(before, Promise):
+            if found.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
+                raise KeyboardInterrupt
+            rows.append(numbers_of(found, before))
+        else:
+            rows.append(refused(str(before if isinstance(found, Result) else found)))
         told()
     return rows
+
+
+def _promised(built: Sequence[Built]) -> Iterator[Promise | EchelonError]:
+    """Yield what is promised of runs, of which neighbours often differ in the seed alone."""
+    for _, alike in groupby(built, key=lambda each: id(each.parts)):
+        runs = list(alike)
+        try:
+            yield from promises(runs[0].parts, [each.settings for each in runs])
+        except EchelonError as error:
+            yield from [error] * len(runs)
