@@ -4,6 +4,7 @@ It is undirected, weighted or not, with one or more leaders.
 """
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -254,6 +255,10 @@ class Graph:
 
     def nearest_leader(self) -> tuple[int, ...]:
         """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
+        return self._nearest
+
+    @cached_property
+    def _nearest(self) -> tuple[int, ...]:
         hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
         # `argmin` takes the first of equals, and leaders are sorted.
         return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))

@@ -208,8 +208,8 @@ class _Path(NamedTuple):
         """Return what followers in states (K, n) are asked with at the beginning."""
         led = self.states[0] if len(self.times) else self.trim
         sent = self.inputs[0] if len(self.times) else np.zeros(self.inputs.shape[1])
-        many = (np.tile(one, (len(states), 1)) for one in (led, sent))
-        return _Rows(np.zeros(len(states)), *many, states)
+        leaders, inputs = (np.tile(one, (len(states), 1)) for one in (led, sent))
+        return _Rows(np.zeros(len(states)), leaders, inputs, states)
 
 
 def frozen_of(
