@@ -238,15 +238,21 @@ def test_every_combination_is_a_run_once_with_the_seeds_fastest(seeds, a, b, whe
     assert [run.case for run in runs] == [k // seeds for k in range(plan.count)]
 
 
-@given(st.integers(1, 60), st.integers(1, 9), st.sets(st.integers(0, 59)))
-def test_what_is_missing_is_computed_once_in_the_batches_of_a_whole_sweep(runs, size, done):
-    whole = list(_missing(runs, [], size))
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 9), st.sets(st.integers(0, 59)))
+def test_what_is_missing_is_computed_once_in_the_batches_of_a_whole_sweep(cases, seeds, size, done):
+    runs = cases * seeds
+    whole = list(_missing(runs, [], size, seeds))
+    assert max(count for _, count in whole) <= size
+    for first, count in whole:
+        # Neighbours share a case, or each case is whole.
+        alike = first // seeds == (first + count - 1) // seeds
+        assert alike or first % seeds == count % seeds == 0
     before = [
         Batch(first, {"outcome": np.zeros(count)})
         for k, (first, count) in enumerate(whole)
         if k in done
     ]
-    left = list(_missing(runs, before, size))
+    left = list(_missing(runs, before, size, seeds))
     assert sorted([*left, *((b.first, b.runs) for b in before)]) == whole
     assert sum(count for _, count in whole) == runs
 

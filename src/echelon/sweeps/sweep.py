@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 from echelon.core.errors import EchelonError, Outcome
 from echelon.engine.many import Fleet
 from echelon.engine.result import Result
+from echelon.kernels import is_installed
 from echelon.promises.promise import Promise, promises
 from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
@@ -18,8 +19,10 @@ from echelon.sweeps.plan import Run, Sweep
 if TYPE_CHECKING:
     import xarray as xr
 
-_AGENT_STEPS, _MOST = 20_000_000, 2_500
-"""Of a batch: a second or two of native code."""
+_AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
+"""Of a batch: a second or two of native code, and as many runs as a vector has lanes."""
+_SLOWER = 20
+"""How many times slower JAX is."""
 _FRAMES = 20
 """That a run is looked at: for what is not finite, or beyond the range of native code."""
 
@@ -94,20 +97,29 @@ def compute(
             progress(done, plan.count)
 
     told()
-    for first, count in _missing(plan.count, before, cases.size):
+    for first, count in _missing(plan.count, before, cases.size, plan.seeds):
         keep(Batch(first, columns_of(_rows(fleet, cases, first, count, told))))
         done += count
         told()
 
 
-def _missing(runs: int, before: Sequence[Batch], size: int) -> Iterator[tuple[int, int]]:
-    """Yield the batches (first, count) that are to do."""
+def _missing(
+    runs: int, before: Sequence[Batch], size: int, seeds: int = 1
+) -> Iterator[tuple[int, int]]:
+    """Yield the batches (first, count) that are to do, of so many runs.
+
+    Of more seeds than a batch holds none shares a batch with another case's; else all of a case
+    are in one.
+    """
+    whole = seeds if seeds > size else size - size % seeds
     at = 0
     for first, end in [*sorted((b.first, b.first + b.runs) for b in before), (runs, runs)]:
         while at < first:
             # Cut where batches begin, so that the same runs are computed together as without a
             # break, to the same bits.
-            count = min(first, at - at % size + size) - at
+            begun = at - at % whole
+            inner = at - (at - begun) % size + size
+            count = min(first, inner, begun + whole) - at
             yield at, count
             at += count
         at = max(at, end)
@@ -121,8 +133,9 @@ class _Cases:
         self.plan = plan
         self.last: tuple[int, Built | str] = 0, build(plan.case((0,) * len(plan.axes)))
         settings, graph = self.last[1].settings, self.last[1].parts.graph
-        steps = settings.steps * graph.agents
-        self.size = max(1, min(_MOST, _AGENT_STEPS // steps))
+        fast = settings.engine != "jax" and is_installed()
+        most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
+        self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
 
     def built(self, run: Run) -> Built | str:
         """Return the parts and settings of a run, or why they cannot be made."""
