@@ -223,6 +223,11 @@ def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():
     )
     assert stepper.engine == "native"
     assert ours.states.tobytes() == theirs.states.tobytes()
+    [warning] = stepper.warnings
+    assert warning == (
+        "JAX stepped the agents from t = 0 s on where a state was beyond 100000, since the sines "
+        "of native code lose digits there."
+    )
 
 
 def test_an_agent_that_is_lost_is_told_as_by_jax():

@@ -143,7 +143,7 @@ class NativeStepper(Stepper):
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
-        self._drawn = -1
+        self._drawn, self._left = -1, -1
 
     # ---- memory ----
 
@@ -174,6 +174,16 @@ class NativeStepper(Stepper):
         return "native"
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Where it left the steps to JAX."""
+        told = (
+            f"JAX stepped the agents from t = {self._left * self.loop.motion.dt:.6g} s on where a "
+            f"state was beyond {_LARGEST[self.bits]:g}, since the sines of native code lose digits "
+            "there."
+        )
+        return (told,) * (self._left >= 0)
+
+    @property
     def longest(self) -> int:
         """Steps that take some tenths of a second, or a few of very many agents."""
         return max(_FEWEST, _AGENT_STEPS * len(self.loops) // len(self.states))
@@ -193,6 +203,7 @@ class NativeStepper(Stepper):
         if self.far is None or not beyond(made.states, self.bits).any():
             return made
         self._held = None
+        self._left = int(now.step) if self._left < 0 else self._left
         return self.far.advance(now, counts, reference)
 
     def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
