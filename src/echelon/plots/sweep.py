@@ -8,7 +8,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.plots import style as draw
 from echelon.sweeps.axes import SEED
-from echelon.sweeps.dataset import succeeded
+from echelon.sweeps.dataset import share_bounds, succeeded
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -25,7 +25,8 @@ def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
     """Return the figures of a sweep, by name.
 
     `errors` shows how errors and times are distributed, `success` the share of runs that settle
-    over each key of numbers but the seed, and `region` that share over the first two of them.
+    over each key of numbers but the seed, with intervals of 95 %, and `region` that share over the
+    first two of them.
     """
     keys = [key for key in map(str, data["outcome"].dims) if key != SEED and _is_line(data, key)]
     with draw.style():
@@ -73,8 +74,7 @@ def _distributions(data: "xr.Dataset") -> "Figure":
         share = np.arange(1, len(values) + 1) / data["outcome"].size
         keep = draw.thin(len(values))
         ax.step(values[keep], share[keep], where="post", color=draw.COLOURS[0])
-        if name != "worst_settling_time" and values[0] > 0.0:
-            ax.set_xscale("log")
+        _scale(ax, "x", values)
     axes[0].set_ylabel("share of runs below")
     return draw.finish(figure)
 
@@ -90,9 +90,12 @@ def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
     figure, axes = _canvas(len(keys[:3]))
     for ax, key in zip(axes, keys, strict=False):
         settled, runs = (part.sortby(key) for part in _share(data, [key]))
-        rate = settled.values / np.maximum(1, runs.values)
-        draw.plot(ax, settled[key].values, rate, marker="o", markersize=3, color=draw.COLOURS[0])
-        _scale(ax.set_xscale, settled[key].values)
+        values, rate = settled[key].values, settled.values / np.maximum(1, runs.values)
+        low, high = share_bounds(settled.values, np.maximum(1, runs.values))
+        bars = np.abs(np.stack([rate - low, high - rate]))
+        look = {"marker": "o", "markersize": 3, "linestyle": ":", "elinewidth": 0.9, "capsize": 2}
+        ax.errorbar(values, rate, bars, color=draw.COLOURS[0], linewidth=0.7, **look)
+        _scale(ax, "x", values)
         ax.set_xlabel(key)
         ax.set_ylim(-0.03, 1.03)
     axes[0].set_ylabel("share of runs that settle")
@@ -106,8 +109,8 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
     figure, (ax,) = _canvas(1)
     x, y = rate[first].values, rate[second].values
     shown = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
-    _scale(ax.set_xscale, x)
-    _scale(ax.set_yscale, y)
+    _scale(ax, "x", x)
+    _scale(ax, "y", y)
     ax.grid(False)
     ax.set_xlabel(first)
     ax.set_ylabel(second)
@@ -115,7 +118,7 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
     return draw.finish(figure)
 
 
-def _scale(choose: Any, values: Array) -> None:
+def _scale(ax: Any, which: str, values: Array) -> None:
     """Choose a logarithmic axis for values that are spread over decades."""
     if values.min() > 0.0 and values.max() >= 30.0 * values.min():
-        choose("log")
+        getattr(ax, f"set_{which}scale")("log")
