@@ -11,10 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 
 from echelon.core import linear
-from echelon.core.linear import held_radius, held_step
+from echelon.core.linear import flows, held_radius, held_step
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
@@ -93,9 +92,9 @@ class Slopes(NamedTuple):
     def _exponent(self, span: float) -> float:
         """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
         J = self.A[:, None] - self.B[:, None] @ self.gains
-        flows = scipy.linalg.expm(span * J)
-        product, logs = flows[0], np.zeros(J.shape[1])
-        for flow in flows[1:]:
+        each = flows(span * J)
+        product, logs = each[0], np.zeros(J.shape[1])
+        for flow in each[1:]:
             sizes = np.linalg.norm(product, axis=(1, 2))
             # Sizes apart, since a product of two hundred would be beyond all numbers.
             logs += np.log(sizes)
