@@ -24,6 +24,7 @@ from echelon.cli.run import run
 from echelon.cli.stop import STOP, Ended
 from echelon.cli.streams import outlive_readers
 from echelon.cli.verify import verify
+from echelon.cli.view import view
 from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
@@ -105,5 +106,5 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # Listed here and not decorated at home, so that a command's file knows nothing of the program.
-for _command in (run, check, design, compare, verify, list_, doctor, schema):
+for _command in (run, view, check, design, compare, verify, list_, doctor, schema):
     app.command(_command.__name__.rstrip("_"))(_guarded(_command))

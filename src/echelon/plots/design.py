@@ -63,10 +63,7 @@ def _modes(loop: Loop) -> "Figure":
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    closed = loop.closed
-    values = closed.strengths / closed.coupling
-    A, B = loop.linear
-    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
+    values, poles = loop.eigenvalues, loop.poles
     figure = Figure((7.0, 4.2), layout="constrained")
     ax = figure.add_subplot()
     colour = np.repeat(values, poles.shape[1])

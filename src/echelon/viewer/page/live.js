@@ -1,0 +1,3 @@
+function startLive() {
+  throw new Error("no stream yet");
+}
