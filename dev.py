@@ -112,6 +112,7 @@ def wheel(rest: list[str]) -> list[list[str]]:
         [echelon, "list"],
         [echelon, "check", "paper"],
         [echelon, "run", "paper", "--set", "simulation.horizon=1", "--out", str(alone / "run")],
+        [echelon, "view", str(alone / "run"), "--html", str(alone / "run.html")],
     ]
 
 

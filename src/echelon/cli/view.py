@@ -64,9 +64,7 @@ def check_target(file: Path, force: bool) -> None:
     if file.is_file() and not force:
         raise OutputError(f"the file `{file}` exists; choose another, or `--force` to replace it.")
     if not file.resolve().parent.is_dir():
-        raise OutputError(
-            f"`{file.parent}` is no folder, so `{file.name}` cannot be written in it."
-        )
+        raise OutputError(f"`{file.parent}` is no folder to write `{file.name}` into.")
 
 
 def show_page(page: bytes, port: int | None, browser: bool) -> None:

@@ -115,8 +115,8 @@ def _poles(result: Result) -> dict[str, Any]:
         return {}
     poles, values = found.loop.poles, found.loop.eigenvalues
     return {
-        "pole_real": (("mode", "pole"), poles.real),
-        "pole_imaginary": (("mode", "pole"), poles.imag),
+        "pole_real": (("mode", "pole"), np.real(poles)),
+        "pole_imaginary": (("mode", "pole"), np.imag(poles)),
         "mode_eigenvalue": ("mode", values),
     }
 

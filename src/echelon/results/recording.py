@@ -1,6 +1,6 @@
-"""A run as its dataset has it: plain arrays and names, read from `run.nc` without any code of a model.
+"""A run as its dataset has it: arrays and names, read from `run.nc` without a model's code.
 
-Whatever draws a run draws this, so that what is drawn again from a folder is what was drawn first.
+Whatever draws a run draws this, so that what is drawn again is what was drawn first.
 """
 
 import dataclasses
@@ -149,6 +149,8 @@ def read_recording(file: Path) -> Recording:
     try:
         with xr.open_dataset(file, engine="h5netcdf") as data:
             return recording(data.load())
+    except OutputError as error:
+        raise OutputError(f"`{file}`: {error}") from error
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise OutputError(
             f"`{file}` cannot be read as a run: it is damaged, or was not written by echelon "
@@ -164,7 +166,7 @@ def recording(data: "xr.Dataset") -> Recording:
         KeyError: it is no dataset of a run.
     """
     _check_format(data)
-    told, values = data.attrs, {name: part.values for name, part in data.data_vars.items()}
+    told, values = data.attrs, {str(name): part.values for name, part in data.items()}
     names = tuple(str(name) for name in data["state"].values)
     # As text, since netCDF keeps an empty list as nothing.
     shown = str(told["position"]).split()

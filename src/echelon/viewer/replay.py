@@ -102,7 +102,7 @@ def _check_size(run: Recording, groups: Mapping[str, Group], frames: int) -> Non
         )
 
 
-# ---- what the page is told ------------------------------------------------------------------------
+# ---- what the page is told ----------------------------------------------------------------------
 
 
 def header(run: Recording, space: Space) -> dict[str, Any]:

@@ -35,7 +35,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def allowed(self) -> bool:
         """Tell whether a request is ours, and refuse it where it is not."""
-        port = self.server.server_address[1]
+        port = self.connection.getsockname()[1]
         ours = {f"{name}:{port}" for name in _NAMES}
         origin = self.headers.get("Origin")
         if self.headers.get("Host") in ours and origin in {None, *(f"http://{x}" for x in ours)}:

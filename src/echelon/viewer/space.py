@@ -98,9 +98,8 @@ def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
     """Return the places (T, N, k), none farther off than ten times what leaders and goals reach."""
     places, columns = run.states[:, :, list(axes)], list(axes)
     goals = places - run.errors[:, :, columns]
-    known = np.concatenate(
-        [goals[:, list(run.leaders)].reshape(-1, len(axes)), goals[0], places[0]]
-    )
+    led = goals[:, list(run.leaders)].reshape(-1, len(axes))
+    known = np.concatenate([led, goals[0], places[0]])
     low, high = known.min(axis=0), known.max(axis=0)
     reach = max(1.0, float((high - low).max()))
     held = np.clip(places, low - _FAR * reach, high + _FAR * reach)
