@@ -77,7 +77,7 @@ def _followed(result: Result) -> dict[str, Any]:
     """Return what the leaders follow and how far they are from it; nothing without a reference."""
     if result.reference is None:
         return {}
-    found = {"reference": (("time", "state"), result.reference)}
+    found: dict[str, Any] = {"reference": (("time", "state"), result.reference)}
     errors = [output_errors(result, leader) for leader in result.graph.leaders]
     known = [error for error in errors if error is not None]
     if known:

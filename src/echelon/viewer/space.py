@@ -107,11 +107,10 @@ def clipped_places(run: Recording, axes: tuple[int, ...]) -> tuple[Array, bool]:
 
 
 def _box(run: Recording, kind: str, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
-    """Return the box of places and goals as drawn, with some room."""
+    """Return the box of goals and starts as drawn, with what lies a little farther off."""
     low, high = np.zeros(3), np.zeros(3)
     shown = slice(1, 2) if kind == "time" else slice(0, len(axes))
-    flat = places.reshape(-1, len(axes))
-    low[shown], high[shown] = flat.min(axis=0), flat.max(axis=0)
+    low[shown], high[shown] = _reached(run, axes, places)
     if kind == "time":
         low[0], high[0] = 0.0, max(run.times[-1], 1e-9)
     reach = float((high - low)[: 3 if kind == "space" else 2].max()) or 1.0
@@ -125,3 +124,20 @@ def _box(run: Recording, kind: str, axes: tuple[int, ...], places: Array) -> tup
     thin[2] &= kind == "space"
     middle = 0.5 * (low + high)
     return np.where(thin, middle - 0.05 * reach, low), np.where(thin, middle + 0.05 * reach, high)
+
+
+def _reached(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Array, Array]:
+    """Return the ends of all places, but of a formation that flies apart those of goals."""
+    goals = places[0] - run.errors[0][:, list(axes)]
+    led = places[:, list(run.leaders)]
+    known = np.concatenate([led.reshape(-1, len(axes)), goals, places[0]])
+    # Where the leaders carry the goals in the end.
+    moved = led[:, 0] - led[0, 0]
+    known = np.concatenate([known, goals + moved.min(axis=0), goals + moved.max(axis=0)])
+    low, high = known.min(axis=0), known.max(axis=0)
+    room = 0.15 * float((high - low).max()) or 1.0
+    every = places.reshape(-1, len(axes))
+    return (
+        np.maximum(np.minimum(low, every.min(axis=0)), low - room),
+        np.minimum(np.maximum(high, every.max(axis=0)), high + room),
+    )

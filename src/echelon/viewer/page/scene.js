@@ -84,6 +84,7 @@ class View {
   makeMeshes() {
     const { run } = this, lines = { transparent: true, depthWrite: false };
     this.add(swarm(run.shape, run.agents, run.space.kind), this.material(VEHICLE), 2);
+    this.halo = this.add(halo(this.flat), this.material(VEHICLE), 3);
     this.makeLinks(lines);
     this.makeTrails(lines);
   }
@@ -245,6 +246,12 @@ class View {
       state[at + 3] = run.nearest[i] === i ? 0 : 1;
     }
     this.texture.needsUpdate = true;
+    this.halo.visible = this.selected >= 0;
+    if (this.halo.visible) {
+      const whose = this.halo.geometry.getAttribute("agent");
+      whose.array.fill(this.selected);
+      whose.needsUpdate = true;
+    }
     this.shared.now.value = moment.time;
     this.trail.window(this.trailMesh.geometry, moment.time);
     this.moment = moment;

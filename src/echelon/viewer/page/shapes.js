@@ -26,7 +26,9 @@ class Body {
     for (let k = 0; k < corners; k++) {
       const [a, b] = [k, k + 1].map((j) => (2 * Math.PI * j) / corners + Math.PI / corners);
       const at = (angle, r) => [x + r * Math.cos(angle), y + r * Math.sin(angle), z];
-      if (inner) this.quad(kind, [0, 0, lift], at(a, inner), at(a, radius), at(b, radius), at(b, inner));
+      if (corners === 4 && !inner && k > 0) continue;
+      if (corners === 4 && !inner) this.quad(kind, [0, 0, lift], ...[0, 1, 2, 3].map((j) => at(a + (j * Math.PI) / 2, radius)));
+      else if (inner) this.quad(kind, [0, 0, lift], at(a, inner), at(a, radius), at(b, radius), at(b, inner));
       else this.triangle(kind, [0, 0, lift], [x, y, z], at(a, radius), at(b, radius));
     }
   }
@@ -75,7 +77,7 @@ const SHAPES = {
     if (few) {
       body.box(0, [0, 0, 0], [0.12, 0.09, 0.045]);
       body.box(0, [0.15, 0, 0.012], [0.05, 0.035, 0.03]);
-    } else body.disc(0, [0, 0, 0.06], 0.2, 6);
+    } else body.disc(0, [0, 0, 0.06], 0.2, 4);
   },
   birotor(body, few) {
     body.box(0, [0, 0, 0], [0.14, 0.06, 0.02]);
@@ -107,8 +109,14 @@ function swarm(shape, agents, space) {
   if (!flat && few) body.disc(5, [0, 0, 0], shape === "ball" ? 0.26 : 0.4, 20);
   if (few) body.disc(6, [0, 0, flat ? -0.02 : 0], 0.5, 40, 0.455);
   else body.disc(6, [0, 0, flat ? -0.02 : 0], 0.16, 4);
-  body.disc(7, [0, 0, flat ? 0.03 : 0], 0.8, 40, 0.72);
   return repeated(body, agents);
+}
+
+// A ring around who is selected, whoever that is.
+function halo(flat) {
+  const body = new Body();
+  body.disc(7, [0, 0, flat ? 0.03 : 0], 0.8, 40, 0.72);
+  return repeated(body, 1);
 }
 
 function repeated(body, agents) {

@@ -203,13 +203,13 @@ class Backdrop {
   }
 }
 
-// Names beside agents: of all where they are few, else of some leaders.
+// Names beside agents: of all where they are few, of leaders where names fit.
 class Labels {
   constructor(view) {
     const { run } = view, leads = new Set(run.leaders);
     this.view = view;
     this.shown = true;
-    const named = run.agents <= 12 ? [...Array(run.agents).keys()] : run.leaders.slice(0, 12);
+    const named = run.agents <= 12 ? [...Array(run.agents).keys()] : run.agents <= 60 ? run.leaders.slice(0, 12) : [];
     this.all = named.map((agent) => {
       const label = document.createElement("span");
       label.className = leads.has(agent) ? "label leader" : "label";
