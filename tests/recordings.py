@@ -54,6 +54,8 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "bounds": Bounds(np.eye(inputs_count), np.zeros(inputs_count), np.ones(inputs_count)),
         "lyapunov": 0.5 * (errors**2).sum(axis=(1, 2)),
         "lyapunov_rate": None,
+        "metric": None,
+        "limited": np.zeros(agents),
         "tracking": None,
         "modes": Modes(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
         "promise": PROMISE,

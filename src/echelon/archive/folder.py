@@ -12,8 +12,8 @@ from pathlib import Path
 
 from echelon.core.errors import OutputError
 
-CHUNKS, INPUTS, RUNS = "chunks", "inputs", "runs"
-_RUN = ("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
+CHUNKS, INPUTS, RUNS, DATA = "chunks", "inputs", "runs", "run.nc"
+_RUN = ("summary.json", DATA, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
 _OURS = {"summary.json": _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
 """What shows that a run or a comparison wrote a folder, and all that `--force` then removes."""

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 from echelon.archive.chunks import Chunks
+from echelon.archive.folder import DATA
 from echelon.core.errors import OutputError
 from echelon.core.types import PathLike
 from echelon.results.recording import Recording, read_recording
-
-DATA = "run.nc"
 
 
 def open_run(place: PathLike) -> Recording:

@@ -148,14 +148,15 @@ def _attributes(result: Result) -> dict[str, Any]:
     }
 
 
-def save_dataset(result: Result, path: Path) -> None:
+def save_dataset(run: "Result | xr.Dataset", path: Path) -> None:
     """Write the dataset of a run as netCDF, whole or not at all.
 
     Raises:
         OSError: it cannot be written.
     """
     # In memory first: on a disk that is full the library under it ends the whole process.
-    write_whole(path, bytes(dataset(result).to_netcdf(None, engine="h5netcdf")))
+    data = dataset(run) if isinstance(run, Result) else run
+    write_whole(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:

@@ -4,6 +4,7 @@ Whatever draws a run draws this, so that what is drawn again is what was drawn f
 """
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -66,6 +67,8 @@ class Recording:
         bounds: of the inputs; None where nothing limits them.
         lyapunov: V (T,); None where the law has none.
         lyapunov_rate: its derivative (T,).
+        metric: P (n, n) of V, where there is a gain; else None.
+        limited: (N,), the part of the steps in which a limit acted.
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
         promise: as `Promise.as_mapping` gives it.
@@ -94,6 +97,8 @@ class Recording:
     bounds: Bounds | None
     lyapunov: np.ndarray | None
     lyapunov_rate: np.ndarray | None
+    metric: np.ndarray | None
+    limited: np.ndarray
     tracking: Tracking | None
     modes: Modes | None
     promise: Mapping[str, Any]
@@ -106,10 +111,11 @@ class Recording:
         """How many there are."""
         return self.states.shape[1]
 
-    @property
+    @functools.cached_property
     def followers(self) -> tuple[int, ...]:
         """Those who do not lead."""
-        return tuple(k for k in range(self.agents) if k not in self.leaders)
+        leads = {*self.leaders}
+        return tuple(k for k in range(self.agents) if k not in leads)
 
     @property
     def measured(self) -> tuple[int, ...]:
@@ -121,11 +127,36 @@ class Recording:
         """The unit of errors: m for a position, else nothing."""
         return "m" if self.position else ""
 
-    @property
+    @functools.cached_property
     def formation_errors(self) -> np.ndarray:
         """Each agent's distance from its goal, (T, N)."""
         with np.errstate(over="ignore", invalid="ignore"):
             return np.linalg.norm(self.errors[:, :, list(self.measured)], axis=2)
+
+    @property
+    def rate(self) -> float | None:
+        """At what rate errors are promised to shrink, 1/s; None where nothing is, or no rate."""
+        return self.promise["rate"] or None if self.promise["promised"] else None
+
+    def error_bound(self) -> np.ndarray | None:
+        """Return what a theorem bounds every formation error by, (T,); None where none does.
+
+        Theorem 1 has S = sum_i delta_i'P delta_i shrink as e^(-2 alpha t), from starts in the
+        certified set, without what the scenario adds and while no limit acts. Of a delta with
+        delta'P delta <= S the measured part is no longer than the root of S times the largest
+        eigenvalue of that block of P^-1.
+        """
+        told, found = self.promise, self.promise.get("certified_set")
+        held = {x["statement"] for x in told["hypotheses"] if x["verdict"] == "holds"}
+        proved = told["theorem"] == "T1" and found is not None and self.rate is not None
+        if not proved or "starts in the certified set" not in held or self.metric is None:
+            return None
+        if self.limited.any() or "without what the scenario adds" in told["sentence"]:
+            return None
+        begin = float(np.einsum("ia,ab,ib->", self.errors[0], self.metric, self.errors[0]))
+        block = np.linalg.inv(self.metric)[np.ix_(self.measured, self.measured)]
+        widest = float(np.linalg.eigvalsh(block)[-1])
+        return np.sqrt(begin * widest) * np.exp(-(self.rate or 0.0) * self.times)
 
     @property
     def loads(self) -> np.ndarray | None:
@@ -192,6 +223,8 @@ def recording(data: "xr.Dataset") -> Recording:
         bounds=_bounds(values),
         lyapunov=values.get("lyapunov"),
         lyapunov_rate=values.get("lyapunov_rate"),
+        metric=values.get("P"),
+        limited=values["saturated"],
         tracking=_tracking(data, values),
         modes=_modes(values),
         promise=json.loads(told["promise"]),
