@@ -20,6 +20,7 @@ from echelon.cli.crash import CRASHED, note_crash
 from echelon.cli.design import design
 from echelon.cli.doctor import doctor
 from echelon.cli.listing import list_, schema
+from echelon.cli.live import live
 from echelon.cli.plot import plot
 from echelon.cli.run import run
 from echelon.cli.stop import STOP, Ended
@@ -107,5 +108,5 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # Listed here and not decorated at home, so that a command's file knows nothing of the program.
-for _command in (run, view, plot, check, design, compare, verify, list_, doctor, schema):
+for _command in (run, view, live, plot, check, design, compare, verify, list_, doctor, schema):
     app.command(_command.__name__.rstrip("_"))(_guarded(_command))

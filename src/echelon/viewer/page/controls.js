@@ -20,7 +20,7 @@ function icon(name) {
 
 function tellPromise({ state, short, whole }) {
   const badge = $(".promise");
-  badge.classList.remove("holds", "edge", "lost");
+  badge.classList.remove("holds", "edge", "lost", "asking");
   badge.classList.add(state);
   badge.querySelector("b").textContent = short;
   badge.querySelector(".whole").textContent = whole;
