@@ -36,12 +36,14 @@ def opened(browser, address, width=1280, height=720, **options):
     # Screenshots cause a warning of the driver, and only errors count.
     page.on("console", lambda told: told.type == "error" and seen.faults.append(told.text))
     page.on("request", lambda request: seen.asked.append(request.url))
-    page.goto(address)
-    until(lambda: page.evaluate("!!window.echelon") or seen.faults)
-    yield page
+    try:
+        page.goto(address)
+        until(lambda: page.evaluate("!!window.echelon") or seen.faults)
+        yield page
+    finally:
+        context.close()
     home = address.split("?")[0]
     outside = [x for x in seen.asked if not x.startswith((home, "blob:", "data:"))]
-    context.close()
     assert seen.faults == [] and outside == []
 
 

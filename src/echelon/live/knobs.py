@@ -172,7 +172,8 @@ class Panel:
             ScenarioError: it is refused, as where a cut has parted the graph.
         """
         data = self._data()
-        if knobs.coupling is not None and knobs.coupling != self.start.coupling:
+        # With another graph a method would choose another coupling.
+        if knobs.coupling is not None and (knobs.cut or knobs.coupling != self.start.coupling):
             data.setdefault("follower", {}).setdefault("gain", {})["coupling"] = knobs.coupling
             if "file" in data["follower"]["gain"]:
                 data["follower"]["gain"] = self._given(knobs.coupling)

@@ -17,6 +17,7 @@ from echelon.live.swarm import Picture, Swarm
 from echelon.scenario.scenario import Scenario
 
 _PICTURE, _WORDS = 0, 1
+_NOTHING = struct.pack("<I", _WORDS) + b"{}"
 _TURN = 2.399963  # the golden angle, rad: kicks go all ways
 _KICK_SPEED, _KICK_PLACE = 2.0, 0.5  # m/s where there is a velocity, else of the first state
 
@@ -152,7 +153,8 @@ class Session:
                     )
                     blocks = self.words[heard:] + [self.frame] * (self.number > seen)
                     seen, heard = self.number, len(self.words)
-                for block in blocks:
+                # A page that is gone is noticed only by what cannot be sent to it.
+                for block in blocks or [_NOTHING]:
                     send(struct.pack("<I", len(block)) + block)
         finally:
             with self.changed:

@@ -315,9 +315,9 @@ class LiveSpec(BaseModel, **STRICT):
     """Turn of the formation about its first leader, degrees."""
     wind: Annotated[float, Unit("the states', per s")] | None = None
     """Wind on the first velocity, or on the first position, beside `disturbance`."""
-    cut: tuple[int, int] | None = None
+    cut: Annotated[tuple[int, int], Field(strict=False)] | None = None
     """The agents of an edge that is cut."""
-    restore: tuple[int, int] | None = None
+    restore: Annotated[tuple[int, int], Field(strict=False)] | None = None
     """The agents of an edge that is restored."""
     kick: Annotated[dict[int, Numbers] | None, Unit("the states'")] = None
     """By agent: what is added to its states at once, in the states' units."""

@@ -50,7 +50,7 @@ class ViewControls {
     this.show = show;
     this.whom = null;
     this.box = make("div", { class: "toggles" });
-    for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => (view.shared[name].value = on ? (name === "trails" && view.run.agents > 200 ? 0.5 : 1) : 0));
+    for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => (view.shared[name].value = on ? shares(view.run)[name] : 0));
     if (view.labels.all.length) this.toggle("names", (on) => (view.labels.shown = on));
     this.makeFollow();
     const home = make("button", { title: "show all (h)" }, "show all");

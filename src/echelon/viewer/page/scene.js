@@ -22,6 +22,11 @@ function themeColour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
+// How opaque things are: a thousand lines are a haze.
+function shares(run) {
+  return run.agents > 200 ? { links: 0.3, goals: 1, trails: 0.5 } : { links: 1, goals: 1, trails: 0.95 };
+}
+
 class View {
   constructor(element, run) {
     this.element = element;
@@ -59,9 +64,9 @@ class View {
       size: value([1, 1]),
       pixels: value(1.6),
       floor_: value(this.run.box.low[2]),
-      links: value(1),
+      links: value(shares(this.run).links),
       goals: value(1),
-      trails: value(this.run.agents > 200 ? 0.5 : 0.95),
+      trails: value(shares(this.run).trails),
       now: value(0),
       window: value(1),
     };
