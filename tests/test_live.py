@@ -204,12 +204,19 @@ def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
     assert parted["state"] == "lost" and "disconnected" in parted["causes"][0]
 
 
-def test_the_first_look_is_the_slowest_mode_that_the_promise_then_tells(panel):
-    for change in ({}, {"coupling": 0.3}, {"cut": frozenset({3})}):
-        knobs = panel.start._replace(**change)
-        found = ech.promise(*build(panel.standing(knobs)))
-        assert panel.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
-        assert first_look(panel, knobs)["state"] == "asking"
+LOOKS = [
+    {"coupling": 0.3},
+    pytest.param({}, marks=pytest.mark.slow),
+    pytest.param({"cut": frozenset({3})}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("change", LOOKS)
+def test_the_first_look_is_the_slowest_mode_that_the_promise_then_tells(panel, change):
+    knobs = panel.start._replace(**change)
+    found = ech.promise(*build(panel.standing(knobs)))
+    assert panel.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
+    assert first_look(panel, knobs)["state"] == "asking"
 
 
 def test_a_growing_mode_is_told_at_once(panel):

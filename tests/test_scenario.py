@@ -152,6 +152,7 @@ def test_defaults():
             "engine": "auto",
         },
         "report": {"steady_window": 6.0},
+        "live": (),
         "seed": 0,
     }
 

@@ -13,12 +13,12 @@ from browser import chromium, opened, until
 from recordings import flown, recorded
 
 from echelon.core.errors import OutputError
+from echelon.plots.space import space_of
 from echelon.results.dataset import dataset
 from echelon.results.recording import recording
 from echelon.viewer.pack import Group, pack
 from echelon.viewer.replay import frames_of, replay_data, replay_page
 from echelon.viewer.serve import Handler, serve, serving
-from echelon.viewer.space import space_of
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.live.knobs import Panel
 from echelon.live.swarm import Swarm
+from echelon.plots.space import Space, space_of
 from echelon.results.recording import Bounds, Recording
 from echelon.viewer.replay import header, motor_loads
-from echelon.viewer.space import Space, space_of
 
 _AHEAD, _PLACES = 60.0, 121
 """Seconds of the reference that the scene makes room for, and at how many times it is asked."""

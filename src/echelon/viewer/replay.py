@@ -7,11 +7,11 @@ import numpy as np
 
 from echelon.core.errors import OutputError
 from echelon.core.types import Array
+from echelon.plots.space import Space, body_width, clipped_places, space_of
 from echelon.results.recording import Recording
 from echelon.viewer.charts import charts_of
 from echelon.viewer.pack import BYTE, COARSE, Group, pack
 from echelon.viewer.page import page
-from echelon.viewer.space import Space, clipped_places, space_of
 
 FLOCK = 200
 """With more agents than this, bodies are flat, and what is stored of motors is a byte."""
@@ -169,21 +169,8 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
 
 def _size(run: Recording, space: Space) -> tuple[float, str]:
     """Return by what bodies are drawn larger than 1, and how that is said."""
-    reach = float((space.high - space.low)[: 3 if space.kind == "space" else 2].max())
-    apart = _spacing(run, space) if space.kind in ("space", "plane") else 0.0
-    wide = float(np.clip(0.45 * apart, reach / 60.0, reach / 12.0))
-    wide = wide if apart else reach / 36.0
+    wide = body_width(run, space)
     across = {"quadrotor": 1.15, "birotor": 1.35, "car": 0.9, "ball": 0.52, "dot": 0.5}
     if space.kind in ("phase", "time"):
         return wide / across["dot"], ""
     return wide / across[space.shape], f"vehicles drawn {wide:.2g} m wide, not to scale"
-
-
-def _spacing(run: Recording, space: Space) -> float:
-    """Return how far apart goals typically are: the median of the distances to the nearest one."""
-    from scipy.spatial import KDTree
-
-    goals = (run.states[0] - run.errors[0])[:, list(space.axes)]
-    apart = KDTree(goals).query(goals, k=2)[0][:, 1] if len(goals) > 1 else np.zeros(1)
-    apart = apart[np.isfinite(apart) & (apart > 0.0)]
-    return float(np.median(apart)) if apart.size else 0.0

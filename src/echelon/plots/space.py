@@ -141,3 +141,16 @@ def _reached(run: Recording, axes: tuple[int, ...], places: Array) -> tuple[Arra
         np.maximum(np.minimum(low, every.min(axis=0)), low - room),
         np.minimum(np.maximum(high, every.max(axis=0)), high + room),
     )
+
+
+def body_width(run: Recording, space: Space) -> float:
+    """Return how wide bodies are drawn: a part of how far apart goals are, so that all are seen."""
+    from scipy.spatial import KDTree
+
+    reach = float((space.high - space.low)[: 3 if space.kind == "space" else 2].max())
+    goals = (run.states[0] - run.errors[0])[:, list(space.axes)]
+    apart = KDTree(goals).query(goals, k=2)[0][:, 1] if run.agents > 1 else np.zeros(1)
+    apart = apart[np.isfinite(apart) & (apart > 0.0)]
+    if space.kind not in ("space", "plane") or not apart.size:
+        return reach / 36.0
+    return float(np.clip(0.45 * np.median(apart), reach / 60.0, reach / 12.0))
