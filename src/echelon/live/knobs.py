@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import scipy.sparse as sp
@@ -49,6 +49,7 @@ class Knobs(NamedTuple):
     cut: frozenset[int] = frozenset()
 
 
+@final
 class Panel:
     """Which knobs a scenario has, their ranges, and what they mean for it.
 

@@ -1,5 +1,6 @@
 """The live page: its code, its stream, and what it asks for."""
 
+import abc
 import contextlib
 import json
 import struct
@@ -80,7 +81,7 @@ def serve_live(session: Session, html: str, port: int | None) -> ThreadingHTTPSe
     return serve(Live, port)
 
 
-class _Live(Handler):
+class _Live(Handler, abc.ABC):
     session: Session
 
     def do_GET(self) -> None:

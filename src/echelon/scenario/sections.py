@@ -305,19 +305,21 @@ class LiveSpec(BaseModel, **STRICT):
 
     at: Annotated[NotNegative, Unit("s")]
     """When, s."""
-    coupling: Positive | None = None
+    coupling: Annotated[Positive | None, Unit("1")] = None
     """The coupling from then on."""
-    feedforward: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
     """1 where followers are sent what `follower.feedforward` says, 0 where nothing."""
-    size: Positive | None = None
+    size: Annotated[Positive | None, Unit("1")] = None
     """Size of the formation, times that of `formation`."""
-    turn: Annotated[float, Unit("deg")] | None = None
+    turn: Annotated[float | None, Unit("deg")] = None
     """Turn of the formation about its first leader, degrees."""
-    wind: Annotated[float, Unit("the states', per s")] | None = None
+    wind: Annotated[float | None, Unit("the states', per s")] = None
     """Wind on the first velocity, or on the first position, beside `disturbance`."""
-    cut: Annotated[tuple[int, int], Field(strict=False)] | None = None
+    cut: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = None
     """The agents of an edge that is cut."""
-    restore: Annotated[tuple[int, int], Field(strict=False)] | None = None
+    restore: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = (
+        None
+    )
     """The agents of an edge that is restored."""
     kick: Annotated[dict[int, Numbers] | None, Unit("the states'")] = None
     """By agent: what is added to its states at once, in the states' units."""

@@ -1,5 +1,6 @@
 """A page served to this machine alone, and the browser that shows it."""
 
+import abc
 import contextlib
 import errno
 import threading
@@ -16,7 +17,7 @@ _TRIES: Final = 50
 _NAMES: Final = (HOST, "localhost", "[::1]")
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(BaseHTTPRequestHandler, abc.ABC):
     """Answers requests for `page` that come from this machine's own pages; others get a 403.
 
     Any page that a person has open can send requests to 127.0.0.1, and a name of another's may be
