@@ -48,7 +48,7 @@ def steppers(graph: ech.Graph, bits: int) -> tuple[Stepper, Stepper, np.ndarray]
     with precision("float64"):
         loop = assemble(problem, drive.leader, drive.follower)
         by_jax = JaxStepper(loop, problem.states)
-        native = NativeStepper(loop, problem.states, bits, by_jax)
+        native = NativeStepper([loop], problem.states, bits, by_jax)
         times = _DT * jax.numpy.arange(10_001)
         reference = np.asarray(drive.reference_states(prepared.parts.model, times))
     return native, by_jax, reference

@@ -31,7 +31,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 # Which tests concern a room, or a file that has tests of its own.
 TESTS = {
-    "core": ["jaxpr", "linearization", "lyapunov", "bad_input"],
+    "core": ["jaxpr", "linearization", "lyapunov", "bad_input", "limits", "gains", "doctor"],
     "enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
     "network": ["graph", "formation", "recommend", "limits"],
     "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
@@ -41,9 +41,10 @@ TESTS = {
     "enclosure/curves.py": ["interval", "hull"],
     "enclosure/interval.py": ["interval", "hull"],
     "verifier": ["verify", "false_claims"],
-    "gains": ["gains", "inner_loop", "regional", "paper"],
+    "gains": ["gains", "inner_loop", "regional", "paper", "bad_input"],
     "laws": ["laws", "feedforward", "inner_loop", "bad_input", "paper", "attack"],
-    "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans"],
+    "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans", "native"],
+    "kernels": ["kernels", "native"],
 }
 LIMIT = 4.0, 30.0
 """A change may make its tests take so many times as long, and so many seconds more."""

@@ -523,6 +523,10 @@ GAINS = {
         lambda: synthesize(CART, PAIR, Riccati(Q=[[1.0, 0.5], [0.0, 1.0]])),
         "`Q` must be a symmetric matrix of finite numbers.",
     ),
+    "Q beyond all numbers": (
+        lambda: synthesize(CART, PAIR, Riccati(Q=[1.0, np.inf])),
+        "`Q` must be a symmetric matrix of finite numbers.",
+    ),
     "Q of another size": (
         lambda: synthesize(CART, PAIR, Riccati(Q=[1.0, 1.0, 1.0])),
         "`Q` has shape (3,), and must be 2 numbers or 2 x 2.",

@@ -22,7 +22,8 @@ def spinning(start, store_every=1):
 
 @pytest.mark.parametrize("store_every", [1, 40])
 @pytest.mark.parametrize(
-    ("start", "first"), [((1.94, 0.0), 0.0), ((0.0, 2.0), np.ceil(50.0 * np.pi / 2.0) / 100.0)]
+    ("start", "first"),
+    [((1.94, 0.0), 0.0), ((0.0, 2.0), np.ceil(50.0 * np.pi / 2.0) / 100.0), ((0.0, 1.575), 1.0)],
 )
 def test_an_agent_that_leaves_its_chart_is_named_with_the_time(start, first, store_every):
     # A constant rate q of pitch reaches 90 degrees at pi / (2 q), told to the step.

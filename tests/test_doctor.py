@@ -1,10 +1,17 @@
 """Each self-check can fail: where its claim is broken, `doctor` says so."""
 
 import contextlib
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
+import numpy as np
+import scipy
 
+import echelon as ech
 from echelon.core import numerics
+from echelon.core.provenance import versions
 from echelon.models import Pendulum, SingleIntegrator
 from echelon.models.check import check_model
 from echelon.scenario import registry
@@ -57,3 +64,20 @@ def test_a_verb_that_switches_precision_for_good_fails_the_check_of_precision(mo
 
         monkeypatch.setattr(doctor, "linearize", switches)
         assert not verdict("_precision_kept").holds
+
+
+def test_versions_are_those_of_what_is_imported_and_of_the_checkout():
+    found = versions()
+    assert found["echelon"] == ech.__version__
+    assert found["python"] == sys.version.split()[0]
+    assert [found[name] for name in ("jax", "numpy", "scipy")] == [
+        package.__version__ for package in (jax, np, scipy)
+    ]
+    home = Path(ech.__file__).resolve().parents[2]
+    assert ("git" in found) == (home / ".git").exists()
+    if "git" in found:
+        ends = [
+            subprocess.run(["git", "-C", str(home), "rev-parse", name], capture_output=True).stdout
+            for name in ("HEAD", found["git"].removesuffix("+"))
+        ]
+        assert ends[0] and ends[0] == ends[1]

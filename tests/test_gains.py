@@ -1,6 +1,7 @@
 """Gains and what their certificates say, against closed forms and eigenvalues."""
 
 import dataclasses
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from echelon.core.errors import GainError
 from echelon.core.linear import observability_rank, uncontrollable_modes
 from echelon.core.words import Kind
 from echelon.gains import Feedback, FixedGain, Method, Riccati
+from echelon.gains.file import gain_as_mapping
 from echelon.gains.gain import synthesize
 from echelon.models import (
     ControlAffine,
@@ -347,3 +349,48 @@ def test_a_coupling_beyond_all_numbers_is_one_sentence_and_no_warning(recwarn):
     with pytest.raises(ech.errors.GainError, match="eigenvalue is beyond all numbers"):
         ech.synthesize(model, graph, ech.gains.Riccati(coupling=1e308))
     assert not [each for each in recwarn if issubclass(each.category, RuntimeWarning)]
+
+
+def test_a_file_whose_coupling_was_raised_by_hand_is_refused_where_it_is_read(tmp_path):
+    model, graph, file = ech.models.DoubleIntegrator(1), ech.Graph.path(3), tmp_path / "gain.json"
+    ech.save_gain(ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, file)
+    stored = json.loads(file.read_text())
+    file.write_text(json.dumps(stored | {"coupling": 1e200}))
+    with pytest.raises(ech.errors.GainError, match="the feedback is too strong to compute with"):
+        ech.load_gain(file, model, graph)
+
+
+class Bounded(ControlAffine):
+    """x' = u, with a bound that may be infinite."""
+
+    state_names, input_names = ("x",), ("u",)
+    bound: float = 1.0
+
+    def drift(self, x):
+        return jnp.zeros_like(x)
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+
+@pytest.mark.parametrize(("bound", "stored"), [(2.0, {"bound": 2.0}), (np.inf, None)])
+def test_parameters_that_json_cannot_hold_are_left_out_of_a_file(bound, stored):
+    model, graph = Bounded(bound), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+    assert gain_as_mapping(gain, model, graph)["model"]["parameters"] == stored
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_contraction_is_coupled_as_weakly_as_its_inequality_allows(exact):
+    model, graph = ech.models.Pendulum(), ech.Graph.path(3)
+    method = ech.gains.Contraction({"angle": 0.5}, rate=0.3, exact=exact)
+    gain = ech.synthesize(model, graph, method)
+    assert gain.coupling == gain.certificate.edge
+
+
+def test_all_states_that_a_lost_mode_lies_along_are_named_and_none_of_rounding_s_size():
+    w = np.array([1.0, 1.0, 1.0, 0.13, 0.0])
+    along = np.outer(w, w) / (w @ w)
+    A, B = 0.5 * along - (np.eye(5) - along), [[1.0], [-1.0], [0.0], [0.0], [1.0]]
+    with pytest.raises(GainError, match="0.5 1/s, which lies along `a`, `b`, `c`, `d`;"):
+        synthesize(Linear(A, B, names=list("abcde")), LINE, Riccati())

@@ -182,12 +182,14 @@ def test_a_loop_weaker_than_its_own_damping_bears_any_delay():
     assert delay_margin(ClosedLoop(-2.0 * ONE, ONE, ONE, ONE, 1.0, [1.0, 1.9])).delay == np.inf
 
 
-def test_a_double_integrator_bears_its_phase_margin():
+@pytest.mark.parametrize("pace", [1e-4, 1.0, 1e4])
+def test_a_double_integrator_bears_its_phase_margin_at_any_pace(pace):
     p, d = 4.0, 3.0
-    margin = delay_margin(ClosedLoop(CHAIN, PUSH, with_rows([p, d]), ONE, 1.0, [1.0]))
+    A, B = pace * CHAIN, pace * PUSH
+    margin = delay_margin(ClosedLoop(A, B, with_rows([p, d]) / pace, ONE, 1.0, [1.0]))
     frequency = np.sqrt(0.5 * (d**2 + np.sqrt(d**4 + 4.0 * p**2)))
-    assert margin.frequency == pytest.approx(frequency)
-    assert margin.delay == pytest.approx(np.arctan(d * frequency / p) / frequency)
+    assert margin.frequency == pytest.approx(pace * frequency)
+    assert margin.delay == pytest.approx(np.arctan(d * frequency / p) / frequency / pace)
 
 
 def test_the_quadrotor_on_the_line_of_three_bears_14_5_ms():

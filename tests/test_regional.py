@@ -509,6 +509,16 @@ def squares(x, v):
     return 0.5 * x**2
 
 
+@pytest.mark.parametrize("slope", [-1.0, 1.0])
+def test_a_state_that_the_slopes_do_not_feel_may_be_left_open(slope):
+    model = ech.models.Linear([[slope]], [[1.0]])
+    with precision("float64"):
+        found = sample_jacobians(model, Domain.about(model, {}), lambda x, u: slope * x, None)
+        assert (found == slope).all()
+        with pytest.raises(ech.errors.GainError, match="leaves `x1` unbounded"):
+            sample_jacobians(model, Domain.about(model, {}), squares, None)
+
+
 @pytest.mark.parametrize("size", [2, 7, 9])
 def test_samples_lie_in_the_domain_and_at_its_corners(size):
     model = ech.models.Linear(-np.eye(size), np.ones((size, 1)))

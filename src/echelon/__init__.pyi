@@ -30,6 +30,7 @@ from .archive.run import (
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome
+from .engine.gradient import gradient as gradient
 from .engine.laws import Laws as Laws
 from .engine.parts import Parts as Parts
 from .engine.result import Result as Result
@@ -81,8 +82,10 @@ from .studies.compare import compare as compare
 from .studies.design import design as design
 from .studies.finite_condition import finite_condition as finite_condition
 from .studies.speedup import speedup as speedup
+from .studies.tune import tune as tune
 from .verifier.verify import verify as verify
 from .world.disturbance import Disturbance as Disturbance
 from .world.world import World as World
 
 __version__: str
+from .sweeps.sweep import sweep as sweep

@@ -6,8 +6,9 @@ import io
 import json
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
@@ -34,19 +35,22 @@ class Chunks:
 
     Args:
         folder: of the run.
+        by: the folder in it where they are.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, by: str = CHUNKS) -> None:
         """Take the folder."""
-        self.folder, self.place = folder, folder / CHUNKS
+        self.folder, self.place = folder, folder / by
 
     @property
     def exist(self) -> bool:
         """Whether the run may go on."""
         return self.place.is_dir()
 
-    def begin(self, scenario: Scenario) -> None:
+    def begin(self, scenario: Scenario, more: Mapping[str, str] = MappingProxyType({})) -> None:
         """Write the scenario with all files that it names, before anything is computed.
+
+        `more` are texts that the numbers rest on too, by their names among these files.
 
         Raises:
             OutputError: a file cannot be written.
@@ -56,6 +60,9 @@ class Chunks:
             for name, source in files.items():
                 (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
                 write_whole(self.folder / name, source.read_bytes())
+            for name, told in more.items():
+                (self.folder / INPUTS).mkdir(exist_ok=True)
+                write_whole(self.folder / INPUTS / name, told)
             write_whole(self.folder / KEPT, text)
             begun = {"inputs": self._digest(), "versions": versions()}
             write_whole(self.place / _BEGUN, json.dumps(begun) + "\n")
@@ -106,10 +113,27 @@ class Chunks:
         Raises:
             OSError: it cannot be written.
         """
+        self.store(stretch.first, _arrays(stretch))
+
+    def store(self, first: int, arrays: Mapping[str, Any]) -> None:
+        """Write arrays under a number, whole or not at all.
+
+        Raises:
+            OSError: they cannot be written.
+        """
         # In memory first, since a file is written whole or not at all.
         content = io.BytesIO()
-        np.savez(content, allow_pickle=False, **_arrays(stretch))
-        write_whole(self.place / f"{stretch.first}.npz", content.getvalue())
+        np.savez(content, allow_pickle=False, **arrays)
+        write_whole(self.place / f"{first}.npz", content.getvalue())
+
+    def stored(self, first: int) -> dict[str, Any] | None:
+        """Return the arrays under a number; None where they are missing or damaged."""
+        try:
+            # A pickle would run what it holds, and a folder may come from others.
+            with np.load(self.place / f"{first}.npz", allow_pickle=False) as stored:
+                return dict(stored)
+        except _DAMAGED:
+            return None
 
     def read(self) -> list[Stretch]:
         """Return the stretches in their order, up to the first that is missing or damaged."""
@@ -119,10 +143,9 @@ class Chunks:
         first, done = -1, 0
         while first != done:
             first = done
+            stored = self.stored(first)
             try:
-                # A pickle would run what it holds, and a folder may come from others.
-                with np.load(self.place / f"{first}.npz", allow_pickle=False) as stored:
-                    stretch = _stretch(first, dict(stored))
+                stretch = _stretch(first, stored or {})
             except _DAMAGED:
                 return
             yield stretch

@@ -12,11 +12,14 @@ from pathlib import Path
 
 from echelon.core.errors import OutputError
 
-CHUNKS, INPUTS, RUNS, DATA = "chunks", "inputs", "runs", "run.nc"
+CHUNKS, INPUTS, RUNS, BATCHES, DATA = "chunks", "inputs", "runs", "batches", "run.nc"
 _RUN = ("summary.json", DATA, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
+_SWEEP = ("sweep.nc", "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
 _OURS = {"summary.json": _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
-"""What shows that a run or a comparison wrote a folder, and all that `--force` then removes."""
+_OURS |= {"sweep.nc": _SWEEP, BATCHES: _SWEEP}
+"""What shows that a command wrote a folder, and all that `--force` then removes."""
+_WANTED = {CHUNKS: _RUN, RUNS: _COMPARISON, BATCHES: _SWEEP}
 
 
 def claim_folder(name: str, out: Path | None, force: bool, by: str = CHUNKS) -> Path:
@@ -81,8 +84,10 @@ def claim_design(out: Path | None, figures: Path | None, force: bool, read: Sequ
 
 
 @contextlib.contextmanager
-def writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path, by: str = CHUNKS) -> Iterator[None]:
     """Keep others from writing into the folder of a run, for as long as this process lives.
+
+    `by` is the folder in it by which it was taken.
 
     Raises:
         OutputError: another process writes into it, or it is no folder of a run that goes on.
@@ -93,7 +98,7 @@ def writing(folder: Path) -> Iterator[None]:
         yield
         return
     try:
-        place = os.open(folder / CHUNKS, os.O_RDONLY)
+        place = os.open(folder / by, os.O_RDONLY)
     except OSError as error:
         raise unwritable(folder, error) from error
     try:
@@ -144,7 +149,7 @@ def _named_folder(out: Path, force: bool, by: str) -> Path:
     probe = out / ".writable"
     probe.touch()
     probe.unlink()
-    _clear(out, present, _RUN if by == CHUNKS else _COMPARISON)
+    _clear(out, present, _WANTED[by])
     return out
 
 
@@ -160,7 +165,9 @@ def _clear(out: Path, present: Sequence[str], wanted: Sequence[str]) -> None:
         raise OutputError(
             f"the folder `{out}` holds `{foreign[0]}`, which no run left there; choose another."
         )
-    with writing(out) if CHUNKS in present else contextlib.nullcontext():
+    with contextlib.ExitStack() as stack:
+        for by in {CHUNKS, BATCHES}.intersection(present):
+            stack.enter_context(writing(out, by))
         # By name, so that nothing goes that echelon did not write.
         for path in (out / name for name in earlier):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)

@@ -30,6 +30,8 @@ from echelon.cli.report import report
 from echelon.cli.run import run
 from echelon.cli.stop import STOP, Ended
 from echelon.cli.streams import outlive_readers
+from echelon.cli.sweep import sweep
+from echelon.cli.tune import tune
 from echelon.cli.verify import verify
 from echelon.cli.video import video
 from echelon.cli.view import view
@@ -120,8 +122,8 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 # Listed here and not decorated at home, so that a command's file knows nothing of the program.
 _COMMANDS: tuple[Callable[..., Any], ...] = (
-    *(init, run, view, live, plot, video, report, export),
-    *(check, design, compare, verify, list_, explain, doctor, schema),
+    *(init, run, sweep, view, live, plot, video, report, export),
+    *(check, design, tune, compare, verify, list_, explain, doctor, schema),
 )
 for _command in _COMMANDS:
     app.command(_command.__name__.rstrip("_"))(_guarded(_command))

@@ -17,7 +17,7 @@ ScenarioArgument = Annotated[str, typer.Argument(help="A bundled scenario's name
 
 
 @contextlib.contextmanager
-def show_progress(quiet: bool) -> "Iterator[Progress | None]":
+def show_progress(quiet: bool, what: str = "steps") -> "Iterator[Progress | None]":
     """Show steps and time left on standard error while a run lasts, where someone watches."""
     if quiet or not sys.stderr.isatty():
         yield None
@@ -35,7 +35,7 @@ def show_progress(quiet: bool) -> "Iterator[Progress | None]":
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("steps, left"),
+        TextColumn(f"{what}, left"),
         TimeRemainingColumn(),
     )
     # Standard error, so that the bar is seen while the report goes into a file.

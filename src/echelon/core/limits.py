@@ -13,6 +13,8 @@ MOST_STEPS: Final = 2**31 - 1
 """The number of a step is an integer of 32 bits in the compiled loop."""
 MOST_AGENTS: Final = 1_000_000
 MOST_EDGES: Final = 10_000_000
+MOST_RUNS: Final = 10_000_000
+"""Of a sweep."""
 MOST_STATES: Final = 300
 """Of one agent: a gain takes the cube of it, and a formation of some has the square in P."""
 
@@ -37,6 +39,18 @@ def excess_edges(edges: float) -> str | None:
 def excess_states(states: int) -> str | None:
     """Return why an agent has too many states."""
     return _most(states, MOST_STATES, "states of an agent")
+
+
+def excess_runs(runs: int, numbers: int = 0) -> str | None:
+    """Return why a sweep has too many runs, of each of which so many numbers are kept."""
+    most = _most(runs, MOST_RUNS, "runs")
+    asked, room = 8 * _COPIES * runs * numbers, memory() // 2
+    if most is not None or asked <= room:
+        return most
+    return (
+        f"{runs} runs are asked for, whose findings need {_bytes(asked)} of memory, and "
+        f"{_bytes(room)} fit: {runs * room // asked} runs"
+    )
 
 
 def horizon_fault(horizon: float, dt: float) -> str | None:

@@ -1,7 +1,7 @@
 """Where the agents start: leaders on their reference, followers about their goals."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -22,28 +22,57 @@ def initial_states(parts: Parts, seed: int) -> np.ndarray:
         SimulationError: given states have a wrong shape or are not finite; a spread is negative.
         ModelError: a spread or error names no state or group.
     """
-    model, graph, initial = parts.model, parts.graph, parts.initial
-    shape = (graph.agents, len(model.state_names))
-    error = _per_state(model, parts.start_error, "start error")
-    if initial is not None and not isinstance(initial, Mapping):
-        states = _read_states(initial, shape, "initial states have", "(agents, states)")
-        # Given states are where leaders belong; the error is what they are off from there.
-        states[list(graph.leaders)] += error
+    return Starts(parts)(seed)
+
+
+@final
+class Starts:
+    """The states at time zero, for one seed after the other.
+
+    Args:
+        parts: what starts.
+
+    Raises:
+        EchelonError: as in `initial_states`.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        """Compute what no seed changes."""
+        model, graph, initial = parts.model, parts.graph, parts.initial
+        self.graph, self.shape = graph, (graph.agents, len(model.state_names))
+        self.error = _per_state(model, parts.start_error, "start error")
+        self.given: np.ndarray | None = None
+        self.named: dict[Any, Any] = {}
+        if initial is not None and not isinstance(initial, Mapping):
+            self.given = _read_states(
+                initial, self.shape, "initial states have", "(agents, states)"
+            )
+            # Given states are where leaders belong; the error is what they are off from there.
+            self.given[list(graph.leaders)] += self.error
+            return
+        named = dict(initial or {})
+        spreads = {key: value for key, value in named.items() if isinstance(key, str)}
+        self.spread = _per_state(model, spreads, "initial spread")
+        if (self.spread < 0.0).any():
+            least = self.spread.min()
+            raise SimulationError(f"an initial spread is {least}, and must not be negative.")
+        self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
+        leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
+        self.goals = leaders + parts.formation.offsets
+
+    def __call__(self, seed: int) -> np.ndarray:
+        """Return the states (N, n) for a seed."""
+        if self.given is not None:
+            return self.given.copy()
+        leaders = list(self.graph.leaders)
+        # Drawn for all agents and scaled afterwards, so that another spread keeps the directions,
+        # and another choice of leaders the followers' draws.
+        deviations = self.spread * np.random.default_rng(seed).uniform(-1.0, 1.0, self.shape)
+        deviations[leaders] = 0.0
+        states = self.goals + deviations
+        _place(states, self.named, self.graph)
+        states[[agent for agent in leaders if agent in self.named]] += self.error
         return states
-    named = dict(initial or {})
-    spreads = {key: value for key, value in named.items() if isinstance(key, str)}
-    spread = _per_state(model, spreads, "initial spread")
-    if (spread < 0.0).any():
-        raise SimulationError(f"an initial spread is {spread.min()}, and must not be negative.")
-    leaders = np.asarray(parts.drive.start(model), np.float64) + error
-    # Drawn for all agents and scaled afterwards, so that another spread keeps the directions, and
-    # another choice of leaders the followers' draws.
-    deviations = spread * np.random.default_rng(seed).uniform(-1.0, 1.0, shape)
-    deviations[list(graph.leaders)] = 0.0
-    states = leaders + parts.formation.offsets + deviations
-    _place(states, {key: value for key, value in named.items() if not isinstance(key, str)}, graph)
-    states[[agent for agent in graph.leaders if agent in named]] += error
-    return states
 
 
 def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:

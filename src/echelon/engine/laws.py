@@ -108,10 +108,10 @@ class Laws(Drive):
         """
         loop, settings = assemble(problem, self.leader, self.follower), problem.settings
         by_jax = JaxStepper(loop, problem.states)
-        if settings.engine == "jax" or settings.engine == "auto" and not _worth_it(problem):
+        if not worth_native(settings, len(problem.states)):
             return by_jax
         try:
-            return NativeStepper(loop, problem.states, int(settings.precision[5:]), by_jax)
+            return NativeStepper([loop], problem.states, int(settings.precision[5:]), by_jax)
         except (Unsupported, MissingExtraError) as error:
             if settings.engine == "native":
                 raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
@@ -122,9 +122,14 @@ _WORTH = 100_000
 """Steps of one agent from which on native code saves more than the second that it takes to make."""
 
 
-def _worth_it(problem: Problem) -> bool:
-    """Tell whether a run is long enough for native code, which computes on processors alone."""
-    long = problem.settings.steps * len(problem.states) >= _WORTH
+def worth_native(settings: Settings, agents: int) -> bool:
+    """Tell whether agents are to be stepped by native code: it is asked for, or pays.
+
+    It computes on processors alone.
+    """
+    if settings.engine != "auto":
+        return settings.engine == "native"
+    long = settings.steps * agents >= _WORTH
     return long and is_installed() and jax.default_backend() == "cpu"
 
 

@@ -1,7 +1,9 @@
 """The closed loop stepped by code for this machine: agents in the lanes of vectors."""
 
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +12,11 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin
-from echelon.engine.places import Places, edge_blocks, heard
+from echelon.engine.own import Own
+from echelon.engine.places import Formations, Places, Swarm
 from echelon.engine.scalars import Rows, body_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import SLOTS, Code, Plan, aligned, program, stride
+from echelon.kernels import SLOTS, Code, Plan, aligned, program
 from echelon.laws.law import Law, Memory
 from echelon.world.disturbance import draw
 
@@ -23,86 +26,134 @@ _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some tenths of a second."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
+_KEPT = 8
+"""Kernels that are kept for other runs."""
+
+
+def follows(loop: Loop) -> bool:
+    """Tell whether the leaders of a loop follow a reference."""
+    return loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
+
+
+class _Kernel(NamedTuple):
+    """The code that steps some loops, the rows that it works on, and its plan."""
+
+    code: Code
+    rows: Rows
+    plan: Plan
+
+
+def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
+    """Return the code that steps some loops, the rows that it works on, and its plan.
+
+    Raises:
+        Unsupported: a law or the model uses what has no scalar operations.
+    """
+    loop, rows, wanted = own.loop, Rows.of(own.loop, own.count), follows(own.loop)
+    n, alone = len(rows.state), len(loop.leaders) == 1
+    plan = Plan(
+        bits=bits,
+        lanes=_LANES[bits],
+        together=together,
+        rows=rows.total,
+        width=n,
+        first=body_of(own, bits, rows, True, wanted),
+        others=body_of(own, bits, rows, False, wanted),
+        tell=rows.tell.start,
+        told=len(rows.tell),
+        one_source=alone and loop.parents is None,
+        one_leader=alone,
+        weighted=bool((np.asarray(loop.exchange.weights) != 1.0).any()),
+        edges=loop.meter.measured,
+        table=n if wanted else 0,
+        dt=loop.motion.dt,
+    )
+    # Where JAX was told to keep what it compiles, so that one setting rules both.
+    cache = getattr(jax.config, "jax_compilation_cache_dir", None)
+    return _Kernel(Code(program(plan), Path(cache) if cache else None), rows, plan)
+
+
+@final
+class Kernels:
+    """Those that were made, so that loops alike but for their own numbers share one."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._made: dict[Hashable, _Kernel] = {}
+
+    def of(self, own: Own, bits: int, together: bool) -> _Kernel:
+        """Return what steps some loops.
+
+        Raises:
+            Unsupported: a law or the model uses what has no scalar operations.
+        """
+        key = (own.signature, bits, together)
+        if key not in self._made:
+            # The oldest goes: a sweep over models has one after the other.
+            while len(self._made) >= _KEPT:
+                self._made.pop(next(iter(self._made)))
+            self._made[key] = _kernel(own, bits, together)
+        return self._made[key]
+
+
+def beyond(states: Array, bits: int) -> Array:
+    """Return which states are beyond the range of the kernels' sines; NaN is not."""
+    return np.abs(states) > _LARGEST[bits]
 
 
 @final
 class NativeStepper(Stepper):
-    """Moves agents under laws.
+    """Moves the agents of a formation, or of many that are alike, under laws.
 
     Args:
-        loop: of the run.
-        states: (N, n) at its beginning.
+        loops: of the run, or of each formation.
+        states: (N, n) at its beginning, formation by formation.
         bits: 64 or 32, the precision.
-        far: what goes on where a state is beyond the range of the kernels' sines.
+        far: what goes on where a state is beyond the range of the kernels' sines; None where the
+            caller looks.
+        pool: threads that step formations; None for the caller's alone.
+        kernels: those that were made before.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
     """
 
-    def __init__(self, loop: Loop, states: Array, bits: int, far: Stepper) -> None:
+    def __init__(
+        self,
+        loops: Sequence[Loop],
+        states: Array,
+        bits: int,
+        far: Stepper | None,
+        pool: Executor | None = None,
+        kernels: Kernels | None = None,
+    ) -> None:
         """Write and compile the step."""
-        self.loop, self.states, self.far = loop, states, far
-        self.follows = loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
+        self.pool = pool
+        self.own = Own(loops)
+        self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
+        self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
-        self.places, self.rows = Places(loop, _LANES[bits]), Rows.of(loop)
-        starts, positions, weights = heard(loop, self.places)
-        self.plan = self._plan(bool((weights != 1.0)[positions >= 0].any()))
-        # Where JAX was told to keep what it compiles, so that one setting rules both.
-        cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-        self.code = Code(program(self.plan), Path(cache) if cache else None)
-        self._reserve(starts, positions, weights)
+        together, lanes = len(loops) > 1, _LANES[bits]
+        self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
+        # Numbers of formations follow each other.
+        each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
+        self.leaders = (each + self.loop.leaders).reshape(-1)
+        self.followers = (each + self.loop.followers).reshape(-1)
+        self.code, self.rows, self.plan = (kernels or Kernels()).of(self.own, bits, together)
+        self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
-        self._drawn = -1
-
-    def _plan(self, weighted: bool) -> Plan:
-        loop, rows = self.loop, self.rows
-        n, alone = len(rows.state), len(loop.leaders) == 1
-        return Plan(
-            bits=self.bits,
-            lanes=self.places.lanes,
-            rows=rows.total,
-            width=n,
-            first=body_of(loop, self.bits, rows, True, self.follows),
-            others=body_of(loop, self.bits, rows, False, self.follows),
-            tell=rows.tell.start,
-            told=len(rows.tell),
-            one_source=alone and loop.parents is None,
-            one_leader=alone,
-            weighted=weighted,
-            edges=loop.meter.measured,
-            table=n if self.follows else 0,
-            dt=loop.motion.dt,
-        )
+        self._drawn, self._left = -1, -1
 
     # ---- memory ----
 
-    def _reserve(self, starts: Array, positions: Array, weights: Array) -> None:
+    def _reserve(self) -> None:
         """Make what never changes during a run, and room for what does."""
-        loop, places, plan = self.loop, self.places, self.plan
-        lanes, of, far = plan.lanes, places.of, stride(plan.width, plan.lanes)
-        self.blocks = aligned((places.blocks, plan.rows, lanes), self.dtype)
-        self.mirrors = [aligned((len(places.agents), far), self.dtype) for _ in range(2)]
-        nearest = np.asarray(loop.meter.nearest)[places.agents]
-        sender = nearest
-        if loop.parents is not None:
-            parents = np.asarray(loop.parents)[places.agents]
-            # A leader is sent nothing, and its own place does as well as any.
-            sender = np.where(parents < 0, places.agents, parents)
-        held = of[sender]
-        heavy = aligned(weights.shape, self.dtype)
-        heavy[:] = weights
-        self.edges, ends = edge_blocks(loop, places, self.dtype)
-        self.fixed = {
-            "segments": places.segments,
-            "neighbour_starts": starts,
-            "neighbours": np.ascontiguousarray(positions * far, np.int32),
-            "weights": heavy,
-            "sources": ((held // lanes) * plan.rows * lanes + held % lanes).astype(np.int32),
-            "leaders": (of[nearest] * far).astype(np.int32),
-            "edges": self.edges,
-            "edge_ends": ends,
-        }
+        places, plan = self.places, self.plan
+        self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
+        self.mirrors = [aligned((places.blocks, plan.mirror), self.dtype) for _ in range(2)]
+        self.found = places.find(plan.width, plan.rows, self.dtype)
+        self.edges = self.found.edges
 
     def _read(self, rows: range) -> Array:
         """Return rows of all agents, (N, rows)."""
@@ -123,23 +174,36 @@ class NativeStepper(Stepper):
         return "native"
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """Where it left the steps to JAX."""
+        told = (
+            f"JAX stepped the agents from t = {self._left * self.loop.motion.dt:.6g} s on where a "
+            f"state was beyond {_LARGEST[self.bits]:g}, since the sines of native code lose digits "
+            "there."
+        )
+        return (told,) * (self._left >= 0)
+
+    @property
     def longest(self) -> int:
         """Steps that take some tenths of a second, or a few of very many agents."""
-        return max(_FEWEST, _AGENT_STEPS // len(self.states))
+        return max(_FEWEST, _AGENT_STEPS * len(self.loops) // len(self.states))
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
-        return jax.tree.map(np.asarray, begin(self.loop, jnp.asarray(self.states)))
+        n = len(self.loop.offsets)
+        first = jax.tree.map(np.asarray, begin(self.loop, jnp.asarray(self.states[:n])))
+        many = jax.tree.map(lambda leaf: np.concatenate([leaf] * len(self.loops)), first[1:])
+        return Moment(first.step, *many)._replace(states=np.asarray(self.states, self.dtype))
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
         if now is not self._held:
             self._load(now)
         made = self._fly(int(now.step), counts, reference)
-        # NaN is beyond nothing, and is lost in either way.
-        if not (np.abs(made.states) > _LARGEST[self.bits]).any():
+        if self.far is None or not beyond(made.states, self.bits).any():
             return made
         self._held = None
+        self._left = int(now.step) if self._left < 0 else self._left
         return self.far.advance(now, counts, reference)
 
     def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
@@ -189,41 +253,70 @@ class NativeStepper(Stepper):
         if number == self._drawn:
             return
         self._drawn = number
-        push, noise = _draw_all(self.loop, number * hold, len(self.states))
-        self._write(self.rows.push, np.asarray(push))
-        if noise is not None:
-            self._write(self.rows.noise, np.asarray(noise))
+        step, agents = jnp.asarray(number * hold, jnp.int32), jnp.arange(len(self.loop.offsets))
+        drawn = _drawn([loop.motion.wind for loop in self.loops], step, agents)
+        for rows, part in zip((self.rows.push, self.rows.noise), drawn, strict=True):
+            if part is not None:
+                self._write(rows, np.asarray(part).reshape(len(self.states), -1))
 
     def _call(self, step: int, steps: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
-        arrays = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
-        arrays |= self.fixed | ({} if table is None else {"table": table})
-        numbers = {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
+        arrays = self.found._asdict() | {"segments": self.places.segments}
+        values = {name: array.ctypes.data for name, array in arrays.items()}
+        values |= {} if table is None else {"table": table.ctypes.data}
+        values |= {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
         # The inputs of single steps are read afterwards; those of many would be stored for nothing.
-        numbers |= {"edge_blocks": len(self.edges), "shown": int(steps == 1)}
-        numbers["first_steady"] = int(self.loop.meter.first_steady)
-        values = {name: array.ctypes.data for name, array in arrays.items()} | numbers
-        self.code.call(np.array([values.get(name, 0) for name in SLOTS], np.int64))
+        values |= {"edge_blocks": len(self.found.edge_ends), "shown": int(steps == 1)}
+        values["first_steady"] = int(self.loop.meter.first_steady)
+        firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
+        firsts["edges"] = self.edges
+        groups = self.places.groups
+
+        def fly(some: Array) -> None:
+            own = {name: array[len(array) // groups * some[0] :] for name, array in firsts.items()}
+            told = values | {name: array.ctypes.data for name, array in own.items()}
+            told["groups"] = len(some)
+            self.code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
+
+        self._share(fly, np.arange(groups))
         if steps % 2:
             self.mirrors.reverse()
+
+    def _share(self, fly: Callable[[Array], None], groups: Array) -> None:
+        """Let threads take the groups; no group knows of another."""
+        if self.pool is None or len(groups) < 2:
+            fly(groups)
+            return
+        # More parts than threads, since another process may take a processor from one of them.
+        list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
 
     # ---- moments and sums ----
 
     def _load(self, now: Moment) -> None:
         """Write a moment into the blocks."""
-        loop, rows = self.loop, self.rows
-        x, offsets = np.asarray(now.states, self.dtype), np.asarray(loop.offsets, self.dtype)
+        rows, x = self.rows, np.asarray(now.states, self.dtype)
+        offsets = np.concatenate([np.asarray(loop.offsets, self.dtype) for loop in self.loops])
         self._write(rows.state, x)
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
-        self.mirrors[0][:, : x.shape[1]] = (x - offsets)[self.places.agents]
+        self._write(rows.own, np.repeat(self.own.values, len(self.loop.offsets), axis=0))
+        self._show(x - offsets)
         memory = np.zeros((len(x), len(rows.memory)))
-        for who, tree in ((loop.leaders, now.leader_memory), (loop.followers, now.follower_memory)):
+        for who, tree in ((self.leaders, now.leader_memory), (self.followers, now.follower_memory)):
             leaves = [np.asarray(leaf).reshape(len(who), -1) for leaf in jax.tree.leaves(tree)]
             flat = np.concatenate([np.zeros((len(who), 0)), *leaves], axis=1)
             memory[who, : flat.shape[1]] = flat
         self._write(rows.memory, memory)
         self._drawn = -1
+
+    def _show(self, values: Array) -> None:
+        """Write what neighbours read of all agents, (N, n)."""
+        shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
+        if self.plan.together:
+            self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)
+            return
+        wide = self.mirrors[0].reshape(*shown.shape[:2], -1)
+        wide[:, :, : values.shape[1]] = shown
 
     def _moment(self, step: int) -> Moment:
         """Return what is in the blocks as a moment."""
@@ -231,8 +324,8 @@ class NativeStepper(Stepper):
         now: Any = [
             np.asarray(step, np.int32),
             self._read(self.rows.state),
-            _memory(loop.leader, flat[loop.leaders]),
-            _memory(loop.follower, flat[loop.followers]),
+            _memory(loop.leader, flat[self.leaders]),
+            _memory(loop.follower, flat[self.followers]),
             self._read(self.rows.cut).astype(np.int8),
         ]
         return Moment._make(now)
@@ -242,11 +335,11 @@ class NativeStepper(Stepper):
         self.blocks[:, first:] = 0.0
         self.blocks[:, self.rows.unsettled.start] = -1.0
         self.blocks[:, self.rows.inside.start : self.rows.inside.stop] = ALWAYS
-        self.edges[:, -1] = 0.0
+        self.edges[..., -1, :] = 0.0
 
     def _sums(self, first: int, end: int) -> Sums:
         """Return the sums over the steps from one to another."""
-        rows, leaders, meter = self.rows, self.loop.leaders, self.loop.meter
+        rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         found = Sums(
             steps=np.array([end - first, steady]),
@@ -254,7 +347,7 @@ class NativeStepper(Stepper):
             tracking=self._read(rows.tracking)[leaders].T,
             outputs=self._read(rows.outputs)[leaders],
             effort=self._read(rows.effort)[:, 0],
-            spacing=self.edges[:, -1].reshape(-1)[: len(meter.edges)],
+            spacing=self.places.spacing(self.edges),
             limited=self._read(rows.limited)[:, 0],
             unsettled=self._read(rows.unsettled)[:, 0],
             inside=np.minimum(self._read(rows.inside).astype(np.float64), ALWAYS),
@@ -273,11 +366,9 @@ def _memory(law: Law, flat: Array) -> Memory:
     )
 
 
-def _draw_all(loop: Loop, step: int, agents: int) -> tuple[jax.Array, jax.Array | None]:
-    """Return what wind adds to the rates (N, n) and noise to the inputs (N, m) at a step."""
-    return _drawn(loop.motion.wind, jnp.asarray(step, jnp.int32), jnp.arange(agents))
-
-
 @jax.jit
-def _drawn(wind: Any, step: jax.Array, agents: jax.Array) -> Any:
-    return jax.vmap(lambda agent: draw(wind, step, agent))(agents)
+def _drawn(winds: Sequence[Any], step: jax.Array, agents: jax.Array) -> Any:
+    """Return what each wind adds to the rates (F, N, n) and noise to the inputs at a step."""
+    many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
+    each = jax.vmap(lambda wind, agent: draw(wind, step, agent), (None, 0))
+    return jax.vmap(each, (0, None))(many, agents)

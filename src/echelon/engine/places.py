@@ -1,44 +1,212 @@
 """Where agents stand in blocks of vectors, and where each finds those that it hears."""
 
-from typing import final
+import abc
+from collections.abc import Sequence
+from typing import NamedTuple, final
 
 import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
 
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
 from echelon.kernels import aligned, stride
 
 
-@final
-class Places:
+class Found(NamedTuple):
+    """What a kernel reads of others, as it is called with it.
+
+    Attributes:
+        neighbour_starts: (blocks + 1,) the first slot of each block.
+        neighbours: (slots, lanes) what each hears, the k-th neighbour of each of a block.
+        weights: (slots, lanes) of these edges.
+        sources: (positions,) where each finds what it is told.
+        leaders: (positions,) where each finds its leader.
+        edges: rows of the edges, for the sums of how far distances are off: the differences of the
+            goals, the distances that they make, and room for the sums.
+        edge_ends: (edges, 2, lanes) where the two ends of each show their numbers.
+    """
+
+    neighbour_starts: Array
+    neighbours: Array
+    weights: Array
+    sources: Array
+    leaders: Array
+    edges: Array
+    edge_ends: Array
+
+
+class Places(abc.ABC):
     """Positions in blocks of as many agents as a vector has lanes.
 
     Leaders come first, then the followers level by level: whoever is sent an input of this step
-    comes after who sends it. A level fills its last block with copies, which do what the agent
-    does and are read by nobody.
+    comes after who sends it.
 
     Attributes:
+        loop: that of the agents, or of the first formation.
         lanes: of a vector.
         agents: (positions,) who stands there.
-        of: (N,) where each agent stands.
+        of: where each agent stands.
         segments: (levels + 1,) the first block of the leaders, of each level, and the end.
+        groups: of formations, which are stepped one after the other.
     """
 
-    def __init__(self, loop: Loop, lanes: int) -> None:
-        """Place the agents of a loop."""
-        levels = [loop.followers]
-        if loop.levels is not None:
-            levels = [loop.followers[np.unique(row)] for row in loop.levels]
-        filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
-        self.lanes, self.agents = lanes, np.concatenate(filled)
-        self.segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
-        # Of copies the first stands for the agent.
-        _, self.of = np.unique(self.agents, return_index=True)
+    loop: Loop
+    lanes: int
+    agents: Array
+    of: Array
+    segments: Array
+    groups: int
 
     @property
     def blocks(self) -> int:
         """How many blocks there are."""
         return len(self.agents) // self.lanes
+
+    @abc.abstractmethod
+    def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
+        """Return where agents find each other: numbers are shown by `width`, blocks have `rows`."""
+
+    @abc.abstractmethod
+    def spacing(self, edges: Array) -> Array:
+        """Return the sums that rows of edges hold, one an edge."""
+
+
+_LARGE = 10_000
+"""Agents whose numbers no longer stay in a processor's own memory from one to the next."""
+
+
+def _ordered(loop: Loop, lanes: int) -> tuple[Array, Array]:
+    """Return the agents in the order of their acting, and the first block of each level.
+
+    A level fills its last block with copies, which do what the agent does and are read by nobody.
+    """
+    levels = [loop.followers]
+    if loop.levels is not None:
+        levels = [loop.followers[np.unique(row)] for row in loop.levels]
+    rank = _nearby(loop)
+    levels = [level[np.argsort(rank[level], kind="stable")] for level in levels]
+    filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
+    segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
+    return np.concatenate(filled), segments
+
+
+def _nearby(loop: Loop) -> Array:
+    """Return the place of each agent in an order in which those that hear each other are near.
+
+    It is their own where that is as good, and of few agents. Numbers of a neighbour that was
+    stepped long ago come from memory: a swarm numbered at random takes three times as long.
+    """
+    agents, exchange = len(loop.offsets), loop.exchange
+    own = np.arange(agents)
+    if agents < _LARGE:
+        return own
+    i, j = np.asarray(exchange.receivers), np.asarray(exchange.senders)
+    links = sp.csr_array((np.ones(len(i), np.int8), (i, j)), shape=(agents, agents))
+    order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
+    rank = np.empty(agents, int)
+    rank[order] = own
+    return rank if np.abs(rank[i] - rank[j]).sum() < np.abs(i - j).sum() else own
+
+
+def _first(agents: Array) -> Array:
+    """Return where each agent stands; of copies the first stands for the agent."""
+    return np.unique(agents, return_index=True)[1]
+
+
+def _senders(loop: Loop) -> Array:
+    """Return who tells each agent what it is told, (N,)."""
+    if loop.parents is None:
+        return np.asarray(loop.meter.nearest)
+    # A leader is sent nothing, and its own place does as well as any.
+    parents = np.asarray(loop.parents)
+    return np.where(parents < 0, np.arange(len(parents)), parents)
+
+
+@final
+class Swarm(Places):
+    """The agents of one formation, neighbours in the lanes of a vector wherever they stand."""
+
+    def __init__(self, loop: Loop, lanes: int) -> None:
+        """Place the agents of a loop."""
+        self.loop, self.lanes, self.groups = loop, lanes, 1
+        self.agents, self.segments = _ordered(loop, lanes)
+        self.of = _first(self.agents)
+
+    def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
+        """Return where agents find each other: what they show stands one after the other."""
+        loop, lanes, far = self.loop, self.lanes, stride(width, self.lanes)
+        starts, positions, weights = heard(loop, self)
+        heavy = aligned(weights.shape, dtype)
+        heavy[:] = weights
+        held = self.of[_senders(loop)[self.agents]]
+        nearest = np.asarray(loop.meter.nearest)[self.agents]
+        return Found(
+            starts,
+            np.ascontiguousarray(positions * far, np.int32),
+            heavy,
+            ((held // lanes) * rows * lanes + held % lanes).astype(np.int32),
+            (self.of[nearest] * far).astype(np.int32),
+            *edge_blocks(loop, self, dtype),
+        )
+
+    def spacing(self, edges: Array) -> Array:
+        """Return the sums that rows of edges hold, (E,)."""
+        return edges[:, -1].reshape(-1)[: len(self.loop.meter.edges)]
+
+
+@final
+class Formations(Places):
+    """One agent of as many formations in a vector: all find each other block by block.
+
+    Agents are numbered formation by formation.
+    """
+
+    def __init__(self, loops: Sequence[Loop], lanes: int) -> None:
+        """Place the agents of loops that are alike."""
+        self.loops, self.loop, self.lanes = loops, loops[0], lanes
+        self.groups = -(-len(loops) // lanes)
+        self.alone = Swarm(self.loop, 1)
+        # The last group is filled with copies.
+        formation = np.minimum(np.arange(self.groups * lanes), len(loops) - 1)
+        formation = formation.reshape(self.groups, 1, lanes)
+        each = len(self.loop.offsets) * formation + self.alone.agents[:, None]
+        self.agents, self.segments = each.reshape(-1), self.alone.segments
+        self.of = _first(self.agents)
+
+    def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
+        """Return where agents find each other in a group: what they show stands row by row."""
+        loop, lanes, of, far = self.loop, self.lanes, self.alone.of, width * self.lanes
+        starts, positions, weights = heard(loop, self.alone)
+        heavy = aligned((len(weights), lanes), dtype)
+        heavy[:] = weights
+        ends = of[np.asarray(loop.meter.edges)] * far
+        return Found(
+            starts,
+            (positions * far).astype(np.int32),
+            heavy,
+            (of[_senders(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
+            (of[np.asarray(loop.meter.nearest)[self.alone.agents]] * far).astype(np.int32),
+            self._edges(dtype),
+            np.ascontiguousarray(ends, np.int32),
+        )
+
+    def _edges(self, dtype: np.dtype) -> Array:
+        """Return the rows of the edges, (groups, E, q + 2, lanes)."""
+        meter, lanes, last = self.loop.meter, self.lanes, len(self.loops) - 1
+        pairs, q = np.asarray(meter.edges), len(meter.measured)
+        rows = aligned((self.groups, len(pairs), q + 2, lanes), dtype)
+        for f in range(self.groups * lanes):
+            meter = self.loops[min(f, last)].meter
+            goals = np.asarray(meter.offsets)[:, list(meter.measured)]
+            rows[f // lanes, :, :q, f % lanes] = goals[pairs[:, 0]] - goals[pairs[:, 1]]
+            rows[f // lanes, :, q, f % lanes] = meter.spacings
+        return rows
+
+    def spacing(self, edges: Array) -> Array:
+        """Return the sums that rows of edges hold, (formations E,)."""
+        each = edges[:, :, -1].transpose(0, 2, 1).reshape(self.groups * self.lanes, -1)
+        return each[: len(self.loops)].reshape(-1)
 
 
 def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:

@@ -9,7 +9,7 @@ from echelon.core.errors import Outcome
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Problem, numbers
 from echelon.engine.grid import Grid
-from echelon.engine.sums import ALWAYS, Sums
+from echelon.engine.sums import ALWAYS, Sums, outside
 
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
@@ -158,19 +158,27 @@ class Recorder:
 
     def _completed(self, whole: Stretch) -> tuple[Outcome, str]:
         """Return how a run ended that reached its horizon: whether all stayed in their chart."""
-        chart, inside = self.problem.model.chart, self.sums.inside
+        model, inside = self.problem.model, self._inside(whole)
         if not inside.size or inside.min() >= ALWAYS:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
         agent, k = divmod(int(inside.argmin()), inside.shape[1])
-        name = [*chart][k]
-        unit = self.problem.model.state_units[self.problem.model.state_names.index(name)]
-        low, high = (f"{bound:.4g}" for bound in chart[name])
+        name = [*model.chart][k]
+        unit = model.state_units[model.state_names.index(name)]
+        low, high = (f"{bound:.4g}" for bound in model.chart[name])
         return Outcome.LEFT_CHART, (
             f"{self._role(agent)} {agent} left the chart of its equations at "
             f"t = {inside.min() * self.problem.settings.dt:.6g} s: `{name}` is not between {low} "
             f"and {high} {unit}".rstrip()
             + ", and what follows is not the agent's motion."
         )
+
+    def _inside(self, whole: Stretch) -> Array:
+        """Return `Sums.inside` with the moment at which the last step ends, where none begins."""
+        model = self.problem.model
+        charted = [model.state_names.index(name) for name in model.chart]
+        bounds = np.array([*model.chart.values()], float).reshape(-1, 2)
+        last = outside(whole.states[-1][:, charted], *bounds.T)
+        return np.minimum(self.sums.inside, np.where(last, self.grid.steps, ALWAYS))
 
     def _role(self, agent: int) -> str:
         return "Leader" if agent in self.problem.graph.leaders else "Follower"

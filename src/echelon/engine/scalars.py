@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.engine.loop import Loop, tell, what_limits_did
+from echelon.engine.own import Own
 from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes
 from echelon.laws.law import Law, LocalView, Memory
 
@@ -26,6 +27,7 @@ class Rows(NamedTuple):
         cut: to which side limits moved each input in the step before (m,).
         tell: what it sends besides its state.
         input: what is delivered to it (m,).
+        own: numbers of its law and model that are others in other formations.
         errors, tracking, outputs, effort, limited, unsettled, inside, chatter: as in `Sums`.
         total: how many rows there are.
     """
@@ -38,6 +40,7 @@ class Rows(NamedTuple):
     cut: range
     tell: range
     input: range
+    own: range
     errors: range
     tracking: range
     outputs: range
@@ -49,8 +52,8 @@ class Rows(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop) -> "Rows":
-        """Return the rows of a loop.
+    def of(cls, loop: Loop, own: int = 0) -> "Rows":
+        """Return the rows of a loop of which so many numbers differ between formations.
 
         Raises:
             Unsupported: a law remembers what is no number.
@@ -59,7 +62,7 @@ class Rows(NamedTuple):
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None
         memory = max(memory_size(law) for law in (loop.leader, loop.follower))
-        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, told_by(loop), m]
+        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, told_by(loop), m, own]
         sizes += [2, 2, q, 1, 1, 1, len(loop.meter.charted), 1]
         ends = np.cumsum([0, *sizes]).tolist()
         rows: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
@@ -154,11 +157,11 @@ def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
     return act
 
 
-def body_of(loop: Loop, bits: int, rows: Rows, leads: bool, follows: bool) -> Body:
+def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body:
     """Return what the leaders or all others do in a step.
 
     Args:
-        loop: of the run.
+        own: the loop of the run, and its numbers that differ between formations.
         bits: 64 or 32.
         rows: where its numbers lie.
         leads: whether leaders are meant.
@@ -167,9 +170,15 @@ def body_of(loop: Loop, bits: int, rows: Rows, leads: bool, follows: bool) -> Bo
     Raises:
         Unsupported: the law or the model uses what has no scalar operations.
     """
-    graph, law = Graph(bits), loop.leader if leads else loop.follower
+    graph, loop = Graph(bits), own.loop
+    law = loop.leader if leads else loop.follower
     known = _known(loop, graph, rows, law, leads, follows)
-    found = lower(_agent(loop, law), graph, [known])
+
+    def act(leaves: list[Any], known: _Known) -> _Done:
+        whole = own.filled(leaves)
+        return _agent(whole, whole.leader if leads else whole.follower)(known)
+
+    found = lower(act, graph, [own.leaves(_leaves(graph, "row", rows.own)), known])
     shapes = jax.tree.structure(_Done(*[0] * 13)._replace(memory=law.init()))
     done: _Done = shapes.unflatten([nodes(graph, part) for part in found])
     remembered = jax.tree.leaves(done.memory, is_leaf=lambda part: isinstance(part, list))
@@ -180,6 +189,7 @@ def body_of(loop: Loop, bits: int, rows: Rows, leads: bool, follows: bool) -> Bo
     if leads and follows:
         sums |= {"tracking": done.tracking, "outputs": done.outputs}
     n = len(known.x)
+    # Of the model as it is: how far two states are apart is the same for all formations.
     [difference] = lower(
         loop.model.difference,
         graph,

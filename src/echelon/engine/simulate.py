@@ -15,10 +15,11 @@ from echelon.engine.drive import Stepper, Stopped
 from echelon.engine.grid import Grid
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, check_memory, prepare
-from echelon.engine.record import Recorder, Stretch, join
+from echelon.engine.record import Record, Recorder, Stretch, join
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
 from echelon.engine.sums import on_host
+from echelon.engine.work import SolverStats
 
 Progress: TypeAlias = Callable[[int, int], None]
 """Called between chunks with the steps done and the steps in all."""
@@ -92,20 +93,26 @@ def _result(
     prepared: Prepared, recorder: Recorder, stepper: Stepper, unfinished: Outcome
 ) -> Result:
     record = recorder.close(unfinished)
+    return result_of(prepared, record, stepper.engine, stepper.warnings, stepper.work)
+
+
+def result_of(
+    prepared: Prepared,
+    record: Record,
+    engine: str,
+    warnings: tuple[str, ...] = (),
+    work: SolverStats | None = None,
+) -> Result:
+    """Return a run as its result, from what was kept of it."""
+    told = record._asdict()
     return Result(
-        times=record.times,
-        states=record.states,
-        inputs=record.inputs,
-        reference=record.reference,
-        sums=record.sums,
-        outcome=record.outcome,
-        message=record.message,
-        warnings=prepared.warnings + stepper.warnings,
-        engine=stepper.engine,
+        wall_time=told.pop("seconds"),
+        **told,
+        warnings=prepared.warnings + warnings,
+        engine=engine,
         parts=prepared.parts,
         settings=prepared.problem.settings,
-        wall_time=record.seconds,
-        work=stepper.work,
+        work=work,
     )
 
 
@@ -142,7 +149,7 @@ class _Flight:
         first, grid = self.recorder.done, self.recorder.grid
         # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
         # last chunks, which have fewer steps, keep them from compiling anew.
-        reference = _sample_reference(self.prepared, first, grid.longest + 1)
+        reference = sample_reference(self.prepared, first, grid.longest + 1)
         made = self.stepper.advance(self.now, grid.counts(first), reference)
         self.recorder.keep(made, reference, time.perf_counter() - self.began)
         self.now = made.now
@@ -155,7 +162,7 @@ class _Flight:
         self.given, self.gave = len(self.recorder.stretches), time.perf_counter()
 
 
-def _sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:
+def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:
     """Return what the leaders follow from a step on, (steps, n) in float64."""
     with precision("float64"):
         # In float64: after three hours float32 has a millisecond between two times.

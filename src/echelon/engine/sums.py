@@ -204,10 +204,7 @@ class Meter(eqx.Module):
         square = self._length(x - offset - leader)
         # A newton and a newton metre cannot be added; accelerations can.
         v = self.model.normalized(u)
-        low, high = jnp.asarray(self.chart.T, x.dtype)
-        bounded = x[self.charted]
-        # What is not finite is another outcome.
-        out = (bounded <= low) | (bounded >= high)
+        out = outside(x[self.charted], *jnp.asarray(self.chart.T, x.dtype))
         return OfAgent(
             errors=_twice(steady, square),
             effort=jnp.sum(v * v),
@@ -250,8 +247,16 @@ class Meter(eqx.Module):
     def _spacing(self, states: States) -> jax.Array:
         """Return the squared errors of the distances along the edges, (E,)."""
         i, j = self.edges.T
-        distance = jnp.sqrt(jax.vmap(self._length)(states[i] - states[j]))
+        square = jax.vmap(self._length)(states[i] - states[j])
+        # A root has no slope at 0, where two agents meet, and one choice alone would still ask it.
+        apart = square > 0.0
+        distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
         return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
+
+
+def outside(bounded: Any, low: Any, high: Any) -> Any:
+    """Return which states are beyond what a chart allows; what is no number is another outcome."""
+    return (bounded <= low) | (bounded >= high)
 
 
 def reference_at(reference: Array | None, k: jax.Array, states: States) -> jax.Array | None:

@@ -3,7 +3,9 @@
 Agents stand in blocks of as many as a vector has lanes. A block holds its numbers row by row, so
 that one address reaches all of them. What neighbours read of an agent stands apart and twice, as
 it is and as it will be after the step, one agent after the other: a neighbour is anywhere, and its
-numbers lie together.
+numbers lie together. Where a vector holds one agent of many formations, its neighbour is another
+vector: what it shows lies row by row, and each group of formations takes all its steps before the
+next one, so that it stays in the nearest cache.
 """
 
 import contextlib
@@ -15,6 +17,7 @@ from echelon.kernels.frame import (
     Body,
     Context,
     Plan,
+    far_block,
     gather,
     load_places,
     load_row,
@@ -36,6 +39,33 @@ def program(plan: Plan) -> str:
         at = w.put(f"getelementptr i64, ptr %slots, i64 {place}")
         slots[name] = w.put(f"load {'ptr' if place < ADDRESSES else 'i64'}, ptr {at}")
     last = w.put(f"add i64 {slots['first_step']}, {slots['steps']}")
+    with loop(w, "0", slots["groups"], []) as (group, _, _):
+        _steps(w, plan, _group(w, plan, slots, group), last)
+    w.do("ret void")
+    head = "define void @run(ptr noalias %slots) #0 {"
+    # 512 bits also where a processor would rather have halves: the types say what is meant.
+    attributes = 'attributes #0 = { nounwind "prefer-vector-width"="512" }'
+    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, ""])
+
+
+def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str, str]:
+    """Write where the numbers of a group are."""
+    end = w.put(f"getelementptr i64, ptr {slots['segments']}, i64 {slots['levels']}")
+    blocks = w.put(f"load i64, ptr {end}")
+    agents = w.put(f"mul i64 {group}, {blocks}")
+    edges = w.put(f"mul i64 {group}, {slots['edge_blocks']}")
+    sizes = {"rows": plan.rows * plan.lanes, "mirror": plan.mirror, "next_mirror": plan.mirror}
+    found = {name: (agents, size) for name, size in sizes.items()}
+    found["edges"] = edges, (len(plan.edges) + 2) * plan.lanes
+    own = dict[str, str]()
+    for name, (count, size) in found.items():
+        far = w.put(f"mul i64 {count}, {size}")
+        own[name] = w.put(f"getelementptr {w.scalar}, ptr {slots[name]}, i64 {far}")
+    return slots | own
+
+
+def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str) -> None:
+    """Write all steps of a group."""
     mirrors = [("ptr", slots["mirror"]), ("ptr", slots["next_mirror"])]
     with loop(w, slots["first_step"], last, mirrors) as (step, carried, following):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
@@ -50,11 +80,6 @@ def program(plan: Plan) -> str:
             with _blocks(w, around, level) as block:
                 _act(w, around, plan.others, block)
         following[:] = [carried[1], carried[0]]
-    w.do("ret void")
-    head = "define void @run(ptr noalias %slots) #0 {"
-    # 512 bits also where a processor would rather have halves: the types say what is meant.
-    attributes = 'attributes #0 = { nounwind "prefer-vector-width"="512" }'
-    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, ""])
 
 
 @contextlib.contextmanager
@@ -76,14 +101,13 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
     size = plan.rows * plan.lanes
     begin = w.put(f"mul i64 {block}, {size}")
     base = w.put(f"getelementptr {w.scalar}, ptr {around.slots['rows']}, i64 {begin}")
-    first = w.put(f"mul i64 {block}, {plan.lanes}")
     results = body.results()
     heard = sorted(n.value[1] for n in needed(results) if n.op == "leaf" and n.value[0] == "z")
 
     def row(leaf: Node) -> str:
         return load_row(w, base, leaf.value[1], plan.lanes)
 
-    z = exchange(w, around, body, block, first, heard, row) if heard else {}
+    z = exchange(w, around, body, block, heard, row) if heard else {}
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
@@ -92,17 +116,17 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
         if kind == "row":
             return row(leaf)
         if kind == "told":
-            start, offset = around.slots["rows"], (plan.tell + rest[0]) * plan.lanes
-            return _look_up(w, around, "sources", start, offset, first, plan.one_source)
+            start, row_ = around.slots["rows"], plan.tell + rest[0]
+            return _look_up(w, around, "sources", start, row_, block, plan.one_source)
         if kind == "leader":
             start = around.mirror
-            return _look_up(w, around, "leaders", start, rest[0], first, plan.one_leader)
+            return _look_up(w, around, "leaders", start, rest[0], block, plan.one_leader)
         return _same_for_all(w, around, kind, rest)
 
     emitter = Emitter(w, load)
     emitter.emit(results)
     _write_rows(w, around, body, emitter, base)
-    write_mirror(w, around, [emitter.value(node) for node in body.mirror], first)
+    write_mirror(w, around, [emitter.value(node) for node in body.mirror], block)
 
 
 def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: str) -> None:
@@ -135,10 +159,15 @@ def _same_for_all(w: Writer, around: Context, kind: str, rest: Sequence[int]) ->
 
 
 def _look_up(
-    w: Writer, around: Context, which: str, start: str, offset: int, first: str, one: bool
+    w: Writer, around: Context, which: str, start: str, row: int, block: str, one: bool
 ) -> str:
     """Write the load of what another agent has, whose place is in a list of places."""
-    places = around.slots[which]
+    places, plan = around.slots[which], around.plan
+    if plan.together:
+        return load_row(w, far_block(w, places, block, start), row, plan.lanes)
+    # What is told stands in rows, and what is shown agent by agent.
+    offset = row * plan.lanes if which == "sources" else row
+    first = w.put(f"mul i64 {block}, {plan.lanes}")
     if not one:
         return gather(w, start, load_places(w, places, first), offset)
     place = w.put(f"load i32, ptr {places}, align 4")

@@ -47,6 +47,8 @@ class Plan(NamedTuple):
     Attributes:
         bits: 64 or 32.
         lanes: of a vector.
+        together: whether a vector holds one agent of as many formations, which are all alike, and
+            not as many agents of one.
         rows: of a block.
         width: numbers that neighbours read of an agent; they stand in whole vectors.
         first: the body of those that act first.
@@ -63,6 +65,7 @@ class Plan(NamedTuple):
 
     bits: int
     lanes: int
+    together: bool
     rows: int
     width: int
     first: Body
@@ -75,6 +78,11 @@ class Plan(NamedTuple):
     edges: tuple[int, ...]
     table: int
     dt: float
+
+    @property
+    def mirror(self) -> int:
+        """How many numbers neighbours read of a block."""
+        return self.lanes * (self.width if self.together else stride(self.width, self.lanes))
 
 
 SLOTS = (
@@ -96,8 +104,13 @@ SLOTS = (
     "edge_blocks",
     "first_steady",
     "shown",
+    "groups",
 )
-"""What a kernel is called with: 12 addresses and 6 whole numbers of 64 bits."""
+"""What a kernel is called with: 12 addresses and 7 whole numbers of 64 bits.
+
+Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
+those of the first of some groups. A swarm is one group.
+"""
 ADDRESSES = 12
 
 
@@ -176,6 +189,14 @@ def store_row(w: Writer, base: str, row: int, lanes: int, value: str) -> None:
     """Write the store of a row of a block."""
     at = w.put(f"getelementptr {w.scalar}, ptr {base}, i64 {row * lanes}")
     w.do(f"store {w.vector} {value}, ptr {at}, align {lanes * bytes_of(w)}")
+
+
+def far_block(w: Writer, places: str, k: str, start: str) -> str:
+    """Write the address of a block, of which entry k of a list tells how far it is."""
+    at = w.put(f"getelementptr i32, ptr {places}, i64 {k}")
+    place = w.put(f"load i32, ptr {at}, align 4")
+    far = w.put(f"sext i32 {place} to i64")
+    return w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {far}")
 
 
 def load_places(w: Writer, start: str, first: str) -> str:

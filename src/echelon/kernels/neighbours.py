@@ -6,6 +6,7 @@ from echelon.kernels.frame import (
     Body,
     Context,
     bytes_of,
+    far_block,
     load_row,
     loop,
     store_row,
@@ -20,7 +21,6 @@ def exchange(
     around: Context,
     body: Body,
     block: str,
-    first: str,
     heard: Sequence[int],
     load: Callable[[Node], str],
 ) -> dict[int, str]:
@@ -30,17 +30,18 @@ def exchange(
     after = w.put(f"getelementptr i64, ptr {at}, i64 1")
     start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
     wanted = [body.difference[k] for k in heard]
-    if all(_is_plain(node) for node in wanted):
+    if all(_is_plain(node) for node in wanted) and not plan.together:
+        first = w.put(f"mul i64 {block}, {plan.lanes}")
         return _subtract(w, around, (start, end), first, heard)
     leaves = [n for n in needed(wanted) if n.op == "leaf"]
     own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
     mine = Emitter(w, load)
     mine.emit(list(own.values()))
     zero = [(w.vector, "zeroinitializer")] * len(heard)
-    pieces = sorted({n.value[1] // w.lanes for n in leaves if n.value[0] == "their"})
+    entries = sorted({n.value[1] for n in leaves if n.value[0] == "their"})
     with loop(w, start, end, zero) as (slot, totals, on):
         place = w.put(f"mul i64 {slot}, {plan.lanes}")
-        theirs = _columns(w, around, "neighbours", place, pieces)
+        theirs = _shown(w, around, "neighbours", slot, entries)
 
         def entry_of(leaf: Node) -> str:
             kind, entry = leaf.value
@@ -60,14 +61,18 @@ def exchange(
     return dict(zip(heard, totals, strict=True))
 
 
-def _columns(
-    w: Writer, around: Context, which: str, place: str, pieces: Sequence[int]
+def _shown(
+    w: Writer, around: Context, which: str, slot: str, entries: Sequence[int]
 ) -> dict[int, str]:
     """Write the load of what some agents show, whose places stand in a list: entry -> a vector."""
-    at = w.put(f"getelementptr i32, ptr {around.slots[which]}, i64 {place}")
+    if around.plan.together:
+        there = far_block(w, around.slots[which], slot, around.mirror)
+        return {k: load_row(w, there, k, w.lanes) for k in entries}
+    first = w.put(f"mul i64 {slot}, {w.lanes}")
+    at = w.put(f"getelementptr i32, ptr {around.slots[which]}, i64 {first}")
     others = [_their(w, around.mirror, at, lane) for lane in range(w.lanes)]
     found = dict[int, str]()
-    for piece in pieces:
+    for piece in sorted({k // w.lanes for k in entries}):
         # A gather of one number a lane would cost more than turning whole rows about.
         rows = [_load_at(w, other, piece * w.lanes) for other in others]
         found |= enumerate(_transposed(w, rows), piece * w.lanes)
@@ -113,10 +118,7 @@ def _subtract(
 
 def _their(w: Writer, mirror: str, places: str, lane: int) -> str:
     """Write the address of what a lane's neighbour shows."""
-    at = w.put(f"getelementptr i32, ptr {places}, i64 {lane}")
-    place = w.put(f"load i32, ptr {at}, align 4")
-    far = w.put(f"sext i32 {place} to i64")
-    return w.put(f"getelementptr {w.scalar}, ptr {mirror}, i64 {far}")
+    return far_block(w, places, str(lane), mirror)
 
 
 def _weight(w: Writer, weights: str, lane: int) -> str:
@@ -129,15 +131,19 @@ def _load_at(w: Writer, start: str, place: int) -> str:
     return w.put(f"load {w.vector}, ptr {at}, align {w.lanes * bytes_of(w)}")
 
 
-def write_mirror(w: Writer, around: Context, values: Sequence[str], first: str) -> None:
-    """Write what neighbours will read, one agent after the other."""
+def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) -> None:
+    """Write what neighbours will read: of formations row by row, else agent after agent."""
     lanes, far = w.lanes, stride(len(values), w.lanes)
-    begin = w.put(f"mul i64 {first}, {far}")
+    begin = w.put(f"mul i64 {block}, {around.plan.mirror}")
     start = w.put(f"getelementptr {w.scalar}, ptr {around.following}, i64 {begin}")
+    if around.plan.together:
+        for k, value in enumerate(values):
+            store_row(w, start, k, lanes, value)
+        return
     padded = [*values, *["zeroinitializer"] * (far - len(values))]
-    for block in range(0, far, lanes):
-        for lane, column in enumerate(_transposed(w, padded[block : block + lanes])):
-            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + block}")
+    for piece in range(0, far, lanes):
+        for lane, column in enumerate(_transposed(w, padded[piece : piece + lanes])):
+            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + piece}")
             w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * bytes_of(w)}")
 
 
@@ -177,10 +183,9 @@ def measure_edges(w: Writer, around: Context) -> None:
     with loop(w, "0", slots["edge_blocks"], []) as (block, _, _):
         begin = w.put(f"mul i64 {block}, {size}")
         base = w.put(f"getelementptr {w.scalar}, ptr {slots['edges']}, i64 {begin}")
-        first = w.put(f"mul i64 {block}, {2 * plan.lanes}")
-        second = w.put(f"add i64 {first}, {plan.lanes}")
-        pieces = sorted({axis // w.lanes for axis in axes})
-        ends = [_columns(w, around, "edge_ends", place, pieces) for place in (first, second)]
+        first = w.put(f"mul i64 {block}, 2")
+        second = w.put(f"add i64 {first}, 1")
+        ends = [_shown(w, around, "edge_ends", end, axes) for end in (first, second)]
         squares = "zeroinitializer"
         for k, axis in enumerate(axes):
             apart = w.operation("sub", [end[axis] for end in ends], False, False)

@@ -234,6 +234,16 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     return _scenario(document, text, file)
 
 
+def varied(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
+    """Return a scenario with texts such as `simulation.horizon=10` laid over it.
+
+    Raises:
+        ScenarioError: It has faults, as in `load_scenario`.
+    """
+    document = settle_overrides(apply_overrides(scenario._document, overrides))
+    return _scenario(document, dump_yaml(document.data), scenario.file)
+
+
 def _plain(value: object) -> object:
     """Return lists for tuples and arrays, and Python's own numbers for NumPy's."""
     to_list: Callable[[], object] | None = getattr(value, "tolist", None)

@@ -1,0 +1,261 @@
+"""Many runs at once, each as `simulate` would have it.
+
+Runs that are alike but for numbers are stepped together by native code, a formation a lane; the
+others run one after the other.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeAlias, final
+from weakref import WeakKeyDictionary
+
+import equinox as eqx
+import numpy as np
+
+from echelon.core.errors import EchelonError, MissingExtraError, Outcome
+from echelon.core.numerics import precision
+from echelon.core.types import Array
+from echelon.engine.drive import Chunk
+from echelon.engine.family import family_of
+from echelon.engine.grid import Grid
+from echelon.engine.initial import Starts
+from echelon.engine.laws import Laws, worth_native
+from echelon.engine.loop import Loop, assemble
+from echelon.engine.motion import Motion
+from echelon.engine.native import Kernels, NativeStepper, beyond
+from echelon.engine.parts import Parts
+from echelon.engine.prepare import Prepared, check_memory, prepare
+from echelon.engine.record import Recorder, Stretch
+from echelon.engine.result import Result
+from echelon.engine.settings import Settings
+from echelon.engine.simulate import result_of, sample_reference, simulate
+from echelon.engine.sums import Sums, on_host
+from echelon.kernels import Unsupported
+
+Run: TypeAlias = tuple[Parts, Settings]
+Told: TypeAlias = Callable[[int, int], None]
+_SMALL = 64
+"""Agents of a formation that is stepped beside others though they do not fill a vector."""
+
+
+class _Case(NamedTuple):
+    """What runs share that differ in the seed alone."""
+
+    prepared: Prepared
+    starts: Starts
+    loop: Loop | None
+
+
+class _Job(NamedTuple):
+    """A run with all that its steps rest on."""
+
+    place: int
+    case: _Case
+    prepared: Prepared
+    loop: Loop
+
+
+@final
+class Fleet:
+    """Flies many runs; what is prepared and compiled for one is there for the next.
+
+    Args:
+        threads: on which native code runs; one for each processor when left out. No number depends
+            on it.
+    """
+
+    def __init__(self, threads: int | None = None) -> None:
+        """Begin with nothing prepared."""
+        self.threads = threads or _processors()
+        self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self.kernels = Kernels()
+        self._cases: WeakKeyDictionary[Parts, dict[Settings, _Case]] = WeakKeyDictionary()
+
+    def fly(self, runs: Sequence[Run], told: Told | None = None) -> Iterator[Result | EchelonError]:
+        """Yield what each run comes to, in their order, as `simulate` would have it.
+
+        Args:
+            runs: parts and settings of each.
+            told: called several times a second; what it raises ends the flight.
+        """
+        found: dict[int, Result | EchelonError] = {}
+        for jobs in self._families(runs):
+            found |= self._together(jobs, told)
+        for place, (parts, settings) in enumerate(runs):
+            yield found.pop(place) if place in found else _alone(parts, settings, told)
+
+    # ---- what belongs together ----
+
+    def _families(self, runs: Sequence[Run]) -> list[list[_Job]]:
+        """Return the runs that can be stepped together, family by family."""
+        families: dict[Any, list[_Job]] = {}
+        for place, (parts, settings) in enumerate(runs):
+            try:
+                job = self._job(place, parts, settings)
+            except EchelonError:
+                job = None  # `simulate` says it again
+            if job is not None:
+                key = family_of(job.loop, settings._replace(seed=0))
+                families.setdefault(key, []).append(job)
+        return [jobs for jobs in families.values() if _fit(jobs)]
+
+    def _job(self, place: int, parts: Parts, settings: Settings) -> _Job | None:
+        """Return a run as a job; None where no laws drive it."""
+        case = self._case(parts, settings._replace(seed=0))
+        if case.loop is None or settings.engine == "jax":
+            return None
+        prepared, loop = case.prepared, case.loop
+        problem = prepared.problem._replace(settings=settings, states=case.starts(settings.seed))
+        if parts.world.disturbance is not None:
+            with precision("float64"):
+                motion = Motion.of(parts.model, parts.world, settings)
+            problem = problem._replace(motion=motion)
+            loop = eqx.tree_at(lambda x: x.motion, loop, motion)
+        return _Job(place, case, prepared._replace(problem=problem), loop)
+
+    def _case(self, parts: Parts, settings: Settings) -> _Case:
+        known = self._cases.setdefault(parts, {})
+        if settings not in known:
+            prepared = prepare(parts, settings)
+            check_memory(parts, settings)
+            drive = prepared.parts.drive
+            with precision("float64"):
+                loop = None
+                if isinstance(drive, Laws):
+                    loop = assemble(prepared.problem, drive.leader, drive.follower)
+                known[settings] = _Case(prepared, Starts(prepared.parts), loop)
+        return known[settings]
+
+    # ---- flights ----
+
+    def _together(self, jobs: list[_Job], told: Told | None) -> dict[int, Result | EchelonError]:
+        """Return what a family comes to; nothing where there is no native code for it."""
+        settings = jobs[0].prepared.problem.settings
+        states = np.concatenate([job.prepared.problem.states for job in jobs])
+        bits = int(settings.precision[5:])
+        loops, began = [job.loop for job in jobs], time.perf_counter()
+        with precision(settings.precision):
+            try:
+                stepper = NativeStepper(loops, states, bits, None, self.pool, self.kernels)
+            except (Unsupported, MissingExtraError, TypeError):
+                # A model that wants its numbers as numbers is traced for each of them.
+                return {}
+            record = _Flock(len(jobs), Grid(settings, stepper.longest), jobs[0].prepared)
+            record.fly(stepper, told)
+        # Each by itself then goes on by JAX.
+        far = np.asarray(beyond(record.states, bits).any(axis=(0, 2, 3)))
+        seconds = (time.perf_counter() - began) / len(jobs)
+        return {
+            job.place: record.result(k, job.prepared, seconds)
+            for k, job in enumerate(jobs)
+            if not far[k]
+        }
+
+
+@final
+class _Flock:
+    """What is kept of formations that fly together."""
+
+    def __init__(self, count: int, grid: Grid, first: Prepared) -> None:
+        self.count, self.grid, self.first = count, grid, first
+        self.times, self._states = list[Array](), list[Array]()
+        self._inputs, self._references = list[Array](), list[Array]()
+        nothing = on_host(first.problem.meter.nothing())
+        self.sums = Sums(*(np.stack([part] * count) for part in nothing))
+        self.finite = np.ones(count, bool)
+
+    def fly(self, stepper: NativeStepper, told: Told | None) -> None:
+        """Take all steps."""
+        now, done, frames = stepper.start(), 0, 0
+        while frames < self.grid.frames:
+            reference = sample_reference(self.first, done, self.grid.longest + 1)
+            made = stepper.advance(now, self.grid.counts(done), reference)
+            frames += self._keep(made, reference, done)
+            now, done = made.now, done + int(made.sums.steps[0])
+            if told is not None:
+                told(done, self.grid.steps)
+
+    def _keep(self, made: Chunk, reference: Array | None, first: int) -> int:
+        """Keep a chunk; return how many of its frames were stored."""
+        counts = self.grid.counts(first)
+        points = first + np.cumsum(counts) - counts
+        frames, agents = len(made.states), made.states.shape[1] // self.count
+        x, u = (part.reshape(frames, self.count, agents, -1) for part in (made.states, made.inputs))
+        # The sums of one that was lost stay what they were when it was, as in a run of its own.
+        self.sums = _where(self.finite, self.sums.plus(_split(made.sums, self.count)), self.sums)
+        finite = np.isfinite(x).all(axis=(2, 3)) & np.isfinite(u).all(axis=(2, 3))
+        stored = self.grid.stored(points)
+        # Frames between those that are stored tell of a loss too.
+        self.finite &= finite.all(axis=0)
+        self.times.append(self.first.problem.settings.dt * points[stored])
+        self._states.append(x[stored])
+        self._inputs.append(u[stored])
+        if reference is not None:
+            self._references.append(reference[points - first][stored])
+        return int(stored.sum())
+
+    @property
+    def states(self) -> Array:
+        """Of all frames, (T, F, N, n)."""
+        return np.concatenate(self._states)
+
+    def result(self, k: int, prepared: Prepared, seconds: float) -> Result:
+        """Return one of the runs."""
+        stretch = Stretch(
+            first=0,
+            done=self.grid.steps,
+            times=np.concatenate(self.times),
+            states=np.concatenate([part[:, k] for part in self._states]),
+            inputs=np.concatenate([part[:, k] for part in self._inputs]),
+            reference=np.concatenate(self._references) if self._references else None,
+            sums=Sums(*(part[k] for part in self.sums)),
+            moment=(),
+            stopped=None,
+            seconds=seconds,
+        )
+        recorder = Recorder(prepared.problem, self.grid, stretch.sums, [stretch])
+        return result_of(prepared, recorder.close(Outcome.INTERRUPTED), "native")
+
+
+def _split(sums: Sums, count: int) -> Sums:
+    """Return the sums of formations that follow each other, each of a formation a row."""
+    twice = {
+        name: getattr(sums, name).reshape(2, count, -1).transpose(1, 0, 2)
+        for name in ("errors", "tracking")
+    }
+    each = {
+        name: part.reshape(count, len(part) // count, *part.shape[1:])
+        for name, part in sums._asdict().items()
+        if name not in ("steps", *twice)
+    }
+    return Sums(steps=np.stack([sums.steps] * count), **twice, **each)
+
+
+def _where(which: Array, new: Sums, old: Sums) -> Sums:
+    shaped = (which.reshape(-1, *[1] * (np.ndim(part) - 1)) for part in new)
+    return Sums(*(np.where(w, a, b) for w, a, b in zip(shaped, new, old, strict=True)))
+
+
+def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | EchelonError:
+    try:
+        return simulate(parts, settings, told)
+    except EchelonError as error:
+        return error
+
+
+def _fit(jobs: list[_Job]) -> bool:
+    """Tell whether runs are worth stepping together: long enough, and filling their vectors."""
+    problem = jobs[0].prepared.problem
+    agents = len(problem.states)
+    if len(jobs) < 2 or agents > _SMALL and len(jobs) < 8:
+        return False
+    return worth_native(problem.settings, len(jobs) * agents)
+
+
+def _processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
