@@ -159,6 +159,7 @@ def test_defaults():
             "engine": "auto",
         },
         "report": {"steady_window": 6.0},
+        "live": (),
         "seed": 0,
     }
 
@@ -288,7 +289,7 @@ def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
         " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`, `simulation`,"
-        " `report`, `seed` (did you mean `seed`?)."
+        " `report`, `live`, `seed` (did you mean `seed`?)."
     ]
 
 
@@ -396,7 +397,7 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
         " `graph`, `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
-        " `simulation`, `report`, `seed`."
+        " `simulation`, `report`, `live`, `seed`."
     )
 
 

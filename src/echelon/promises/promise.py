@@ -6,14 +6,18 @@ integrator, feed-forward, limits and starts that run; what a gain says of itself
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, cast, final
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from echelon.certificates.certificate import RegionCertificate
 from echelon.core.numerics import precision
+from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
+from echelon.engine.initial import Starts
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.settings import Settings
@@ -24,7 +28,8 @@ from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
 from echelon.promises.hypotheses import agent_lines, hypotheses
 from echelon.promises.leaders import leaders_of
-from echelon.promises.path import Frozen, frozen_of, longest_step
+from echelon.promises.modes import held
+from echelon.promises.path import Frozen, Slopes, frozen_at, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
 from echelon.promises.statement import Cause, Hypothesis, Statement
 from echelon.promises.stopping import Stopping, condition_lines, drift_reason, stopping_of
@@ -240,6 +245,61 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     return known[settings]
 
 
+def promises(parts: Parts, settings: Sequence[Settings]) -> Iterator[Promise]:
+    """Yield what is promised of parts under settings that differ in the seed alone.
+
+    Each is what `promise` returns; what no seed changes is computed once.
+
+    Raises:
+        EchelonError: as in `promise`.
+    """
+    alike = (s for s in _kept.get(parts, {}) if s._replace(seed=0) == settings[0]._replace(seed=0))
+    first, prepared = promise(parts, next(alike, settings[0])), prepare(parts, settings[0])
+    if _asks_where(prepared.parts, first.loop) and first.frozen is None:
+        # Nobody leaves the trim, and a seed may be what does.
+        yield from (promise(parts, each) for each in settings)
+        return
+    with precision("float64"):
+        states = np.stack(list(map(Starts(prepared.parts), (each.seed for each in settings))))
+        leaders, slopes = leaders_of(prepared.parts, states[0]), None
+        decays: Array = np.ones((len(states), 1), bool)
+        if first.frozen is not None:
+            slopes = frozen_at(prepared.parts, settings[0], first.loop, leaders, states)
+            decays = slopes.decaying(settings[0]).reshape(len(states), -1)
+    case = Case(prepared.parts, settings[0], first.loop, leaders, first.region, None, first.frozen)
+    for k, each in enumerate(settings):
+        began = None if slopes is None else Slopes(*(_part(x, k, len(states)) for x in slopes))
+        yield _started(first, case._replace(settings=each), states[k], began, bool(decays[k].all()))
+
+
+def _part(array: Array, k: int, parts: int) -> Array:
+    size = len(array) // parts
+    return array[k * size : (k + 1) * size]
+
+
+def _started(
+    first: Promise, case: Case, states: Array, began: Slopes | None, decays: bool
+) -> Promise:
+    """Return a promise as it is where agents start in other states (N, n)."""
+    lines, frozen = dict(first.hypotheses), first.frozen
+    if frozen is not None and began is not None:
+        frozen = frozen._replace(starts=began)
+        # The line tells of where they start only if steps grow there.
+        holds = lines[Hypothesis.STEP].verdict is Verdict.HOLDS
+        if case.smooth and not (holds and decays):
+            lines[Hypothesis.STEP] = held(case._replace(frozen=frozen))
+    for line in set_lines(case.parts, states, first.region, first.certified):
+        lines[cast(Hypothesis, line.statement)] = line
+    told = MappingProxyType(lines)
+    return dataclasses.replace(first, hypotheses=told, frozen=frozen)
+
+
+def _asks_where(parts: Parts, loop: Loop) -> bool:
+    """Tell whether laws are looked at away from the trim."""
+    # What does not decay at the trim has nothing to lose elsewhere.
+    return loop.every and parts.drive.metric(parts.model) is not None
+
+
 def _compute(prepared: Prepared, settings: Settings) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
@@ -247,8 +307,6 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
     if run is not None:
         return _anywhere(run, Case(parts, settings, loop, leaders, None, None, None))
     region = region_of(parts, leaders)
-    # What does not decay at the trim has nothing to lose elsewhere.
-    asked = loop.every and parts.drive.metric(parts.model) is not None
     case = Case(
         parts,
         settings,
@@ -256,7 +314,7 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         leaders,
         region.certificate,
         slopes_beside(parts) if at_trim(parts.model).bends.any() else None,
-        frozen_of(parts, settings, loop, leaders, states) if asked else None,
+        frozen_of(parts, settings, loop, leaders, states) if _asks_where(parts, loop) else None,
     )
     lines = list(hypotheses(case))
     region = weaken(parts, region, lines)

@@ -158,12 +158,18 @@ def _initial(scenario: Scenario) -> Any:
 
 
 def check_size(scenario: Scenario, built: Built) -> None:
-    """Check that what a run of a scenario stores has room; what only looks at it stores nothing.
+    """Check that a scenario can be run as it stands, and that what the run stores has room.
 
     Raises:
-        ScenarioError: it has not.
+        ScenarioError: it has not, or holds what was done live, which a run cannot repeat.
     """
     faults = _Faults(scenario)
+    with faults.at("live"):
+        if scenario.live:
+            raise ScenarioError(
+                f"got {len(scenario.live)} events, allowed is none in a run; `echelon live` "
+                "repeats them, and without `live` this is the scenario before them."
+            )
     with faults.at("simulation"):
         check_memory(*built)
     faults.settle()

@@ -327,3 +327,29 @@ class ReportSpec(BaseModel, **STRICT):
     steady_window: Annotated[Positive, Unit("s")] = Field(default_factory=lambda: 1.0)
     """The end of the run that counts as steady, s; a fifth of the horizon by default, and where it
     would not be shorter than the run."""
+
+
+@final
+class LiveSpec(BaseModel, **STRICT):
+    """What was done at a time of `echelon live`, which does it again; `echelon run` refuses it."""
+
+    at: Annotated[NotNegative, Unit("s")]
+    """When, s."""
+    coupling: Annotated[Positive | None, Unit("1")] = None
+    """The coupling from then on."""
+    feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
+    """1 where followers are sent what `follower.feedforward` says, 0 where nothing."""
+    size: Annotated[Positive | None, Unit("1")] = None
+    """Size of the formation, times that of `formation`."""
+    turn: Annotated[float | None, Unit("deg")] = None
+    """Turn of the formation about its first leader, degrees."""
+    wind: Annotated[float | None, Unit("the states', per s")] = None
+    """Wind on the first velocity, or on the first position, beside `disturbance`."""
+    cut: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = None
+    """The agents of an edge that is cut."""
+    restore: Annotated[Annotated[tuple[int, int], Field(strict=False)] | None, Unit("agents")] = (
+        None
+    )
+    """The agents of an edge that is restored."""
+    kick: Annotated[dict[int, Numbers] | None, Unit("the states'")] = None
+    """By agent: what is added to its states at once, in the states' units."""
