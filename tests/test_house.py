@@ -241,7 +241,8 @@ def test_every_dependency_is_imported_or_has_its_reason():
         "h5py": "what h5netcdf writes through, and does not bring",
     }
     extras = project()["optional-dependencies"]
-    names = [*project()["dependencies"], *extras["certify"], *extras["fast"], *extras["optimal"]]
+    optional = (extras[name] for name in ("certify", "cluster", "fast", "optimal"))
+    names = [*project()["dependencies"], *itertools.chain(*optional)]
     required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
     found = {
         target.split(".")[0]
@@ -250,7 +251,7 @@ def test_every_dependency_is_imported_or_has_its_reason():
         for target in targets(module, node)
     }
     assert required - found == set(not_imported)
-    assert set(extras) == {"certify", "fast", "optimal", "all", "dev"}
+    assert set(extras) == {"certify", "cluster", "fast", "optimal", "all", "dev"}
 
 
 def test_every_advice_to_install_names_this_distribution():
@@ -262,7 +263,7 @@ def test_every_advice_to_install_names_this_distribution():
     extras = {extra for _, extra in named if extra}
     assert {name for name, _ in named - here} == {project()["name"]}
     assert extras and extras <= set(project()["optional-dependencies"])
-    assert f"{project()['name']}[certify,fast,optimal]" in project()["optional-dependencies"]["all"]
+    assert f"{project()['name']}[certify,cluster,fast,optimal]" in project()["optional-dependencies"]["all"]
 
 
 def test_the_version_is_the_same_wherever_it_stands():
