@@ -25,7 +25,9 @@ BUILD = ROOT / "build"
 PINNED = ["--constraint", "constraints.txt"]
 HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
 
-  setup   set up .venv with all extras; does nothing when nothing changed
+  setup   set up .venv with all extras and build what the page draws with (three.js, from npm);
+          does nothing when nothing changed
+  browser find Chromium for the tests, or install Debian's, where this may be done
   demo    run the paper's experiment: echelon run paper [ARGUMENT ...]
   test    run the tests: pytest [ARGUMENT ...], on all cores
   lint    check style, layout and who imports whom: ruff, import-linter
@@ -110,7 +112,26 @@ def wheel(rest: list[str]) -> list[list[str]]:
         [echelon, "list"],
         [echelon, "check", "paper"],
         [echelon, "run", "paper", "--set", "simulation.horizon=1", "--out", str(alone / "run")],
+        [echelon, "view", str(alone / "run"), "--html", str(alone / "run.html")],
     ]
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+def browser(rest: list[str]) -> list[list[str]]:
+    """Return the command that tells Chromium's version, installed first where there is none."""
+    if not any(map(shutil.which, BROWSERS)) and shutil.which("apt-get"):
+        # As root as it is, else only where that takes no password.
+        sudo = [] if os.geteuid() == 0 else ["sudo", "-n"]
+        apt = [*sudo, "apt-get", "-qq", "-o", "DPkg::Lock::Timeout=300"]
+        for command in (["update"], ["install", "-y", "--no-install-recommends", "chromium"]):
+            if not works([*apt, *command]):
+                break
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        raise SetupError("there is no Chromium on the PATH for the tests of the page; install it.")
+    return [[found, "--version"]]
 
 
 PAGES = {"results": [], "comparison": [], "certificates": ["--all"]}
@@ -130,6 +151,7 @@ def results(rest: list[str]) -> list[list[str]]:
 
 VERBS = {
     "setup": lambda rest: [],
+    "browser": browser,
     "demo": lambda rest: [[str(program("echelon")), "run", "paper", *rest]],
     "test": tests,
     "lint": lambda rest: [
@@ -166,10 +188,16 @@ def run(command: list[str], folder: Path = ROOT) -> int:
 
 
 def setup() -> None:
-    """Make .venv what pyproject.toml and constraints.txt ask for, unless it is so already."""
+    """Make .venv what pyproject.toml and constraints.txt ask for, and build the page's three.js."""
     wanted = fingerprint()
-    if program("python").exists() and STAMP.is_file() and STAMP.read_text("utf-8") == wanted:
-        return
+    if not (program("python").exists() and STAMP.is_file() and STAMP.read_text("utf-8") == wanted):
+        install_all(wanted)
+    if run([str(program("python")), str(ROOT / "web" / "build.py")]) != 0:
+        print("dev.py: all but `echelon view` and `echelon live` works without.", file=sys.stderr)
+
+
+def install_all(wanted: str) -> None:
+    """Install what is needed into .venv, and note of what."""
     print(f"Setting up {VENV}; the first time, this takes a few minutes.", flush=True)
     STAMP.unlink(missing_ok=True)
     install = [*installer(VENV), "--editable", ".[all,dev]", *PINNED]

@@ -239,10 +239,11 @@ def test_every_dependency_is_imported_or_has_its_reason():
     not_imported = {
         "h5netcdf": "the engine by which xarray writes and reads run.nc",
         "h5py": "what h5netcdf writes through, and does not bring",
+        "pyarrow": "what pandas writes Parquet with",
     }
     extras = project()["optional-dependencies"]
-    optional = (extras[name] for name in ("certify", "cluster", "fast", "optimal"))
-    names = [*project()["dependencies"], *itertools.chain(*optional)]
+    optional = ("certify", "cluster", "fast", "optimal", "video", "parquet")
+    names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
     required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
     found = {
         target.split(".")[0]
@@ -251,7 +252,7 @@ def test_every_dependency_is_imported_or_has_its_reason():
         for target in targets(module, node)
     }
     assert required - found == set(not_imported)
-    assert set(extras) == {"certify", "cluster", "fast", "optimal", "all", "dev"}
+    assert set(extras) == {*optional, "all", "dev"}
 
 
 def test_every_advice_to_install_names_this_distribution():
@@ -263,7 +264,8 @@ def test_every_advice_to_install_names_this_distribution():
     extras = {extra for _, extra in named if extra}
     assert {name for name, _ in named - here} == {project()["name"]}
     assert extras and extras <= set(project()["optional-dependencies"])
-    assert f"{project()['name']}[certify,cluster,fast,optimal]" in project()["optional-dependencies"]["all"]
+    everything = f"{project()['name']}[certify,cluster,fast,optimal,video,parquet]"
+    assert everything in project()["optional-dependencies"]["all"]
 
 
 def test_the_version_is_the_same_wherever_it_stands():

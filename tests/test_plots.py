@@ -27,7 +27,9 @@ from echelon.network.graph import Graph
 from echelon.plots.run import figures, save_figures
 from echelon.plots.style import COLOURS, thin
 from echelon.references import Circle, Lemniscate
+from echelon.results.dataset import dataset
 from echelon.results.lyapunov import lyapunov
+from echelon.results.recording import recording
 
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 POINT = FixedGain([1.0, 1.0, 0.1], coupling=2.0)
@@ -78,7 +80,7 @@ def all_figures(result):
     """The figures of a run with V, made once."""
     if id(result) not in DRAWN:
         # The result is kept too: its id must not be given to another.
-        DRAWN[id(result)] = (result, figures(result, lyapunov(result)))
+        DRAWN[id(result)] = (result, figures(result))
     return DRAWN[id(result)][1]
 
 
@@ -117,8 +119,8 @@ def exploded(result, factor=1e300):
 def test_every_figure_is_there_and_its_axes_have_names(runs, name):
     result = runs(name)
     made = all_figures(result)
-    expected = {"leader_3d", "trajectories", "formation_error", "lyapunov"}
-    expected |= {"tracking_error"} if result.reference is not None else set()
+    expected = {"leader_3d", "trajectories", "formation", "inputs", "lyapunov"}
+    expected |= {"tracking"} if result.reference is not None else set()
     assert set(made) == expected
     for figure in made.values():
         assert all(ax.get_ylabel() for ax in figure.axes)
@@ -216,7 +218,7 @@ def test_metres_are_alike_in_all_directions(runs):
 
 def test_the_tracking_error_is_the_output_minus_the_reference(runs):
     result = runs("quadrotor")
-    panels, lines = drawn(result, "tracking_error")
+    panels, lines = drawn(result, "tracking")
     off = result.states[:, 0] - result.reference
     for name, k in (("x", 0), ("y", 1), ("z", 2), ("yaw", 8)):
         np.testing.assert_allclose(lines[name][:, 1], off[:, k], rtol=0.0, atol=1e-15)
@@ -227,7 +229,7 @@ def test_the_tracking_error_is_the_output_minus_the_reference(runs):
 @pytest.mark.parametrize("name", ["quadrotor", "van-der-pol"])
 def test_the_formation_error_is_the_distance_from_the_goal(runs, name):
     result = runs(name)
-    (ax,), lines = drawn(result, "formation_error")
+    (ax,), lines = drawn(result, "formation")
     for agent in result.graph.followers:
         goal = result.states[:, 0] + result.formation.offsets[agent]
         off = (result.states[:, agent] - goal)[:, list(result.measured)]
@@ -237,11 +239,11 @@ def test_the_formation_error_is_the_distance_from_the_goal(runs, name):
 
 
 def test_a_centimetre_is_marked_where_errors_are_lengths(runs):
-    (ax,), lines = drawn(runs("quadrotor"), "formation_error")
+    (ax,), lines = drawn(runs("quadrotor"), "formation")
     assert set(lines["1 cm"][:, 1]) == {0.01}
     assert ax.get_ylabel() == "formation error (m)"
     assert ax.get_ylim()[0] <= 0.01 <= ax.get_ylim()[1]
-    (ax,), lines = drawn(runs("van-der-pol"), "formation_error")
+    (ax,), lines = drawn(runs("van-der-pol"), "formation")
     assert "1 cm" not in lines
     assert ax.get_ylabel() == "formation error"
 
@@ -249,14 +251,14 @@ def test_a_centimetre_is_marked_where_errors_are_lengths(runs):
 def test_errors_of_zero_leave_gaps_and_stretch_no_axis(runs):
     result = runs("unicycle")
     goals = np.broadcast_to(result.formation.offsets, result.states.shape)
-    (ax,), lines = drawn(dataclasses.replace(result, states=goals), "formation_error")
+    (ax,), lines = drawn(dataclasses.replace(result, states=goals), "formation")
     for agent in result.graph.followers:
         assert np.isnan(lines[f"follower {agent} (always 0)"][:, 1]).all()
     assert ax.get_ylim()[0] >= 1e-3
     # At their goals from the middle on: the line ends there, and the axis at what it shows.
     half = result.states.copy()
     half[len(half) // 2 :] = goals[len(half) // 2 :]
-    (ax,), lines = drawn(dataclasses.replace(result, states=half), "formation_error")
+    (ax,), lines = drawn(dataclasses.replace(result, states=half), "formation")
     for agent in result.graph.followers:
         shown = lines[f"follower {agent}"][:, 1]
         assert np.isnan(shown[len(half) // 2 :]).all() and (shown[: len(half) // 2] > 0).all()
@@ -275,20 +277,25 @@ def test_v_and_its_derivative_are_drawn_as_given(runs):
     assert below.get_ylabel() == "|dV/dt| (1/s)"
 
 
+def with_v(result, value, rate):
+    """The recording of a run with another V."""
+    return dataclasses.replace(recording(dataset(result)), lyapunov=value, lyapunov_rate=rate)
+
+
 def test_a_rising_v_is_told_apart(runs):
     result = runs("van-der-pol")
     count = len(result.times)
     rate = np.linspace(-1.0, 2.0, count)
-    lines = labelled(figures(result, (np.ones(count), rate))["lyapunov"])
+    lines = labelled(figures(with_v(result, np.ones(count), rate))["lyapunov"])
     np.testing.assert_array_equal(lines["V falls"][:, 1], np.where(rate < 0.0, -rate, np.nan))
     np.testing.assert_array_equal(lines["V rises"][:, 1], np.where(rate > 0.0, rate, np.nan))
 
 
 def test_without_v_there_is_no_figure_of_it_and_without_motion_no_panel(runs):
     result = runs("van-der-pol")
-    assert "lyapunov" not in figures(result)
+    assert "lyapunov" not in figures(with_v(result, None, None))
     still = np.zeros(len(result.times))
-    assert len(figures(result, (still, still))["lyapunov"].axes) == 1
+    assert len(figures(with_v(result, still, still))["lyapunov"].axes) == 1
 
 
 def test_many_followers_have_no_names_and_their_worst_has(runs):
@@ -297,11 +304,16 @@ def test_many_followers_have_no_names_and_their_worst_has(runs):
     (ax,) = made["trajectories"].axes
     told = [text.get_text() for text in ax.get_legend().get_texts()]
     assert told == ["leader 0", "graph, every 0.1 s", "start", "end"]
-    lines = labelled(made["formation_error"])
-    assert set(lines) == {"worst follower", "median follower", "1 cm"}
+    lines = labelled(made["formation"])
+    worst = next(name for name in lines if name.startswith("worst: follower "))
+    told = {worst, "median follower", "largest at each time", "1 cm"}
+    assert {name for name in lines if not name.startswith("slope promised")} == told
     off = (result.states - result.formation.offsets)[:, :, :2]
     errors = np.linalg.norm(off[:, 1:] - off[:, :1], axis=2)
-    np.testing.assert_allclose(lines["worst follower"][:, 1], errors.max(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(lines["largest at each time"][:, 1], errors.max(axis=1), rtol=1e-12)
+    place = int(worst.split()[-1]) - 1
+    assert place == (errors**2).sum(axis=0).argmax()
+    np.testing.assert_allclose(lines[worst][:, 1], errors[:, place], rtol=1e-12)
     np.testing.assert_allclose(lines["median follower"][:, 1], np.median(errors, axis=1))
 
 
@@ -317,7 +329,7 @@ def test_all_agents_of_a_swarm_are_drawn(runs):
 @pytest.mark.parametrize("name", FEW)
 def test_a_run_that_grew_out_of_all_bounds_is_drawn_within_its_start(runs, name, tmp_path):
     result = exploded(runs(name))
-    paths = save_figures(result, tmp_path, (np.full(51, 1e300), np.full(51, np.inf)))
+    paths = save_figures(with_v(result, np.full(51, 1e300), np.full(51, np.inf)), tmp_path)
     assert all(path.stat().st_size for path in paths)
     figure = figures(result)["trajectories"]
     for ax in figure.axes:
@@ -343,9 +355,8 @@ def test_what_is_within_reach_is_drawn_and_nothing_else_changes(runs):
 def test_a_run_of_one_frame_is_drawn_as_dots(runs, name, tmp_path):
     whole = runs(name)
     result = cut(whole, whole.states[:1], None if whole.reference is None else whole.reference[:1])
-    v = lyapunov(result)
-    assert save_figures(result, tmp_path, v)
-    figure = figures(result, v)["leader_3d"]
+    assert save_figures(result, tmp_path)
+    figure = figures(result)["leader_3d"]
     lines = [line for ax in figure.axes for line in ax.get_lines()]
     assert all(line.get_marker() not in ("None", "", " ", None) for line in lines)
 
@@ -370,8 +381,8 @@ def test_long_runs_are_thinned_and_keep_their_ends():
 
 def test_each_figure_is_written_as_png_and_pdf(runs, tmp_path):
     result = runs("quadrotor")
-    paths = save_figures(result, tmp_path, lyapunov(result))
-    names = ["leader_3d", "trajectories", "tracking_error", "formation_error", "lyapunov"]
+    paths = save_figures(result, tmp_path)
+    names = ["leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov"]
     expected = [
         tmp_path / "figures" / f"{name}.{kind}" for name in names for kind in ("png", "pdf")
     ]
@@ -410,7 +421,7 @@ law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
 drive = ech.Laws(ech.laws.TrimInput(), law)
 parts = ech.Parts(model, graph, ech.Formation.line(model, graph), drive)
 result = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.05))
-assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 6
+assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 10
 assert "matplotlib.pyplot" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)

@@ -121,7 +121,13 @@ def test_defaults():
         },
         "formation": {"offsets": None, "name": None, "spacing": 1.0, "columns": None},
         "reference": None,
-        "leader": {"law": "passive", "reacts": False, "start_error": {}, "gain": None},
+        "leader": {
+            "law": "passive",
+            "reacts": False,
+            "start_error": {},
+            "gain": None,
+            **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer")),
+        },
         "follower": {
             "law": "consensus",
             "gain": {
@@ -137,6 +143,7 @@ def test_defaults():
                 "python": None,
                 "file": None,
             },
+            **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer", "hears")),
             "feedforward": "relay",
             "trim": True,
         },
@@ -152,6 +159,7 @@ def test_defaults():
             "engine": "auto",
         },
         "report": {"steady_window": 6.0},
+        "live": (),
         "seed": 0,
     }
 
@@ -238,7 +246,11 @@ def test_the_table_of_methods_says_what_their_classes_say(name):
 @pytest.mark.parametrize("role", ["leader", "follower"])
 def test_the_table_of_laws_says_what_their_classes_say(role):
     for name, entry in getattr(registry, f"{role.upper()}_LAWS").items():
-        offered = {"leader": ("gain",), "follower": ("gain", "feedforward", "trim")}[role]
+        stopping = ("roots", "rate", "coupling", "speed", "observer")
+        offered = {
+            "leader": ("gain", *stopping),
+            "follower": ("gain", "feedforward", "trim", *stopping, "hears"),
+        }[role]
         taken = set(accepted(resolve(entry))) & {*offered}
         assert {*entry.needs, *entry.takes} == taken, name
 
@@ -277,7 +289,7 @@ def test_an_unknown_section_gets_a_guess(refused):
     assert refused(seed="sed: 0") == [
         "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
         " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`, `simulation`,"
-        " `report`, `seed` (did you mean `seed`?)."
+        " `report`, `live`, `seed` (did you mean `seed`?)."
     ]
 
 
@@ -385,7 +397,7 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
     assert str(caught.value) == (
         f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
         " `graph`, `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
-        " `simulation`, `report`, `seed`."
+        " `simulation`, `report`, `live`, `seed`."
     )
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from echelon.core.errors import OutputError
 
-CHUNKS, INPUTS, RUNS, BATCHES = "chunks", "inputs", "runs", "batches"
-_RUN = ("summary.json", "run.nc", "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
+CHUNKS, INPUTS, RUNS, BATCHES, DATA = "chunks", "inputs", "runs", "batches", "run.nc"
+_RUN = ("summary.json", DATA, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
 _SWEEP = ("sweep.nc", "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
 _OURS = {"summary.json": _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}

@@ -4,15 +4,15 @@ import json
 from pathlib import Path
 
 from echelon.archive.chunks import Chunks
-from echelon.archive.folder import claim_folder, unwritable
+from echelon.archive.folder import DATA, claim_folder, unwritable
 from echelon.core.errors import OutputError
 from echelon.core.files import write_whole
 from echelon.core.types import PathLike
 from echelon.engine.result import Result
 from echelon.engine.simulate import reassemble
 from echelon.reports.run import report
-from echelon.results.dataset import save_dataset, summary
-from echelon.results.lyapunov import lyapunov
+from echelon.results.dataset import dataset, save_dataset, summary
+from echelon.results.recording import recording
 from echelon.scenario.build import build, note_origin
 from echelon.scenario.scenario import KEPT, load_scenario
 
@@ -68,7 +68,8 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
     """
     try:
         # The data first: a figure that fails then costs no run.
-        save_dataset(result, folder / "run.nc")
+        data = dataset(result)
+        save_dataset(data, folder / DATA)
         # NaN is no JSON: whoever reads the file with another parser would stop there.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
         write_whole(folder / "summary.json", content + "\n")
@@ -77,8 +78,7 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
             # Here, since matplotlib takes long to load, and a run without figures needs none of it.
             from echelon.plots.run import save_figures
 
-            v = lyapunov(result)
-            save_figures(result, folder, None if v is None else (v.value, v.rate))
+            save_figures(recording(data), folder)
     except OSError as error:
         raise unwritable(folder, error) from error
 

@@ -3,6 +3,7 @@
 Heavy modules are imported inside each command, so that `--help` is quick.
 """
 
+import contextlib
 import errno
 import functools
 import os
@@ -19,13 +20,21 @@ from echelon.cli.compare import compare
 from echelon.cli.crash import CRASHED, note_crash
 from echelon.cli.design import design
 from echelon.cli.doctor import doctor
+from echelon.cli.explain import explain
+from echelon.cli.export import export
+from echelon.cli.init import init
 from echelon.cli.listing import list_, schema
+from echelon.cli.live import live
+from echelon.cli.plot import plot
+from echelon.cli.report import report
 from echelon.cli.run import run
 from echelon.cli.stop import STOP, Ended
 from echelon.cli.streams import outlive_readers
 from echelon.cli.sweep import sweep
 from echelon.cli.tune import tune
 from echelon.cli.verify import verify
+from echelon.cli.video import video
+from echelon.cli.view import view
 from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
@@ -39,7 +48,6 @@ _EPILOG = (
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -84,7 +92,13 @@ def _about(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version and leave.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("-q", "--quiet", help="Print nothing but what goes wrong.")
+    ] = False,
 ) -> None:
+    if quiet:
+        nowhere = context.with_resource(open(os.devnull, "w"))
+        context.with_resource(contextlib.redirect_stdout(nowhere))
     if version:
         print(f"echelon {__version__}")
         raise typer.Exit()
@@ -107,5 +121,9 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # Listed here and not decorated at home, so that a command's file knows nothing of the program.
-for _command in (run, sweep, check, design, tune, compare, verify, list_, doctor, schema):
+_COMMANDS: tuple[Callable[..., Any], ...] = (
+    *(init, run, sweep, view, live, plot, video, report, export),
+    *(check, design, tune, compare, verify, list_, explain, doctor, schema),
+)
+for _command in _COMMANDS:
     app.command(_command.__name__.rstrip("_"))(_guarded(_command))

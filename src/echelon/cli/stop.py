@@ -34,7 +34,7 @@ class Stop:
     def __init__(self) -> None:
         """Begin untold."""
         self.number: int | None = None
-        self._held = False
+        self._held, self._said = False, _SAID
 
     @property
     def exit_code(self) -> int:
@@ -73,9 +73,9 @@ class Stop:
             self.number = None
 
     @contextlib.contextmanager
-    def hold(self) -> Iterator[None]:
-        """Let signals wait for `check`, as long as there is something to lose."""
-        self._held = True
+    def hold(self, said: str = _SAID) -> Iterator[None]:
+        """Let signals wait for `check`, as long as there is something to lose; say what follows."""
+        self._held, self._said = True, said
         try:
             yield
         finally:
@@ -103,8 +103,8 @@ class Stop:
                     sys.stderr.flush()
                 os._exit(self.exit_code)
             self.number = number[0]
-            if self._held:
-                print(_SAID, file=sys.stderr, flush=True)
+            if self._held and self._said:
+                print(self._said, file=sys.stderr, flush=True)
 
     def _interrupt(self, number: int, _: object) -> None:
         self.number = number

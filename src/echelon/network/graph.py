@@ -301,14 +301,16 @@ class Graph:
         parents[child] = parent
         return tuple(parents.tolist())
 
-    def exchange(self) -> "Exchange":
-        """Return the computation of the disagreement on this graph, ready for JAX."""
-        i, j = self.edges.T
-        return Exchange(
-            receivers=np.concatenate([i, j]),
-            senders=np.concatenate([j, i]),
-            weights=np.concatenate([self.weights, self.weights]),
-        )
+    def exchange(self, leaderward: bool = False) -> "Exchange":
+        """Return the computation of the disagreement; leaderward, of those nearer a leader."""
+        (i, j), weights = self.edges.T, self.weights
+        receivers, senders = np.concatenate([i, j]), np.concatenate([j, i])
+        weights = np.concatenate([weights, weights])
+        if leaderward:
+            depth = self.depths()
+            nearer = depth[senders] < depth[receivers]
+            receivers, senders, weights = receivers[nearer], senders[nearer], weights[nearer]
+        return Exchange(receivers=receivers, senders=senders, weights=weights)
 
     def disagreement(self, y: States) -> States:
         """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""

@@ -9,8 +9,9 @@ from echelon.core.types import Array
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.plots import style as draw
-from echelon.promises.closed_loop import Loop
+from echelon.plots.network import poles
 from echelon.promises.promise import promise
+from echelon.results.recording import Modes
 from echelon.studies.basin import (
     Radii,
     Slice,
@@ -49,73 +50,10 @@ def save_design_figures(
     sliced = asked is not None or len(parts.model.state_names) > 1
     states = chosen_slice(parts.model, asked) if sliced else None
     with draw.style():
-        made["modes"] = _modes(loop)
+        made["modes"] = poles(Modes(loop.poles, loop.eigenvalues))
         if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
             made["certified_set"], radii = _certified_set(parts, settings, states)
     return draw.save(made, folder), radii
-
-
-# ---- modes ------------------------------------------------------------------------------------
-
-
-def _modes(loop: Loop) -> "Figure":
-    """Return the poles of every mode looked at in the complex plane, coloured by lambda."""
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
-
-    closed = loop.closed
-    values = closed.strengths / closed.coupling
-    A, B = loop.linear
-    poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
-    figure = Figure((7.0, 4.2), layout="constrained")
-    ax = figure.add_subplot()
-    colour = np.repeat(values, poles.shape[1])
-    norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
-    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
-    dots = ax.scatter(poles.real.ravel(), poles.imag.ravel(), 34, colour, **look)
-    ax.axvline(0.0, color=draw.EDGE, linewidth=0.9, zorder=2)
-    slowest = float(poles.real.max())
-    ax.axvline(slowest, color=draw.COLOURS[1], linewidth=0.9, linestyle=(0, (4, 2)), zorder=2)
-    _wide_axis(ax, poles.real, poles.imag)
-    ax.set_xlabel("real part (1/s)")
-    ax.set_ylabel("imaginary part (rad/s)")
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
-    text, place = f"slowest: {slowest:.3g} 1/s", (slowest, 1.0)
-    near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
-    ax.annotate(text, place, (4, -4), va="top", size=9, color=draw.COLOURS[1], **near)
-    bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
-    bar.set_label("eigenvalue λ of the grounded Laplacian")
-    _label_bar(bar, values)
-    return figure
-
-
-def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
-    """Use scales that show slow and fast poles alike, and end a little right of the axis."""
-    from matplotlib.ticker import FuncFormatter
-
-    sizes, heights = np.abs(real), np.abs(imaginary)
-    least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
-    right = max(0.0, float(real.max()))
-    if most > 30.0 * least:
-        ax.set_xscale("symlog", linthresh=least, linscale=0.6)
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-        ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
-    else:
-        ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
-    turning = heights[heights > 1e-9 * most]
-    if turning.size and heights.max() > 30.0 * np.median(turning):
-        ax.set_yscale("symlog", linthresh=float(np.median(turning)))
-    if not turning.size:
-        ax.set_ylim(-1.0, 1.0)
-
-
-def _label_bar(bar: Any, values: Array) -> None:
-    """Name each eigenvalue on the colour bar where they are few, else only powers of ten."""
-    from matplotlib.ticker import NullLocator
-
-    if len(values) <= 8:
-        bar.set_ticks(values, labels=[f"{value:.3g}" for value in values])
-        bar.ax.yaxis.set_minor_locator(NullLocator())
 
 
 # ---- sets -------------------------------------------------------------------------------------

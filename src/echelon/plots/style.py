@@ -3,8 +3,9 @@
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,16 +29,29 @@ NAMED = 10
 _TOP = 1e9  # A logarithmic axis that reached further would flatten what is of interest.
 _POINTS = 2000  # a line's, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
-_WIDTH = 7.0  # inches: two columns of a journal
-_SIDE = 4.3  # inches: what a space may fill
+
+
+class Page(NamedTuple):
+    """Where a figure will stand: its width, what a space may fill of it (in), its letters (pt)."""
+
+    width: float
+    side: float
+    letters: float
+
+    @property
+    def narrow(self) -> bool:
+        """Whether legends have no room beside the axes."""
+        return self.width < 5.0
+
+
+SCREEN = Page(7.0, 4.3, 10.0)
+ONE_COLUMN, TWO_COLUMNS = Page(3.5, 2.6, 8.0), Page(7.16, 4.4, 8.0)
+"""Of a page of a journal."""
+
+_page: ContextVar[Page] = ContextVar("page", default=SCREEN)
 _STYLE: dict[Any, Any] = {
     "font.family": "STIXGeneral",
     "mathtext.fontset": "stix",
-    "font.size": 10,
-    "axes.labelsize": 10,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "legend.fontsize": 9,
     "legend.frameon": False,
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
@@ -50,17 +64,33 @@ _STYLE: dict[Any, Any] = {
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
     "pdf.fonttype": 42,  # Journals refuse fonts of type 3.
+    "svg.fonttype": "none",  # so that text can be searched, and takes the page's own font
+    "svg.hashsalt": "echelon",  # without it no two files are alike
     "savefig.dpi": 150,
 }
 
 
 @contextmanager
-def style() -> Iterator[None]:
-    """Draw in echelon's style, and put matplotlib's settings back."""
+def style(page: Page = SCREEN) -> Iterator[None]:
+    """Draw in echelon's style for a page, and put matplotlib's settings back."""
     import matplotlib
 
-    with matplotlib.rc_context(_STYLE), np.errstate(over="ignore", invalid="ignore"):
-        yield
+    large, small = ("font.size", "axes.labelsize"), ("xtick", "ytick")
+    letters: dict[Any, Any] = dict.fromkeys(large, page.letters) | {
+        "legend.fontsize": page.letters - 1.0
+    }
+    letters |= {f"{axis}.labelsize": page.letters - 1.0 for axis in small}
+    token = _page.set(page)
+    try:
+        with matplotlib.rc_context(_STYLE | letters), np.errstate(over="ignore", invalid="ignore"):
+            yield
+    finally:
+        _page.reset(token)
+
+
+def page() -> Page:
+    """Return the page that is drawn for."""
+    return _page.get()
 
 
 # ---- lines ------------------------------------------------------------------------------------
@@ -151,7 +181,10 @@ def panels(times: Array, horizon: float, rows: int, height: float) -> "tuple[Fig
     """Return panels above each other that share the axis of time, `height` inches each."""
     from matplotlib.figure import Figure
 
-    figure = Figure((_WIDTH, max(3.2, height * rows)), layout="constrained")
+    # Smaller letters need less height too.
+    height *= page().letters / 10.0 if page().narrow else 1.0
+    least = 2.3 if page().narrow else 3.2
+    figure = Figure((page().width, max(least, height * rows)), layout="constrained")
     axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
     # A lone frame stands on no axis, where half of its dots would be cut off.
     limits = (0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon)
@@ -159,15 +192,25 @@ def panels(times: Array, horizon: float, rows: int, height: float) -> "tuple[Fig
     return figure, axes
 
 
+def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Any]]]":
+    """Return panels in rows that share their values and columns that share their times."""
+    from matplotlib.figure import Figure
+
+    height *= page().letters / 10.0 if page().narrow else 1.0
+    figure = Figure((page().width, max(2.3, height * rows)), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex="col", sharey="row", squeeze=False)
+    return figure, [list(row) for row in axes]
+
+
 def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
     """Return one set of axes in the plane or in space, for two or three labels."""
     from matplotlib.figure import Figure
 
     if len(labels) == 2:
-        figure = Figure((_WIDTH, 4.2), layout="constrained")
+        figure = Figure((page().width, 0.6 * page().width), layout="constrained")
         ax: Any = figure.add_subplot()
     else:
-        figure = Figure((_WIDTH, _WIDTH))
+        figure = Figure((page().width, page().width))
         ax = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d", computed_zorder=False)
         ax.view_init(elev=30.0, azim=-60.0)
         for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
@@ -193,13 +236,15 @@ def frame(ax: Any, points: Array, alike: bool = True) -> None:
         _fit_box(ax, half)
     elif alike:
         ax.set_aspect("equal")
-        ax.figure.set_figheight(np.clip(0.7 + 5.0 * half[1] / half[0], 2.4, 5.2))
+        wide = page().width / 1.4
+        ax.figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
 
 
 def _fit_box(ax: Any, half: Array) -> None:
     """Let the box of a space fill the width or the height, and the figure be no higher than it."""
-    room, left = np.array([_SIDE, _SIDE]), 0.5
-    ax.set_position((0.0, 0.0, _SIDE / _WIDTH, _SIDE / _WIDTH))
+    width, side = page().width, page().side
+    room, left = np.array([side, side]), 0.07 * width
+    ax.set_position((0.0, 0.0, side / width, side / width))
     ax.set_box_aspect(half / half.max())
     zoom = 1.0
     # Perspective makes the size not quite proportional to the zoom, so it is corrected once more.
@@ -211,7 +256,7 @@ def _fit_box(ax: Any, half: Array) -> None:
     height = high[1] - low[1] + 0.75
     corner = np.array([left + 0.5 * (room[0] - high[0] + low[0]), 0.45]) - low
     ax.figure.set_figheight(height)
-    ax.set_position((corner[0] / _WIDTH, corner[1] / height, _SIDE / _WIDTH, _SIDE / height))
+    ax.set_position((corner[0] / width, corner[1] / height, side / width, side / height))
     _label_box(ax, half)
 
 
@@ -223,8 +268,8 @@ def _label_box(ax: Any, half: Array) -> None:
         axis, count = getattr(ax, f"{name}axis"), 5 if half[k] > 0.4 * half.max() else 3
         axis.set_major_locator(MaxNLocator(count, steps=[1, 2, 5, 10]))
         # Matplotlib measures these distances in widths of the box.
-        stretch = _SIDE / 5.6 * half.max() / np.delete(half, k).max()
-        axis.labelpad = 24.5 * stretch - 21.0
+        stretch = page().side / 5.6 * half.max() / np.delete(half, k).max()
+        axis.labelpad = 24.5 * stretch - (15.0 if page().narrow else 21.0)
         ax.tick_params(axis=name, pad=11.0 * stretch - 8.0)
 
 
@@ -269,39 +314,44 @@ def logarithmic(ax: Any, *values: Array) -> None:
     ax.yaxis.set_minor_locator(NullLocator())
 
 
-def save(figures: "Mapping[str, Figure]", folder: Path) -> list[Path]:
-    """Write each figure as PNG (150 dpi) and PDF into a folder, made if need be; return the paths.
+def save(
+    figures: "Mapping[str, Figure]",
+    folder: Path,
+    kinds: Sequence[str] = ("png", "pdf"),
+    dpi: int = 150,
+) -> list[Path]:
+    """Write each figure as PNG and PDF into a folder, made if need be; return the paths.
 
     Raises:
         OSError: the folder or a file cannot be written.
     """
     paths = []
     folder.mkdir(parents=True, exist_ok=True)
+    # Without its date, the same run writes the same file.
+    dates: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
     for name, figure in figures.items():
-        png, pdf = (folder / f"{name}.{kind}" for kind in ("png", "pdf"))
-        with style():
-            make_whole(png, lambda part: figure.savefig(part, format="png"))
-            # Without its date, the same run writes the same file.
-            dated = {"CreationDate": None}
-            make_whole(pdf, lambda part: figure.savefig(part, format="pdf", metadata=dated))
-        paths += [png, pdf]
+        for kind in kinds:
+            path, told = folder / f"{name}.{kind}", dates.get(kind)
+            with style():
+                make_whole(
+                    path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=told)
+                )
+            paths.append(path)
     return paths
 
 
-def finish(figure: "Figure", cut: bool = False, once: bool = False) -> "Figure":
-    """Add legends, only the first where `once`, and the note on what is left out.
+def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any = None) -> "Figure":
+    """Add legends, only the first where `once`, or one at `corner`, and what is left out.
 
     The layout is settled here, and not again for each format, which saves time.
     """
-    for ax in figure.axes[:1] if once else figure.axes:
-        if not ax.get_legend_handles_labels()[1]:
-            continue
-        if ax.name == "3d":
-            figure.legend(loc="upper right", bbox_to_anchor=(0.995, 0.97))
-        else:
-            ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
+    first = figure.axes[:1] if corner is None or page().narrow else [corner]
+    for ax in first if once else figure.axes:
+        if ax.get_legend_handles_labels()[1]:
+            _add_legend(figure, ax)
     if cut:
-        figure.suptitle("The run grew beyond these axes; what lies farther is not drawn.", size=9)
+        text = "The run grew beyond these axes; what lies farther is not drawn."
+        figure.suptitle(text, size=page().letters - 1.0, wrap=True)
     engine: Any = figure.get_layout_engine()
     if engine is not None:
         figure.align_ylabels()
@@ -311,3 +361,35 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False) -> "Figure":
             engine.execute(figure)
         figure.set_layout_engine("none")
     return figure
+
+
+def _add_legend(figure: "Figure", ax: Any) -> None:
+    """Put a legend beside the axes, or above them where a page is narrow."""
+    narrow = page().narrow
+    if not narrow and ax.name == "3d":
+        figure.legend(loc="upper right", bbox_to_anchor=(0.995, 0.97))
+    elif not narrow:
+        ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0)
+    elif ax.name == "3d":
+        _raise_roof(figure, ax)
+    else:
+        look = {"handlelength": 1.4, "columnspacing": 1.0, "handletextpad": 0.5}
+        ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(ax), **look)
+
+
+def _columns(ax: Any) -> int:
+    """Return how many entries of a legend fit beside each other in one column of a page."""
+    longest = max(len(text) for text in ax.get_legend_handles_labels()[1])
+    return max(1, min(4, int(66 / (longest + 6))))
+
+
+def _raise_roof(figure: "Figure", ax: Any) -> None:
+    """Make room above a space for its legend."""
+    columns = _columns(ax)
+    rows = -(-len(ax.get_legend_handles_labels()[1]) // columns)
+    old, more = figure.get_figheight(), 0.17 * rows
+    box = ax.get_position()
+    scale = old / (old + more)
+    figure.set_figheight(old + more)
+    ax.set_position((box.x0, box.y0 * scale, box.width, box.height * scale))
+    figure.legend(loc="upper left", ncols=columns, handlelength=1.4, columnspacing=1.0)

@@ -56,6 +56,17 @@ class Loop(NamedTuple):
         """What acts on the state in each mode, inner loop included, (K, m, n)."""
         return self.inner + self.closed.strengths[:, None, None] * self.closed.K
 
+    @property
+    def eigenvalues(self) -> Array:
+        """Of the graph, (K,): those whose modes were looked at."""
+        return self.closed.strengths / self.closed.coupling
+
+    @property
+    def poles(self) -> Array:
+        """Of each mode looked at, (K, n)."""
+        A, B = self.linear
+        return np.linalg.eigvals(A - self.closed.strengths[:, None, None] * (B @ self.closed.K))
+
     def radius(self, settings: Settings) -> float:
         """Return the largest spectral radius of a step of the integrator that runs."""
         A, B = self.open

@@ -26,12 +26,14 @@ from echelon.promises.case import Case
 from echelon.promises.certified_set import CertifiedSet, certified_set, set_lines
 from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
-from echelon.promises.hypotheses import hypotheses
+from echelon.promises.hypotheses import agent_lines, hypotheses
 from echelon.promises.leaders import leaders_of
 from echelon.promises.modes import held
 from echelon.promises.path import Frozen, Slopes, frozen_at, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
 from echelon.promises.statement import Cause, Hypothesis, Statement
+from echelon.promises.stopping import Stopping, condition_lines, drift_reason, stopping_of
+from echelon.promises.tube import Tube, tube_of
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -51,6 +53,8 @@ class Promise:
         without: what acts on the agents that is left out, in words; empty without any.
         own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         frozen: the laws away from the trim; None where they are not looked at.
+        tube: what T5 promises; None under other laws, or where it promises nothing.
+        hold: the longest step that T5 allows, s; None under other laws.
     """
 
     loop: Loop
@@ -62,6 +66,8 @@ class Promise:
     without: str
     own: float | None
     frozen: Frozen | None
+    tube: Tube | None = None
+    hold: float | None = None
 
     @property
     def linear(self) -> bool:
@@ -80,15 +86,19 @@ class Promise:
         return not self.reasons
 
     @property
+    def _ground(self) -> RegionCertificate | Tube | None:
+        return (self.tube or self.region) if self.promised else None
+
+    @property
     def theorem(self) -> Theorem | None:
         """The theorem behind the promise; None where it is the linearization alone, or nothing."""
-        region = self.region if self.promised else None
+        region = self._ground
         return None if region is None else region.theorem
 
     @property
     def kind(self) -> Kind:
         """The kind of argument behind the promise."""
-        region = self.region if self.promised else None
+        region = self._ground
         return Kind.LINEARIZATION if region is None else region.kind
 
     @property
@@ -99,7 +109,8 @@ class Promise:
         """
         if not self.promised:
             return None
-        return -self.loop.slowest if self.region is None else self.region.rate
+        ground = self._ground
+        return -self.loop.slowest if ground is None else ground.rate
 
     @property
     def edge(self) -> float | None:
@@ -109,6 +120,8 @@ class Promise:
     @property
     def slowest(self) -> float | None:
         """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
+        if self.tube is not None:
+            return -self.tube.rate
         return self.loop.slowest if self.linear else None
 
     @property
@@ -118,6 +131,8 @@ class Promise:
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
+        if self.hold is not None:
+            return self.hold
         return longest_step(self.loop, self.frozen, settings)
 
     @property
@@ -147,6 +162,10 @@ class Promise:
 
     def _promised(self) -> str:
         region = self.region
+        if self.tube is not None:
+            text = self.tube.sentence()
+            without = f" This is said without what the scenario adds: {self.without}."
+            return text + without if self.without else text
         if self.linear:
             text = "by linearization: followers that start near enough to their goals, with the "
             text += f"leader near enough to the trim, converge to them{self.condition}"
@@ -199,6 +218,7 @@ class Promise:
                 "kind": str(found.kind),
                 "why": found.why,
             },
+            "anywhere": None if self.tube is None else self.tube.as_mapping(),
             "hypotheses": [each.as_mapping() for each in self.hypotheses.values()],
         }
 
@@ -283,6 +303,9 @@ def _asks_where(parts: Parts, loop: Loop) -> bool:
 def _compute(prepared: Prepared, settings: Settings) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
+    run = stopping_of(parts, settings, states)
+    if run is not None:
+        return _anywhere(run, Case(parts, settings, loop, leaders, None, None, None))
     region = region_of(parts, leaders)
     case = Case(
         parts,
@@ -309,4 +332,17 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         without=case.disturbed,
         own=None if leaders.rest else leaders.slowest,
         frozen=case.frozen,
+    )
+
+
+def _anywhere(run: Stopping, case: Case) -> Promise:
+    """Return what is promised under the law `stopping-point`."""
+    found, drifts = tube_of(run), drift_reason(run)
+    lines = [*agent_lines(case), *condition_lines(run), *found.lines]
+    lines += [drifts] if drifts is not None else []
+    kept = MappingProxyType({cast(Hypothesis, x.statement): x for x in lines})
+    tube = None if any(line.reason for line in kept.values() if line.fails) else found.tube
+    own = case.leaders.slowest
+    return Promise(
+        case.loop, None, None, kept, "", "", case.disturbed, own, None, tube, run.longest_step
     )

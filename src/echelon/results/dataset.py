@@ -11,9 +11,11 @@ import numpy as np
 
 from echelon.core.files import write_whole
 from echelon.engine.result import Result
+from echelon.models.model import ControlAffine
 from echelon.promises.promise import promise
 from echelon.results.lyapunov import lyapunov
-from echelon.results.metrics import Metrics, metrics
+from echelon.results.metrics import Metrics, metrics, output_errors
+from echelon.results.recording import FORMAT
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,9 +25,12 @@ def dataset(result: Result) -> "xr.Dataset":
     """Return a run as a dataset with dimensions time, agent, state, input, edge.
 
     Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
-    `offset`, `reference`, `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`,
-    `edge_agents`, `edge_weight`, and the gain's `P`, `R` and `coupling`. The attribute `promise` is
-    JSON.
+    `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
+    references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
+    `edge_weight`, the gain's `P`, `R` and `coupling`, the poles of the modes looked at
+    (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`), and where inputs u are limited
+    `limit_low` <= `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format`
+    the number of this list.
     """
     import xarray as xr
 
@@ -40,21 +45,15 @@ def dataset(result: Result) -> "xr.Dataset":
             "agent",
             np.isin(np.arange(result.graph.agents), result.graph.leaders).astype(np.int8),
         ),
+        "nearest_leader": ("agent", np.array(result.graph.nearest_leader())),
         "edge_agents": (("edge", "end"), result.graph.edges),
         "edge_weight": ("edge", result.graph.weights),
     }
-    if result.reference is not None:
-        variables["reference"] = (("time", "state"), result.reference)
     v = lyapunov(result)
     if v is not None:
         variables |= {"lyapunov": ("time", v.value), "lyapunov_rate": ("time", v.rate)}
         variables["lyapunov_drift"] = ("time", v.drift)
-    gain = result.drive.gain
-    if gain is not None:
-        # A dimension stands in a variable once, so that columns have one of their own.
-        variables["P"] = (("state", "state_column"), gain.P)
-        variables["R"] = (("input", "input_column"), gain.R)
-        variables["coupling"] = ((), gain.coupling)
+    variables |= {**_followed(result), **_gain(result), **_limits(result), **_poles(result)}
     coordinates = {
         "time": ("time", result.times, {"units": "s"}),
         "agent": np.arange(result.graph.agents),
@@ -62,8 +61,64 @@ def dataset(result: Result) -> "xr.Dataset":
         "state_unit": ("state", list(model.state_units)),
         "input": list(model.input_names),
         "input_unit": ("input", list(model.input_units)),
+        "output": list(model.output_names),
+        "output_unit": ("output", _output_units(model)),
     }
     return xr.Dataset(variables, coordinates, _attributes(result))
+
+
+def _output_units(model: ControlAffine) -> list[str]:
+    """Return the units of the outputs, known of those that are states."""
+    units = dict(zip(model.state_names, model.state_units, strict=True))
+    return [units.get(name, "") for name in model.output_names]
+
+
+def _followed(result: Result) -> dict[str, Any]:
+    """Return what the leaders follow and how far they are from it; nothing without a reference."""
+    if result.reference is None:
+        return {}
+    found: dict[str, Any] = {"reference": (("time", "state"), result.reference)}
+    errors = [output_errors(result, leader) for leader in result.graph.leaders]
+    known = [error for error in errors if error is not None]
+    if known:
+        found["tracking_error"] = (("time", "leader", "output"), np.stack(known, axis=1))
+    return found
+
+
+def _gain(result: Result) -> dict[str, Any]:
+    """Return what the gain is; nothing without one."""
+    gain = result.drive.gain
+    if gain is None:
+        return {}
+    return {
+        # A dimension stands in a variable once, so that columns have one of their own.
+        "P": (("state", "state_column"), gain.P),
+        "R": (("input", "input_column"), gain.R),
+        "coupling": ((), gain.coupling),
+    }
+
+
+def _limits(result: Result) -> dict[str, Any]:
+    """Return what limits the inputs that were delivered; nothing where they are not."""
+    limits = result.model.input_limits if result.settings.limits else None
+    if limits is None:
+        return {}
+    matrix, low, high = (np.asarray(part, np.float64) for part in limits)
+    rows = {"limit_low": ("limit", low), "limit_high": ("limit", high)}
+    return {"limit_matrix": (("limit", "input"), matrix), **rows}
+
+
+def _poles(result: Result) -> dict[str, Any]:
+    """Return the poles near the trim; nothing where laws have none."""
+    found = promise(result.parts, result.settings)
+    if not found.linear:
+        return {}
+    poles, values = found.loop.poles, found.loop.eigenvalues
+    return {
+        "pole_real": (("mode", "pole"), np.real(poles)),
+        "pole_imaginary": (("mode", "pole"), np.imag(poles)),
+        "mode_eigenvalue": ("mode", values),
+    }
 
 
 def _attributes(result: Result) -> dict[str, Any]:
@@ -88,17 +143,20 @@ def _attributes(result: Result) -> dict[str, Any]:
         **settings,
         **laws,
         "model": type(result.model).__name__,
+        "position": " ".join(result.model.position),
+        "format": FORMAT,
     }
 
 
-def save_dataset(result: Result, path: Path) -> None:
+def save_dataset(run: "Result | xr.Dataset", path: Path) -> None:
     """Write the dataset of a run as netCDF, whole or not at all.
 
     Raises:
         OSError: it cannot be written.
     """
     # In memory first: on a disk that is full the library under it ends the whole process.
-    write_whole(path, bytes(dataset(result).to_netcdf(None, engine="h5netcdf")))
+    data = dataset(run) if isinstance(run, Result) else run
+    write_whole(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:

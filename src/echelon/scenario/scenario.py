@@ -7,7 +7,7 @@ allowed`.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, final, get_args
+from typing import Annotated, Any, NoReturn, final, get_args
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
@@ -51,6 +51,8 @@ class Scenario(BaseModel, **sections.STRICT):
     disturbance: sections.DisturbanceSpec | None = None
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
+    live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()
+    """What `echelon live` does at its time, as it saved what a person did; no other command can."""
     seed: Seed = 0
     """Seed of everything random in the run."""
 

@@ -1,0 +1,227 @@
+"""What a person may turn while a loop runs, and the scenario that says the same."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import scipy.sparse as sp
+
+from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.numerics import precision
+from echelon.core.types import Array
+from echelon.models.linearization import linearize
+from echelon.scenario.build import Built
+from echelon.scenario.override import named_files
+from echelon.scenario.scenario import Scenario, scenario_from_mapping
+from echelon.scenario.yaml import dump_yaml
+
+
+class Range(NamedTuple):
+    """Between what a knob goes, on a logarithmic scale or not; what is beyond is clamped."""
+
+    low: float
+    high: float
+    logarithmic: bool = False
+
+    def clamp(self, value: float) -> float:
+        """Return the nearest allowed value."""
+        return float(np.clip(value, self.low, self.high))
+
+
+class Knobs(NamedTuple):
+    """How all knobs stand.
+
+    Attributes:
+        coupling: c; None of a law without a gain.
+        feedforward: 1 where followers are sent what the scenario says, 0 where nothing.
+        size: of the formation, times the scenario's.
+        turn: of it, degrees.
+        wind: added to the first velocity's rate, or to the first position's.
+        cut: places of the edges that are cut.
+    """
+
+    coupling: float | None
+    feedforward: float = 1.0
+    size: float = 1.0
+    turn: float = 0.0
+    wind: float = 0.0
+    cut: frozenset[int] = frozenset()
+
+
+@final
+class Panel:
+    """Which knobs a scenario has, their ranges, and what they mean for it.
+
+    Args:
+        scenario: as it was given.
+        built: what it builds.
+    """
+
+    def __init__(self, scenario: Scenario, built: Built) -> None:
+        """Find out which knobs there are."""
+        self.scenario, self.built, parts = scenario, built, built.parts
+        self.parts, model = parts, parts.model
+        gain = parts.drive.gain
+        self.start = Knobs(None if gain is None else gain.coupling)
+        self.ranges: dict[str, Range] = {}
+        if gain is not None:
+            self.ranges["coupling"] = Range(0.02 * gain.coupling, 8.0 * gain.coupling, True)
+        if str(parts.drive.feedforward.name) != "NONE":
+            self.ranges["feedforward"] = Range(0.0, 1.0)
+        self.axes = list(model.position_indices())
+        if self.axes and parts.formation.offsets[:, self.axes].any():
+            self.ranges["size"] = Range(0.3, 3.0, True)
+            if len(self.axes) > 1:
+                self.ranges["turn"] = Range(-180.0, 180.0)
+        self.windward = self._windward()
+        if self.windward is not None:
+            self.ranges["wind"] = Range(-3.0, 3.0)
+
+    def _windward(self) -> int | None:
+        """Return the state that the wind acts on; None of agents without a position."""
+        groups, names = self.parts.model.state_groups, self.parts.model.state_names
+        if "velocity" in groups:
+            return names.index(groups["velocity"][0])
+        return self.axes[0] if self.axes else None
+
+    def told(self) -> list[dict[str, Any]]:
+        """Return the knobs as the page takes them."""
+        units = self.parts.model.state_units
+        wind = "" if self.windward is None else units[self.windward]
+        texts = {
+            "coupling": ("coupling c", ""),
+            "feedforward": ("feed-forward", ""),
+            "size": ("formation size", "\u00d7"),
+            "turn": ("formation turn", "\u00b0"),
+            "wind": ("wind", f"{wind}/s".replace("m/s/s", "m/s\u00b2") if wind else ""),
+        }
+        return [
+            {
+                "name": name,
+                "text": texts[name][0],
+                "unit": texts[name][1],
+                "low": span.low,
+                "high": span.high,
+                "log": span.logarithmic,
+                "value": getattr(self.start, name),
+            }
+            for name, span in self.ranges.items()
+        ]
+
+    def turned(self, knobs: Knobs, name: str, value: float) -> Knobs:
+        """Return the knobs with one of them at a value, clamped.
+
+        Raises:
+            SimulationError: there is no such knob, or the value is no number.
+        """
+        if name not in self.ranges:
+            raise SimulationError(
+                f"there is no knob `{name}`{did_you_mean(name, self.ranges)}; this scenario has "
+                f"{listing(self.ranges)}."
+            )
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
+            raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
+        return knobs._replace(**{name: round(self.ranges[name].clamp(value), 9)})
+
+    def offsets(self, knobs: Knobs) -> Array:
+        """Return the offsets (N, n) of the formation as it stands, about its first leader."""
+        offsets = np.array(self.parts.formation.offsets, np.float64)
+        middle = offsets[self.parts.graph.leaders[0], self.axes]
+        places = knobs.size * (offsets[:, self.axes] - middle)
+        if len(self.axes) > 1:
+            angle = np.deg2rad(knobs.turn)
+            c, s = np.cos(angle), np.sin(angle)
+            places[:, :2] = places[:, :2] @ np.array([[c, s], [-s, c]])
+        offsets[:, self.axes] = middle + places
+        return offsets
+
+    def wind(self, knobs: Knobs) -> Array:
+        """Return the lasting wind (n,) with what the knob adds."""
+        known, model = self.parts.world.disturbance, self.parts.model
+        wind = model.per_state({} if known is None else known.constant)
+        if self.windward is not None:
+            wind[self.windward] += knobs.wind
+        return wind
+
+    def slowest(self, knobs: Knobs) -> float | None:
+        """Return the slowest mode (1/s) near the trim under a gain; None without one."""
+        gain, graph = self.parts.drive.gain, self.parts.graph
+        if gain is None or knobs.coupling is None:
+            return None
+        kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
+        i, j = graph.edges[kept].T
+        heavy, count = graph.weights[kept], graph.agents
+        A = sp.coo_array((heavy, (i, j)), shape=(count, count)).toarray()
+        L = np.diag((A + A.T).sum(axis=1)) - A - A.T
+        rows = list(graph.followers)
+        values = np.linalg.eigvalsh(L[np.ix_(rows, rows)])
+        with precision("float64"):
+            A, B = linearize(self.parts.model).with_inner(gain.inner)
+        K = gain.R_inverse @ B.T @ gain.P
+        # The extreme ones and some between: of a thousand the rest would take seconds.
+        few = values[np.unique(np.linspace(0, len(values) - 1, 40).astype(int))]
+        poles = np.linalg.eigvals(A - knobs.coupling * few[:, None, None] * (B @ K))
+        return float(poles.real.max())
+
+    # ---- the scenario that says the same --------------------------------------------------------
+
+    def standing(self, knobs: Knobs) -> Scenario:
+        """Return the scenario with the knobs as they stand: what is promised is asked of it.
+
+        Raises:
+            ScenarioError: it is refused, as where a cut has parted the graph.
+        """
+        data = self._data()
+        # With another graph a method would choose another coupling.
+        if knobs.coupling is not None and (knobs.cut or knobs.coupling != self.start.coupling):
+            data.setdefault("follower", {}).setdefault("gain", {})["coupling"] = knobs.coupling
+            if "file" in data["follower"]["gain"]:
+                data["follower"]["gain"] = self._given(knobs.coupling)
+        if not knobs.feedforward:
+            data.setdefault("follower", {})["feedforward"] = "none"
+        if knobs.cut:
+            data["graph"] = self._graph(knobs)
+        if (knobs.size, knobs.turn) != (1.0, 0.0):
+            offsets = self.offsets(knobs)
+            rows = {i: offsets[i, self.axes].tolist() for i in np.flatnonzero(offsets.any(axis=1))}
+            data["formation"] = {"offsets": rows}
+        if knobs.wind and self.windward is not None:
+            name = self.parts.model.state_names[self.windward]
+            constant = data.setdefault("disturbance", {}).setdefault("constant", {})
+            constant[name] = constant.get(name, 0.0) + knobs.wind
+        return scenario_from_mapping(data, self.scenario.folder)
+
+    def _data(self) -> dict[str, Any]:
+        """Return the scenario's data, without what was done live."""
+        data = copy.deepcopy(self.scenario.data)
+        data.pop("live", None)
+        return data
+
+    def _given(self, coupling: float) -> dict[str, Any]:
+        gain = self.parts.drive.gain
+        assert gain is not None
+        P, R = gain.P.tolist(), gain.R.tolist()
+        return {"method": "given", "P": P, "R": R, "coupling": coupling}
+
+    def _graph(self, knobs: Knobs) -> dict[str, Any]:
+        graph = self.parts.graph
+        kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
+        edges = [
+            [*pair, weight]
+            for pair, weight in zip(
+                graph.edges[kept].tolist(), graph.weights[kept].tolist(), strict=True
+            )
+        ]
+        return {"edges": edges, "leaders": list(graph.leaders), "agents": graph.agents}
+
+    def saved(self, events: Sequence[Mapping[str, Any]]) -> str:
+        """Return the YAML of the scenario with what was done live, which it repeats."""
+        data = self._data()
+        # It may be written elsewhere than where the files that it names are.
+        for path, file, rest in list(named_files(data, ())):
+            place: Any = data
+            for key in path[:-1]:
+                place = place[key]
+            place[path[-1]] = f"{(self.scenario.folder / file).resolve()}{rest}"
+        return dump_yaml({**data, "live": [dict(event) for event in events]})

@@ -1,0 +1,155 @@
+"""Who hears whom, and the poles into which the disagreement splits."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.plots import style as draw
+from echelon.plots.agents import pen_of
+from echelon.results.recording import Modes, Recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_NUMBERED = 60
+"""With more agents than this, numbers would cover each other."""
+
+
+def modes(run: Recording) -> "Figure | None":
+    """Return the poles of every mode looked at; None where laws have no linearization."""
+    return None if run.modes is None else poles(run.modes)
+
+
+def poles(found: Modes) -> "Figure":
+    """Return poles in the complex plane, coloured by the eigenvalue of the graph."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    values, (real, imaginary) = found.eigenvalues, (np.real(found.poles), np.imag(found.poles))
+    width = draw.page().width
+    figure = Figure((width, 0.6 * width), layout="constrained")
+    ax = figure.add_subplot()
+    colour = np.repeat(values, real.shape[1])
+    norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
+    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
+    dots = ax.scatter(real.ravel(), imaginary.ravel(), 34, colour, **look)
+    ax.axvline(0.0, color=draw.EDGE, linewidth=0.9, zorder=2)
+    slowest = float(real.max())
+    ax.axvline(slowest, color=draw.COLOURS[1], linewidth=0.9, linestyle=(0, (4, 2)), zorder=2)
+    _wide_axis(ax, real, imaginary)
+    ax.set_xlabel("real part (1/s)")
+    ax.set_ylabel("imaginary part (rad/s)")
+    _name_slowest(ax, slowest)
+    bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
+    bar.set_label("eigenvalue \u03bb of the graph")
+    _label_bar(bar, values)
+    return figure
+
+
+def _name_slowest(ax: Any, slowest: float) -> None:
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
+    near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
+    look = {"va": "top", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
+    ax.annotate(f"slowest: {slowest:.3g} 1/s", (slowest, 1.0), (4, -4), **look, **near)
+
+
+def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
+    """Use scales that show slow and fast poles alike, and end a little right of the axis."""
+    from matplotlib.ticker import FuncFormatter
+
+    sizes, heights = np.abs(real), np.abs(imaginary)
+    least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
+    right = max(0.0, float(real.max()))
+    if most > 30.0 * least:
+        ax.set_xscale("symlog", linthresh=least, linscale=0.6)
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
+    else:
+        ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
+    turning = heights[heights > 1e-9 * most]
+    if turning.size and heights.max() > 30.0 * np.median(turning):
+        ax.set_yscale("symlog", linthresh=float(np.median(turning)))
+    if not turning.size:
+        ax.set_ylim(-1.0, 1.0)
+
+
+def _label_bar(bar: Any, values: Array) -> None:
+    """Name each eigenvalue on the colour bar where they are few, else only powers of ten."""
+    from matplotlib.ticker import NullLocator
+
+    if len(values) <= 8:
+        bar.set_ticks(values, labels=[f"{value:.3g}" for value in values])
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+
+
+# ---- the graph --------------------------------------------------------------------------------
+
+
+def network(run: Recording) -> "Figure":
+    """Return who hears whom: agents where the formation puts them, or around a circle.
+
+    An arrow goes from a leader to who hears it; a line without one is heard both ways.
+    """
+    from matplotlib.figure import Figure
+
+    places, units = _places(run)
+    size = np.ptp(places, axis=0)
+    width = draw.page().width * (1.0 if draw.page().narrow else 0.75)
+    tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
+    figure = Figure((width, 0.75 + 0.85 * width * tall), layout="constrained")
+    ax = figure.add_subplot()
+    small = draw.crowding(run.agents) ** 0.3
+    _links(ax, run, places, small)
+    for agent in range(run.agents):
+        leads = agent in run.leaders
+        look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
+        draw.plot(ax, places[agent][None], **look)
+    for agent in range(run.agents if run.agents <= _NUMBERED else 0):
+        text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
+        ax.annotate(str(agent), places[agent], ha="center", va="center", **text)
+    _finish_network(ax, places, units)
+    return figure
+
+
+def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
+    """Return where agents are drawn (N, 2), with the axes' texts where these are places."""
+    offsets = run.offsets[:, list(run.position)]
+    spread = np.ptp(offsets, axis=0) if run.position else np.zeros(0)
+    axes = np.argsort(-spread, kind="stable")[:2]
+    apart = len(np.unique(offsets.round(9), axis=0)) == run.agents
+    if len(axes) == 2 and spread[axes[1]] > 1e-9 and apart:
+        axes = np.sort(axes)
+        names = [run.state_names[run.position[k]] for k in axes]
+        return offsets[:, axes], tuple(f"{name} offset (m)" for name in names)
+    turn = 2.0 * np.pi * np.arange(run.agents) / run.agents
+    return np.column_stack([np.sin(turn), np.cos(turn)]), ()
+
+
+def _links(ax: Any, run: Recording, places: Array, small: float) -> None:
+    """Draw the edges, thicker where they weigh more."""
+    from matplotlib.collections import LineCollection
+
+    heavy = np.sqrt(run.weights / run.weights.max())
+    wide = np.clip(1.6 * heavy, 0.3, 1.6) * small
+    pairs = places[run.edges]
+    ax.add_collection(LineCollection(list(pairs), linewidths=wide, colors="0.55", zorder=1))
+    leads = {*run.leaders}
+    if run.mutual or run.agents > _NUMBERED:
+        return
+    for (i, j), line in zip(run.edges, wide, strict=True):
+        first, second = (i, j) if i in leads else (j, i)
+        if first in leads and second not in leads:
+            arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0}
+            ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+
+
+def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:
+    low, high = places.min(axis=0), places.max(axis=0)
+    room = 0.08 * float((high - low).max()) or 1.0
+    ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    ax.set_aspect("equal")
+    if units:
+        ax.set(xlabel=units[0], ylabel=units[1])
+    else:
+        ax.axis("off")

@@ -1,0 +1,1 @@
+"""Pages in the browser: a run as a replay, and a loop that runs while one watches."""

@@ -1,0 +1,66 @@
+"""The page: one HTML file with its code and its data inside, deflated."""
+
+import base64
+import zlib
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Final
+
+from echelon.core.errors import MissingExtraError
+
+_HERE: Final = Path(__file__).resolve().parent / "page"
+_BUNDLE, _LICENSE = "three.min.js", "three.LICENSE.txt"
+_SCRIPTS = (
+    "run.js",
+    "shaders.js",
+    "shapes.js",
+    "surroundings.js",
+    "scene.js",
+    "chart.js",
+    "controls.js",
+    "live.js",
+    "replay.js",
+)
+
+
+def page(title: str, data: bytes) -> str:
+    """Return a page that draws deflated data, such as `pack` makes.
+
+    Raises:
+        MissingExtraError: three.js is not built, as in a fresh clone.
+    """
+    html = Template(_read("page.html"))
+    return html.substitute(
+        title=escape(f"{title} \u00b7 echelon"),
+        style=_read("page.css"),
+        code=_text(zlib.compress(_code().encode(), 9)),
+        data=_text(data),
+    )
+
+
+def check_page() -> None:
+    """Check that pages can be made.
+
+    Raises:
+        MissingExtraError: three.js is not built, as in a fresh clone.
+    """
+    if not (_HERE / _BUNDLE).is_file():
+        raise MissingExtraError(
+            "the page's three.js is not built in this copy of echelon; `python3 dev.py setup` in "
+            "its folder builds it, and installed wheels hold it."
+        )
+
+
+def _code() -> str:
+    check_page()
+    parts = [_read(_BUNDLE), f"/* three.js:\n{_read(_LICENSE)}*/", *map(_read, _SCRIPTS)]
+    return "\n".join(parts)
+
+
+def _read(name: str) -> str:
+    return (_HERE / name).read_text("utf-8")
+
+
+def _text(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

@@ -1,0 +1,164 @@
+// Curves over time on a canvas that is drawn once; the cursor is an element that moves over it.
+
+const RAISED = "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079";
+const raise = (k) => "10" + (k < 0 ? "\u207b" : "") + [...String(Math.abs(k))].map((digit) => RAISED[digit]).join("");
+const MARGIN = { left: 46, right: 14, top: 6, bottom: 20 };
+
+// A number in three digits, as a person writes it.
+function brief(value) {
+  if (!Number.isFinite(value)) return "\u2013";
+  const size = Math.abs(value);
+  if (size && (size < 1e-3 || size >= 1e5)) {
+    const power = Math.floor(Math.log10(size));
+    return `${(value / 10 ** power).toFixed(1)}\u00b7${raise(power)}`.replace("-", "\u2212");
+  }
+  return value.toPrecision(3).replace("-", "\u2212");
+}
+
+class Chart {
+  // What is told of a chart: title, unit, log, lines, marks; what is done when a time is chosen.
+  constructor(element, told, seek) {
+    Object.assign(this, told);
+    this.element = document.createElement("figure");
+    this.element.className = "chart";
+    this.element.innerHTML = `<figcaption><b></b><span class="legend"></span></figcaption>
+      <div class="area"><canvas></canvas><div class="cursor"></div></div>`;
+    this.element.querySelector("b").textContent = this.unit ? `${this.title}, ${this.unit}` : this.title;
+    element.append(this.element);
+    this.canvas = this.element.querySelector("canvas");
+    this.cursor = this.element.querySelector(".cursor");
+    this.area = this.element.querySelector(".area");
+    this.makeLegend();
+    if (seek) this.listen(seek);
+    new ResizeObserver(() => this.draw()).observe(this.area);
+  }
+
+  makeLegend() {
+    const legend = this.element.querySelector(".legend");
+    this.readouts = this.lines.map((line) => {
+      if (line.name === null) return null;
+      const entry = document.createElement("span"), value = document.createElement("i");
+      entry.style.setProperty("--colour", this.colour(line));
+      entry.className = line.dash ? "dashed" : "";
+      entry.append(line.name, " ", value);
+      legend.append(entry);
+      return value;
+    });
+  }
+
+  colour({ colour }) {
+    return typeof colour === "number" ? PALETTE[colour % PALETTE.length] : `var(--${colour})`;
+  }
+
+  listen(seek) {
+    const choose = (event) => {
+      const box = this.area.getBoundingClientRect();
+      const part = (event.clientX - box.left - MARGIN.left) / (box.width - MARGIN.left - MARGIN.right);
+      const [low, high] = this.span();
+      seek(low + Math.max(0, Math.min(1, part)) * (high - low));
+    };
+    this.area.addEventListener("pointerdown", (event) => {
+      this.area.setPointerCapture(event.pointerId);
+      choose(event);
+    });
+    this.area.addEventListener("pointermove", (event) => event.buttons && choose(event));
+  }
+
+  span() {
+    const { times } = this;
+    return times.length > 1 ? [times[0], times[times.length - 1]] : [0, 1];
+  }
+
+  // The values between which the axis goes; of a logarithmic one the exponents.
+  reach() {
+    let [low, high] = [Infinity, -Infinity];
+    const take = (y) => Number.isFinite(y) && ((low = Math.min(low, y)), (high = Math.max(high, y)));
+    for (const line of this.lines) if (!line.bound) line.values.forEach(take);
+    for (const mark of this.marks) take(this.log ? Math.log10(mark.value) : mark.value);
+    if (!(low <= high)) return this.log ? [-1, 0] : [0, 1];
+    if (this.log) return high - low > 2 ? [low - 0.15, high + 0.25] : [Math.floor(low - 0.05), Math.ceil(high + 0.05)];
+    const room = 0.06 * (high - low) || Math.max(1e-6, 0.1 * Math.abs(high));
+    return [low - room, high + room];
+  }
+
+  draw() {
+    const [w, h] = [this.area.clientWidth, this.area.clientHeight], ratio = Math.min(2, devicePixelRatio);
+    if (!w || !h) return;
+    Object.assign(this.canvas, { width: Math.round(w * ratio), height: Math.round(h * ratio) });
+    const pen = this.canvas.getContext("2d"), [low, high] = this.reach(), [first, last] = this.span();
+    pen.scale(ratio, ratio);
+    pen.font = "11px system-ui, sans-serif";
+    this.x = (t) => MARGIN.left + ((t - first) / (last - first || 1)) * (w - MARGIN.left - MARGIN.right);
+    this.y = (v) => h - MARGIN.bottom - ((v - low) / (high - low)) * (h - MARGIN.top - MARGIN.bottom);
+    this.drawGrid(pen, low, high, first, last, w, h);
+    pen.save();
+    pen.beginPath();
+    pen.rect(MARGIN.left, MARGIN.top - 2, w - MARGIN.left - MARGIN.right, h - MARGIN.top - MARGIN.bottom + 4);
+    pen.clip();
+    this.drawMarks(pen, w);
+    for (const line of this.lines) this.drawLine(pen, line);
+    pen.restore();
+    if (this.now !== undefined) this.point(this.now);
+  }
+
+  drawGrid(pen, low, high, first, last, w, h) {
+    const across = niceStep(last - first || 1, Math.max(2, w / 80));
+    const step = this.log ? Math.max(1, Math.ceil((high - low) / Math.max(2, h / 26))) : niceStep(high - low, Math.max(2, h / 34));
+    Object.assign(pen, { strokeStyle: themeColour("--grid"), lineWidth: 1, fillStyle: themeColour("--faint"), textAlign: "right", textBaseline: "middle" });
+    for (const value of ticks(low, high, step)) {
+      const y = Math.round(this.y(value)) + 0.5;
+      pen.beginPath();
+      pen.moveTo(MARGIN.left, y);
+      pen.lineTo(w - MARGIN.right, y);
+      pen.stroke();
+      pen.fillText(this.log ? raise(Math.round(value)) : shown(value, step), MARGIN.left - 6, y);
+    }
+    Object.assign(pen, { textAlign: "center", textBaseline: "bottom" });
+    const marks = ticks(first, last, across);
+    marks.forEach((t, k) => pen.fillText(shown(t, across) + (k === marks.length - 1 ? " s" : ""), this.x(t), h - 1));
+  }
+
+  drawMarks(pen, w) {
+    for (const mark of this.marks) {
+      const y = this.y(this.log ? Math.log10(mark.value) : mark.value);
+      Object.assign(pen, { strokeStyle: themeColour("--cut"), fillStyle: themeColour("--cut"), lineWidth: 1, textAlign: "right", textBaseline: mark.below ? "top" : "bottom" });
+      pen.setLineDash([4, 3]);
+      pen.beginPath();
+      pen.moveTo(MARGIN.left, y);
+      pen.lineTo(w - MARGIN.right, y);
+      pen.stroke();
+      pen.setLineDash([]);
+      pen.fillText(mark.name, w - MARGIN.right - 2, y + (mark.below ? 2 : -2));
+    }
+  }
+
+  drawLine(pen, line) {
+    const style = this.colour(line), name = style.startsWith("var(") ? style.slice(4, -1) : null;
+    Object.assign(pen, { strokeStyle: name ? themeColour(name) : style, lineWidth: line.dash ? 1.3 : 1.5, lineJoin: "round" });
+    pen.setLineDash(line.dash ? [5, 3] : []);
+    pen.beginPath();
+    let up = true;
+    line.values.forEach((value, k) => {
+      if (!Number.isFinite(value)) return void (up = true);
+      const at = [this.x(this.times[k]), this.y(value)];
+      if (up) pen.moveTo(...at);
+      pen.lineTo(...at);
+      up = false;
+    });
+    pen.stroke();
+    pen.setLineDash([]);
+  }
+
+  // Put the cursor at a time, and tell the values there.
+  point(time) {
+    this.now = time;
+    if (!this.x) return;
+    this.cursor.style.transform = `translateX(${this.x(time).toFixed(1)}px)`;
+    const k = Math.max(0, Math.min(this.times.length - 1, upper(this.times, time) - 1));
+    this.lines.forEach((line, place) => {
+      const value = line.values[k];
+      if (this.readouts[place] && !line.mute)
+        this.readouts[place].textContent = Number.isFinite(value) ? brief(this.log ? 10 ** value : value) : this.log ? "0" : "";
+    });
+  }
+}

@@ -1,0 +1,133 @@
+// What replay and live page share: the frame of the page, view buttons, the card of an agent.
+
+const $ = (selector) => document.querySelector(selector);
+
+function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+const ICONS = { play: "M3 1.5l11 6.5-11 6.5z", pause: "M3 1.5h3.5v13H3zM9.5 1.5H13v13H9.5z" };
+
+function icon(name) {
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  svg.setAttribute("viewBox", "0 0 16 16");
+  svg.innerHTML = `<path d="${ICONS[name]}"/>`;
+  return svg;
+}
+
+function tellPromise({ state, short, whole }) {
+  const badge = $(".promise");
+  badge.classList.remove("holds", "edge", "lost", "asking");
+  badge.classList.add(state);
+  badge.querySelector("b").textContent = short;
+  badge.querySelector(".whole").textContent = whole;
+}
+
+function dress(run) {
+  $("h1").textContent = run.title;
+  $(".facts").textContent = run.facts.join(" \u00b7 ");
+  $(".notes").textContent = run.notes.join(" ");
+  if (run.promise) tellPromise(run.promise);
+  else $(".promise").hidden = true;
+  const key = $(".key"), say = (look, words) => key.append(make("span", {}, look, words));
+  if (run.thrust) say(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
+  if (run.agents > run.leaders.length) say(make("i", { class: "ring" }), "goal");
+  if (!run.mutual && run.agents <= 60) say(make("i", { class: "one" }), "from who is heard to who hears");
+  key.append(make("span", {}, run.drawn));
+}
+
+function setDark(dark) {
+  document.documentElement.classList.toggle("dark", dark);
+}
+
+// The buttons of the view, and what follows from them.
+class ViewControls {
+  constructor(view, charts, show) {
+    this.view = view;
+    this.show = show;
+    this.whom = null;
+    this.box = make("div", { class: "toggles" });
+    for (const name of ["links", "goals", "trails"]) this.toggle(name, (on) => (view.shared[name].value = on ? shares(view.run)[name] : 0));
+    if (view.labels.all.length) this.toggle("names", (on) => (view.labels.shown = on));
+    this.makeFollow();
+    const home = make("button", { title: "show all (h)" }, "show all");
+    home.addEventListener("click", () => this.home());
+    this.box.append(home);
+    setDark(matchMedia("(prefers-color-scheme: dark)").matches);
+    view.setTheme();
+    $("#theme").addEventListener("click", () => {
+      setDark(!document.documentElement.classList.contains("dark"));
+      view.setTheme();
+      for (const chart of charts()) chart.draw();
+    });
+    this.listen();
+  }
+
+  home() {
+    this.whom = null;
+    this.select.value = "";
+    this.view.home();
+  }
+
+  toggle(name, act) {
+    const button = make("button", { class: "toggle", "aria-pressed": "true" }, name);
+    button.addEventListener("click", () => {
+      const on = button.getAttribute("aria-pressed") !== "true";
+      button.setAttribute("aria-pressed", on);
+      act(on);
+      this.view.draw();
+    });
+    this.box.append(button);
+  }
+
+  makeFollow() {
+    const { run } = this.view, leads = new Set(run.leaders);
+    this.select = make("select", { title: "what the camera follows", "aria-label": "what the camera follows" });
+    const option = (value, words) => this.select.append(make("option", { value }, words));
+    option("", "camera at rest");
+    option("all", "follow all");
+    for (const i of run.agents <= 30 ? Array(run.agents).keys() : run.leaders.slice(0, 12)) option(i, leads.has(i) ? `follow leader ${i}` : `follow ${i}`);
+    this.select.addEventListener("change", () => {
+      const { value } = this.select;
+      this.whom = value === "" ? null : value === "all" ? "all" : Number(value);
+      this.view.moved = null;
+      this.show();
+    });
+    this.box.append(this.select);
+  }
+
+  // A click chooses the agent under it; a drag turns the camera.
+  listen() {
+    const { view } = this, canvas = view.renderer.domElement;
+    let from = null;
+    canvas.addEventListener("pointerdown", (event) => (from = [event.clientX, event.clientY]));
+    canvas.addEventListener("pointerup", (event) => {
+      if (!from || Math.hypot(event.clientX - from[0], event.clientY - from[1]) > 4) return;
+      const box = canvas.getBoundingClientRect(), [x, y] = [event.clientX - box.left, event.clientY - box.top];
+      const agent = view.agentAt(x, y), link = agent < 0 ? view.linkAt(x, y) : -1;
+      if (link >= 0 && this.onlink) return void this.onlink(link);
+      view.selected = agent;
+      this.show();
+    });
+  }
+
+  // After each moment: the camera and the card of who is selected.
+  update(moment) {
+    this.view.follow(moment, this.whom);
+    const card = $(".card"), { run, selected } = this.view;
+    card.hidden = selected < 0;
+    if (selected < 0) return;
+    const leads = run.leaders.includes(selected), p = moment.position, g = moment.goal, at = 3 * selected;
+    const away = Math.hypot(...[0, 1, 2].map((k) => (p[at + k] - g[at + k]) / [...run.space.stretch, 1][k]));
+    const others = run.edges.flatMap(([i, j], k) => (!this.view.alive[k] ? [] : i === selected ? [j] : j === selected ? [i] : []));
+    const hears = leads && !run.mutual ? "hears nobody" : others.length ? `hears ${others.slice(0, 8).join(", ")}${others.length > 8 ? " \u2026" : ""}` : "hears nobody";
+    const place = run.space.kind === "time" ? [p[at + 1] / run.space.stretch[1]] : [0, 1, 2].slice(0, run.space.names.length).map((k) => p[at + k] / [...run.space.stretch, 1][k]);
+    const unit = run.space.units[run.space.kind === "time" ? 1 : 0];
+    card.replaceChildren(make("b", {}, `${leads ? "leader" : "follower"} ${selected}`), make("span", {}, `at ${place.map((v) => v.toFixed(2)).join(", ")} ${unit}`), make("br"));
+    if (!leads) card.append(make("span", {}, `${brief(away)} ${unit} from its goal`), make("br"));
+    card.append(make("span", {}, hears));
+  }
+}

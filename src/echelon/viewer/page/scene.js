@@ -1,0 +1,329 @@
+// The scene: vehicles, links, goals and trails, drawn when something has changed and only then.
+
+const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"];
+
+// Whether the graphics card is a program on the processor.
+function isSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) throw new Error("this browser draws no WebGL 2");
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+}
+
+function rgb(colour) {
+  const c = new THREE.Color(colour);
+  c.convertLinearToSRGB();
+  return [c.r, c.g, c.b];
+}
+
+function themeColour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+// How opaque things are: a thousand lines are a haze.
+function shares(run) {
+  return run.agents > 200 ? { links: 0.3, goals: 1, trails: 0.5 } : { links: 1, goals: 1, trails: 0.95 };
+}
+
+class View {
+  constructor(element, run) {
+    this.element = element;
+    this.run = run;
+    this.flat = run.space.kind !== "space";
+    this.software = isSoftware();
+    this.renderer = new THREE.WebGLRenderer({ antialias: !this.software, alpha: true, powerPreference: "high-performance" });
+    this.backdrop = new Backdrop(this);
+    element.prepend(this.backdrop.canvas, this.renderer.domElement);
+    this.scene = new THREE.Scene();
+    this.sharpness = this.wanted = 1;
+    this.makeState();
+    this.makeUniforms();
+    this.makeMeshes();
+    this.makeCamera();
+    this.labels = new Labels(this);
+    this.selected = -1;
+    new ResizeObserver(() => this.resize()).observe(element);
+    this.setTheme();
+    this.resize();
+  }
+
+  // ---- what is drawn ----
+
+  makeState() {
+    const { agents } = this.run, rows = Math.ceil(agents / COLUMNS);
+    this.state = new Float32Array(4 * TEXELS * COLUMNS * rows);
+    this.texture = new THREE.DataTexture(this.state, TEXELS * COLUMNS, rows, THREE.RGBAFormat, THREE.FloatType);
+  }
+
+  makeUniforms() {
+    const value = (x) => ({ value: x });
+    this.shared = {
+      state: value(this.texture),
+      size: value([1, 1]),
+      pixels: value(1.6),
+      floor_: value(this.run.box.low[2]),
+      links: value(shares(this.run).links),
+      goals: value(1),
+      trails: value(shares(this.run).trails),
+      now: value(0),
+      window: value(1),
+    };
+    for (const name of ["shadow", "goalColour", "linkColour", "cutColour", "plain"]) this.shared[name] = value([0, 0, 0]);
+  }
+
+  material(code, more = {}) {
+    const all = { uniforms: this.shared, glslVersion: THREE.GLSL3, side: THREE.DoubleSide, ...code, ...more };
+    return new THREE.ShaderMaterial(all);
+  }
+
+  add(geometry, material, order) {
+    const mesh = new THREE.Mesh(geometry, material);
+    mesh.frustumCulled = false;
+    mesh.renderOrder = order;
+    this.scene.add(mesh);
+    return mesh;
+  }
+
+  makeMeshes() {
+    const { run } = this, lines = { transparent: true, depthWrite: false };
+    this.add(swarm(run.shape, run.agents, run.space.kind), this.material(VEHICLE), 2);
+    this.halo = this.add(halo(this.flat), this.material(VEHICLE), 3);
+    this.makeLinks(lines);
+    this.makeTrails(lines);
+  }
+
+  makeLinks(lines) {
+    const { run } = this, leads = new Set(run.leaders), few = run.agents <= 60;
+    // From who speaks alone to who hears; between two that hear each other the order is nothing.
+    const ends = run.edges.map(([i, j]) => (!run.mutual && leads.has(j) && !leads.has(i) ? [j, i] : [i, j]));
+    const kinds = ends.map(([i, j]) => (!run.mutual && leads.has(i) && !leads.has(j) ? 1 : 0));
+    if (few) for (let i = 0; i < run.agents; i++) {
+      if (run.nearest[i] !== i) (ends.push([i, i]), kinds.push(2));
+      if (!this.flat) (ends.push([i, i]), kinds.push(3));
+    }
+    const geometry = ribbons(ends.length, {
+      ends: [2, (r) => ends[r]],
+      kind: [1, (r) => [kinds[r]]],
+      alive: [1, () => [1]],
+    });
+    this.links = this.add(geometry, this.material(LINK, lines), 1);
+    this.alive = run.edges.map(() => true);
+  }
+
+  makeTrails(lines) {
+    this.trail = new Trail(this.run, this.flat);
+    this.trailMesh = this.add(this.trail.geometry, this.material(TRAIL, lines), 0);
+    this.shared.window.value = this.trail.seconds;
+  }
+
+  setLink(edge, alive) {
+    if (this.alive[edge] === alive) return;
+    this.alive[edge] = alive;
+    const part = this.links.geometry.getAttribute("alive");
+    part.array.fill(alive ? 1 : 0, 4 * edge, 4 * edge + 4);
+    part.needsUpdate = true;
+    this.draw();
+  }
+
+  // ---- camera ----
+
+  makeCamera() {
+    const { low, high } = this.run.box;
+    this.middle = new THREE.Vector3(...low.map((value, k) => (value + high[k]) / 2));
+    this.reach = Math.max(...high.map((value, k) => value - low[k]));
+    this.camera = this.flat
+      ? new THREE.OrthographicCamera(-1, 1, 1, -1, -1000 * this.reach, 1000 * this.reach)
+      : new THREE.PerspectiveCamera(32, 1, this.reach / 500, this.reach * 60);
+    this.camera.up.set(0, this.flat ? 1 : 0, this.flat ? 0 : 1);
+    this.orbit = new THREE.OrbitControls(this.camera, this.renderer.domElement);
+    Object.assign(this.orbit, { enableRotate: !this.flat, screenSpacePanning: this.flat, zoomToCursor: this.flat });
+    if (this.flat) this.orbit.mouseButtons = { LEFT: 2, MIDDLE: 1, RIGHT: 2 };
+    if (this.flat) this.orbit.touches = { ONE: 1, TWO: 2 };
+    this.orbit.maxPolarAngle = 0.495 * Math.PI;
+    this.orbit.addEventListener("change", () => this.draw());
+    this.home();
+  }
+
+  // Look at everything.
+  home() {
+    const { low, high } = this.run.box, [w, h] = [this.element.clientWidth || 16, this.element.clientHeight || 9];
+    this.orbit.target.copy(this.middle);
+    this.moved = null;
+    if (this.flat) {
+      this.camera.position.set(this.middle.x, this.middle.y, 10);
+      this.camera.zoom = 0.86 * Math.min(w / (high[0] - low[0]), h / (high[1] - low[1]));
+      this.camera.updateProjectionMatrix();
+    } else {
+      this.stand(w / h);
+    }
+    this.orbit.update();
+    this.draw();
+  }
+
+  // Stand so near that the box just fits, its middle in the middle of the picture.
+  stand(aspect) {
+    const back = new THREE.Vector3(0.42, -0.78, 0.47).normalize(), up = new THREE.Vector3(0, 0, 1);
+    const right = up.clone().cross(back).normalize(), high = back.clone().cross(right);
+    const tall = Math.tan((this.camera.fov * Math.PI) / 360) * 0.87, wide = tall * aspect;
+    const { low, high: top } = this.run.box, corners = [];
+    for (let k = 0; k < 8; k++) corners.push(new THREE.Vector3(...[0, 1, 2].map((axis) => ((k >> axis) & 1 ? top : low)[axis])).sub(this.middle));
+    let [x, y, away] = [0, 0, 0];
+    // Where the picture's middle is depends on how far off it is seen from.
+    for (let round = 0; round < 8; round++) {
+      away = Math.max(...corners.map((c) => Math.max(Math.abs(c.dot(right) - x) / wide, Math.abs(c.dot(high) - y) / tall) + c.dot(back)));
+      const seen = (axis) => corners.map((c) => c.dot(axis) / (away - c.dot(back)));
+      const middle = (values) => (Math.max(...values) + Math.min(...values)) / 2;
+      [x, y] = [away * middle(seen(right)), away * middle(seen(high))];
+    }
+    this.orbit.target.add(right.multiplyScalar(x)).add(high.multiplyScalar(y));
+    this.camera.position.copy(this.orbit.target).add(back.multiplyScalar(away));
+  }
+
+  // Keep an agent, or the middle of all, where it is on the screen; null lets go.
+  follow(moment, whom) {
+    if (whom === null) return void (this.moved = null);
+    const p = moment.position, at = new THREE.Vector3();
+    const { agents } = this.run, chosen = whom === "all" ? [...Array(agents).keys()] : [whom];
+    for (const i of chosen) at.add(new THREE.Vector3(p[3 * i], p[3 * i + 1], p[3 * i + 2]));
+    at.divideScalar(chosen.length);
+    const shift = at.clone().sub(this.moved ?? this.orbit.target);
+    this.camera.position.add(shift);
+    this.orbit.target.add(shift);
+    this.moved = at;
+    this.orbit.update();
+  }
+
+  resize() {
+    const [w, h] = [this.element.clientWidth, this.element.clientHeight];
+    if (!w || !h) return;
+    if (this.flat) {
+      const old = this.camera.right * 2 || w;
+      Object.assign(this.camera, { left: -w / 2, right: w / 2, top: h / 2, bottom: -h / 2 });
+      if (old === 2) this.home();
+    } else this.camera.aspect = w / h;
+    this.camera.updateProjectionMatrix();
+    this.backdrop.resize(w, h);
+    this.setSharpness(this.wanted = 1);
+    if (!this.sized) this.home();
+    this.sized = true;
+    this.draw();
+  }
+
+  setSharpness(sharpness) {
+    const ratio = sharpness * (this.software ? 1 : Math.min(2, devicePixelRatio));
+    const [w, h] = [this.element.clientWidth, this.element.clientHeight];
+    this.sharpness = sharpness;
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(w, h);
+    this.shared.size.value = [w, h];
+  }
+
+  // ---- drawing ----
+
+  setTheme() {
+    const uniforms = { shadow: "--shade", goalColour: "--goal", linkColour: "--link", cutColour: "--cut", plain: "--plain" };
+    for (const [name, colour] of Object.entries(uniforms)) this.shared[name].value = rgb(themeColour(colour));
+    const { run, state } = this, leader = rgb(themeColour("--leader"));
+    const leads = new Set(run.leaders), many = run.agents > 200;
+    let place = 0;
+    for (let i = 0; i < run.agents; i++) {
+      const colour = leads.has(i) ? leader : rgb(PALETTE[many ? 0 : place++ % PALETTE.length]);
+      state.set([...colour, run.size * (many && leads.has(i) ? 1.25 : 1)], 4 * this.texel(i, 3));
+    }
+    this.draw();
+  }
+
+  texel(agent, k) {
+    return Math.floor(agent / COLUMNS) * COLUMNS * TEXELS + (agent % COLUMNS) * TEXELS + k;
+  }
+
+  show(moment) {
+    const { state, run } = this, { position: p, turn: q, motors: m, goal: g } = moment;
+    for (let i = 0; i < run.agents; i++) {
+      let at = 4 * this.texel(i, 0);
+      state[at] = p[3 * i], state[at + 1] = p[3 * i + 1], state[at + 2] = p[3 * i + 2];
+      state[at + 3] = i === this.selected ? 1 : 0;
+      for (let k = 0; k < 4; k++) (state[at + 4 + k] = q[4 * i + k]), (state[at + 8 + k] = m[4 * i + k]);
+      at += 16;
+      state[at] = g[3 * i], state[at + 1] = g[3 * i + 1], state[at + 2] = g[3 * i + 2];
+      state[at + 3] = run.nearest[i] === i ? 0 : 1;
+    }
+    this.texture.needsUpdate = true;
+    this.halo.visible = this.selected >= 0;
+    if (this.halo.visible) {
+      const whose = this.halo.geometry.getAttribute("agent");
+      whose.array.fill(this.selected);
+      whose.needsUpdate = true;
+    }
+    this.shared.now.value = moment.time;
+    this.trail.window(this.trailMesh.geometry, moment.time);
+    this.moment = moment;
+    this.draw();
+  }
+
+  draw() {
+    if (this.asked) return;
+    this.asked = true;
+    requestAnimationFrame(() => this.render());
+  }
+
+  render() {
+    const began = performance.now();
+    this.asked = false;
+    if (this.wanted !== this.sharpness) this.setSharpness(this.wanted);
+    this.backdrop.draw();
+    this.renderer.render(this.scene, this.camera);
+    this.labels.place();
+    this.adapt(performance.now() - began, began);
+  }
+
+  // Fewer pixels while pictures follow each other too slowly, all of them again at rest.
+  adapt(took, now) {
+    const between = now - (this.last ?? 0);
+    this.last = now;
+    clearTimeout(this.rest);
+    const busy = between < 400 && Math.max(between, took) > 45;
+    this.slow = busy ? (this.slow ?? 0) + 1 : 0;
+    if (this.slow > 3 && this.sharpness > 0.5) (this.wanted = Math.max(0.5, 0.8 * this.sharpness)), (this.slow = 0);
+    if (this.wanted < 1) this.rest = setTimeout(() => ((this.wanted = 1), this.draw()), 400);
+  }
+
+  // Where a place of the scene is on the screen, in pixels; null behind the camera.
+  project(x, y, z) {
+    const v = new THREE.Vector3(x, y, z).project(this.camera);
+    if (v.z > 1 && !this.flat) return null;
+    return [(0.5 + 0.5 * v.x) * this.element.clientWidth, (0.5 - 0.5 * v.y) * this.element.clientHeight];
+  }
+
+  projectAgent(i) {
+    const p = this.moment.position;
+    return this.project(p[3 * i], p[3 * i + 1], p[3 * i + 2]);
+  }
+
+  // The agent nearest to a place on the screen, or -1.
+  agentAt(x, y) {
+    let found = -1, least = 24;
+    for (let i = 0; i < this.run.agents; i++) {
+      const at = this.projectAgent(i);
+      const away = at ? Math.hypot(at[0] - x, at[1] - y) : Infinity;
+      if (away < least) (found = i), (least = away);
+    }
+    return found;
+  }
+
+  // The link nearest to a place on the screen, or -1.
+  linkAt(x, y) {
+    let found = -1, least = 9;
+    this.run.edges.forEach(([i, j], edge) => {
+      const [a, b] = [this.projectAgent(i), this.projectAgent(j)];
+      if (!a || !b) return;
+      const [u, v] = [b[0] - a[0], b[1] - a[1]], length = u * u + v * v || 1;
+      const t = Math.max(0, Math.min(1, ((x - a[0]) * u + (y - a[1]) * v) / length));
+      const away = Math.hypot(a[0] + t * u - x, a[1] + t * v - y);
+      if (away < least) (found = edge), (least = away);
+    });
+    return found;
+  }
+}

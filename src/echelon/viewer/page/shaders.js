@@ -1,0 +1,118 @@
+// What the graphics card computes. The state of all agents is one texture, five texels an agent:
+// 0 place and mark, 1 attitude, 2 motors, 3 colour and size, 4 goal and whether it is shown.
+
+const COLUMNS = 64, TEXELS = 5;
+
+const FETCH = `
+uniform highp sampler2D state;
+vec4 texel(float agent, int k) {
+  int i = int(agent + 0.5);
+  return texelFetch(state, ivec2((i % ${COLUMNS}) * ${TEXELS} + k, i / ${COLUMNS}), 0);
+}`;
+
+// Blue over green and yellow to red, apart in lightness too, so that few colours need to be told.
+const THRUST = `
+vec3 thrust(float s) {
+  vec3 a = vec3(0.13, 0.29, 0.53), b = vec3(0.11, 0.60, 0.62), c = vec3(0.95, 0.77, 0.25), d = vec3(0.84, 0.27, 0.05);
+  s = clamp(s, 0.0, 1.0) * 3.0;
+  return s < 1.0 ? mix(a, b, s) : s < 2.0 ? mix(b, c, s - 1.0) : mix(c, d, s - 2.0);
+}`;
+
+// kind: 0 body, 1 to 4 a rotor, 5 shadow, 6 ring of the goal, 7 ring of who is selected, 8 dark part.
+const VEHICLE = {
+  vertexShader: `${FETCH}${THRUST}
+in float agent, kind;
+out vec3 shade;
+uniform float floor_, goals;
+uniform vec3 shadow, goalColour, plain;
+vec3 turned(vec4 q, vec3 v) { return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v); }
+void main() {
+  vec4 place = texel(agent, 0), q = texel(agent, 1), motors = texel(agent, 2), look = texel(agent, 3), goal = texel(agent, 4);
+  vec3 p = position * look.w, n = normal;
+  shade = look.rgb;
+  if (kind < 4.5 || kind > 7.5) {
+    p = place.xyz + turned(q, p);
+    n = turned(q, n);
+    float light = 0.62 + 0.38 * clamp(dot(n, normalize(vec3(0.3, -0.5, 0.85))), -0.6, 1.0);
+    if (kind > 0.5 && kind < 4.5) {
+      float s = motors[int(kind - 0.5)];
+      shade = s < 0.0 ? mix(look.rgb, plain, 0.55) : thrust(s);
+      light = 0.9 + 0.1 * n.z;
+    }
+    if (kind > 7.5) shade *= 0.55;
+    shade *= light;
+    if (place.w > 0.5) shade = mix(shade, vec3(1.0), 0.18);
+  } else if (kind < 5.5) {
+    p = vec3(place.xy + p.xy, floor_);
+    shade = shadow;
+  } else if (kind < 6.5) {
+    p = goal.xyz + p * goals * goal.w;
+    shade = goalColour;
+  } else {
+    p = place.xyz + p * place.w;
+  }
+  gl_Position = projectionMatrix * modelViewMatrix * vec4(p, 1.0);
+}`,
+  fragmentShader: `in vec3 shade; out vec4 colour; void main() { colour = vec4(shade, 1.0); }`,
+};
+
+// A line of so many pixels between two points: four corners, moved aside on the screen.
+const RIBBON = `
+uniform vec2 size;
+uniform float pixels;
+vec4 ribbon(vec3 first, vec3 second, vec2 corner, float wide) {
+  vec4 a = projectionMatrix * modelViewMatrix * vec4(first, 1.0);
+  vec4 b = projectionMatrix * modelViewMatrix * vec4(second, 1.0);
+  const float near = 0.01;
+  if (a.w < near && b.w > near) a = mix(a, b, (near - a.w) / (b.w - a.w));
+  if (b.w < near && a.w > near) b = mix(b, a, (near - b.w) / (a.w - b.w));
+  vec2 way = (b.xy / b.w - a.xy / a.w) * size;
+  way = length(way) > 1e-6 ? normalize(way) : vec2(1.0, 0.0);
+  vec4 end = corner.x < 0.5 ? a : b;
+  end.xy += vec2(-way.y, way.x) * corner.y * wide * pixels / size * end.w;
+  return end;
+}`;
+
+// Between agents (links), from an agent to its goal, and down to the floor.
+const LINK = {
+  vertexShader: `${FETCH}${RIBBON}
+in vec2 ends, corner;
+in float kind, alive;
+out vec4 shade;
+out float along;
+uniform float floor_, links, goals;
+uniform vec3 linkColour, cutColour, goalColour, shadow;
+void main() {
+  vec3 first = texel(ends.x, 0).xyz, second = texel(ends.y, 0).xyz;
+  float wide = kind < 0.5 ? 1.1 : 2.4 - 1.9 * corner.x;
+  bool cut = alive < 0.5;
+  shade = vec4(cut ? cutColour : linkColour, links * (cut ? 0.55 : 0.9));
+  along = cut ? corner.x : -1.0;
+  if (kind > 1.5) {
+    vec4 goal = texel(ends.x, 4);
+    second = kind < 2.5 ? goal.xyz : vec3(first.xy, floor_);
+    wide = kind < 2.5 ? 0.9 : 0.55;
+    shade = kind < 2.5 ? vec4(goalColour, 0.75 * goals * goal.w) : vec4(shadow, 1.0);
+  }
+  gl_Position = shade.a > 0.0 ? ribbon(first, second, corner, wide) : vec4(2.0, 2.0, 2.0, 1.0);
+}`,
+  fragmentShader: `in vec4 shade; in float along; out vec4 colour;
+void main() { if (along > 0.0 && fract(along * 14.0) > 0.5) discard; colour = shade; }`,
+};
+
+// Where an agent has been: the older, the paler.
+const TRAIL = {
+  vertexShader: `${FETCH}${RIBBON}
+in vec3 first, second;
+in float agent, when;
+in vec2 corner;
+out vec4 shade;
+uniform float now, window, trails;
+void main() {
+  float age = (now - when) / window;
+  shade = vec4(texel(agent, 3).rgb, trails * (1.0 - 0.85 * age));
+  bool shown = trails > 0.0 && age >= 0.0 && age <= 1.0;
+  gl_Position = shown ? ribbon(first, second, corner, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
+}`,
+  fragmentShader: `in vec4 shade; out vec4 colour; void main() { colour = shade; }`,
+};

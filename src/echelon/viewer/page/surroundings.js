@@ -1,0 +1,232 @@
+// What stands around the agents: trails, the grid with its numbers, names.
+
+// Trails: segments lie in the index buffer by time, so that the last seconds are one range of it.
+class Trail {
+  constructor(run, flat) {
+    const few = run.agents <= 12;
+    this.agents = run.agents;
+    this.live = !run.positions;
+    // A flock's are short: a thousand long ones would hide each other.
+    this.seconds = run.space.kind === "time" ? 1e9 : few ? Math.min(8, 0.4 * run.duration) : run.agents > 200 ? 1 : 3;
+    if (run.space.kind === "phase") this.seconds = Math.max(this.seconds, 0.3 * run.duration);
+    const apart = few ? 0.02 : run.agents > 200 ? 0.2 : 0.08;
+    this.stride = this.live ? 1 : Math.max(1, Math.round(apart / run.clock.step));
+    if (run.agents * (this.live ? 0 : run.frames / this.stride) > 4e5) this.stride = Math.ceil((run.agents * run.frames) / 4e5);
+    this.steps = this.live ? Math.ceil(this.seconds / run.clock.step) : Math.floor((run.frames - 1) / this.stride);
+    this.times = [];
+    this.geometry = this.live ? this.empty() : this.recorded(run);
+    this.geometry.setDrawRange(0, this.live ? Infinity : 0);
+  }
+
+  recorded(run) {
+    const places = [];
+    for (let s = 0; s <= this.steps; s++) {
+      this.times.push(run.timeOf(s * this.stride));
+      places.push(run.at(s * this.stride).position.slice());
+    }
+    const at = (r, later) => {
+      const s = Math.floor(r / this.agents), i = r % this.agents;
+      return places[s + later].subarray(3 * i, 3 * i + 3);
+    };
+    return ribbons(this.steps * this.agents, {
+      first: [3, (r) => at(r, 0)],
+      second: [3, (r) => at(r, 1)],
+      agent: [1, (r) => [r % this.agents]],
+      when: [1, (r) => [this.times[Math.floor(r / this.agents) + 1]]],
+    });
+  }
+
+  empty() {
+    this.next = 0;
+    return ribbons(this.steps * this.agents, {
+      first: [3, () => [0, 0, 0]],
+      second: [3, () => [0, 0, 0]],
+      agent: [1, (r) => [r % this.agents]],
+      when: [1, () => [-1e9]],
+    });
+  }
+
+  // In a stream the newest segments take the place of the oldest.
+  push(before, now, time) {
+    const parts = ["first", "second", "when"].map((name) => this.geometry.getAttribute(name));
+    const [first, second, when] = parts, base = 4 * this.agents * (this.next++ % this.steps);
+    for (let i = 0; i < this.agents; i++)
+      for (let k = 0; k < 4; k++) {
+        const at = base + 4 * i + k;
+        first.array.set(before.subarray(3 * i, 3 * i + 3), 3 * at);
+        second.array.set(now.subarray(3 * i, 3 * i + 3), 3 * at);
+        when.array[at] = time;
+      }
+    for (const part of parts) (part.addUpdateRange(base * part.itemSize, 4 * this.agents * part.itemSize), (part.needsUpdate = true));
+  }
+
+  forget() {
+    const when = this.geometry.getAttribute("when");
+    when.array.fill(-1e9);
+    when.needsUpdate = true;
+  }
+
+  window(geometry, time) {
+    if (this.live) return;
+    const end = upper(this.times, time), start = upper(this.times, time - this.seconds);
+    const first = Math.max(0, start - 1), last = Math.max(0, Math.min(this.steps, end - 1));
+    geometry.setDrawRange(6 * this.agents * first, 6 * this.agents * Math.max(0, last - first));
+  }
+}
+
+// How many of sorted numbers are at most a value.
+function upper(sorted, value) {
+  let [low, high] = [0, sorted.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (sorted[middle] <= value + 1e-9) low = middle + 1;
+    else high = middle;
+  }
+  return low;
+}
+
+// A step of 1, 2 or 5 times a power of ten, of which about so many fit.
+function niceStep(range, count) {
+  const power = 10 ** Math.floor(Math.log10(range / count));
+  return power * [1, 2, 5, 10].find((m) => m * power * count >= range * 0.999);
+}
+
+function ticks(low, high, step) {
+  const out = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) out.push(k * step);
+  return out;
+}
+
+function shown(value, step) {
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  return (Math.abs(value) < step / 2 ? 0 : value).toFixed(digits).replace("-", "\u2212");
+}
+
+// The grid with its numbers, on a canvas behind the scene.
+class Backdrop {
+  constructor(view) {
+    this.view = view;
+    this.canvas = document.createElement("canvas");
+    this.canvas.className = "backdrop";
+  }
+
+  resize(w, h) {
+    const ratio = Math.min(2, devicePixelRatio);
+    [this.w, this.h, this.ratio, this.key] = [w, h, ratio, ""];
+    this.canvas.width = Math.round(w * ratio);
+    this.canvas.height = Math.round(h * ratio);
+  }
+
+  draw() {
+    const { camera, orbit } = this.view;
+    const key = [...camera.position, ...orbit.target, camera.zoom, this.w, this.h, themeColour("--grid")].join();
+    if (key === this.key) return;
+    this.key = key;
+    const pen = (this.pen = this.canvas.getContext("2d"));
+    pen.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    pen.clearRect(0, 0, this.w, this.h);
+    pen.font = "11px system-ui, sans-serif";
+    pen.fillStyle = themeColour("--faint");
+    if (this.view.flat) this.drawFlat();
+    else this.drawFloor();
+  }
+
+  line(a, b, strong) {
+    if (!a || !b) return;
+    const { pen } = this;
+    pen.strokeStyle = themeColour(strong ? "--axis" : "--grid");
+    pen.lineWidth = 1;
+    pen.beginPath();
+    pen.moveTo(...a);
+    pen.lineTo(...b);
+    pen.stroke();
+  }
+
+  text(words, x, y, align, base = "middle") {
+    Object.assign(this.pen, { textAlign: align, textBaseline: base });
+    this.pen.fillText(words, x, y);
+  }
+
+  // Lines right through the view, with numbers at the left and below.
+  drawFlat() {
+    const { view, w, h } = this, { space } = view.run, [sx, sy] = space.stretch;
+    const half = [w, h].map((size) => size / 2 / view.camera.zoom), at = view.camera.position;
+    const range = [[at.x - half[0], at.x + half[0], sx], [at.y - half[1], at.y + half[1], sy]];
+    const [xs, ys] = range.map(([low, high, s], k) => {
+      const step = niceStep((high - low) / s, [w / 90, h / 60][k]);
+      return ticks(low / s, high / s, step).map((value) => [value, s * value, step]);
+    });
+    for (const [value, x] of xs) this.line([view.project(x, 0, 0)[0], 0], [view.project(x, 0, 0)[0], h], !value);
+    for (const [value, y] of ys) this.line([0, view.project(0, y, 0)[1]], [w, view.project(0, y, 0)[1]], !value);
+    for (const [value, x, step] of xs) this.text(shown(value, step), view.project(x, 0, 0)[0] + 4, h - 12, "left");
+    for (const [value, y, step] of ys) this.text(shown(value, step), 8, view.project(0, y, 0)[1] - 8, "left");
+    this.pen.fillStyle = themeColour("--ink");
+    const name = (k) => space.names[k].replaceAll("_", " ") + (space.units[k] ? `, ${space.units[k]}` : "");
+    this.text(name(0), w - 10, h - 28, "right");
+    this.text(name(1), 40, 14, "left");
+  }
+
+  // A floor somewhat larger than the box, numbered along the two sides that face the camera.
+  drawFloor() {
+    const { view } = this, { low, high } = view.run.box, floor = low[2], at = view.camera.position;
+    const size = Math.max(high[0] - low[0], high[1] - low[1]), step = niceStep(size, 8);
+    const [x, y] = [0, 1].map((k) => [Math.floor(low[k] / step + 0.2) * step, Math.ceil(high[k] / step - 0.2) * step]);
+    const put = (a, b) => view.project(a, b, floor);
+    for (const value of ticks(...x, step)) this.line(put(value, y[0]), put(value, y[1]), Math.abs(value) < step / 9);
+    for (const value of ticks(...y, step)) this.line(put(x[0], value), put(x[1], value), Math.abs(value) < step / 9);
+    const front = at.y < view.middle.y ? y[0] : y[1], side = at.x < view.middle.x ? x[0] : x[1];
+    const out = 0.35 * step, beyond = (edge, [a, b]) => edge + (edge === a ? -out : out);
+    const write = (words, place) => place && this.text(words, ...place, "center");
+    for (const value of ticks(...x, 2 * step)) write(shown(value, step), put(value, beyond(front, y)));
+    for (const value of ticks(...y, 2 * step)) write(shown(value, step), put(beyond(side, x), value));
+    this.pen.fillStyle = themeColour("--ink");
+    const { names, units } = view.run.space, unit = (k) => (units[k] ? `, ${units[k]}` : "");
+    write(names[0] + unit(0), put((x[0] + x[1]) / 2 + step / 2, beyond(beyond(front, y), y)));
+    write(names[1] + unit(1), put(beyond(beyond(side, x), x), (y[0] + y[1]) / 2 + step / 2));
+    this.drawHeight(step, front === y[0] ? y[1] : y[0], side, floor);
+  }
+
+  // The height, up from the corner beside the camera's view.
+  drawHeight(step, y, x, floor) {
+    const { view } = this, top = Math.max(view.run.box.high[2], floor + step);
+    const apart = niceStep(top - floor, 3), { names, units } = view.run.space;
+    const last = Math.ceil(top / apart - 1e-9) * apart;
+    this.line(view.project(x, y, floor), view.project(x, y, last), true);
+    this.pen.fillStyle = themeColour("--faint");
+    for (const value of ticks(floor + apart / 2, last, apart)) {
+      const at = view.project(x, y, value);
+      if (at) (this.line(at, [at[0] - 5, at[1]], true), this.text(shown(value, apart), at[0] - 8, at[1], "right"));
+    }
+    this.pen.fillStyle = themeColour("--ink");
+    const at = view.project(x, y, last);
+    if (at) this.text(names[2] + (units[2] ? `, ${units[2]}` : ""), at[0], at[1] - 10, "center");
+  }
+}
+
+// Names beside agents: of all where they are few, of leaders where names fit.
+class Labels {
+  constructor(view) {
+    const { run } = view, leads = new Set(run.leaders);
+    this.view = view;
+    this.shown = true;
+    const named = run.agents <= 12 ? [...Array(run.agents).keys()] : run.agents <= 60 ? run.leaders.slice(0, 12) : [];
+    this.all = named.map((agent) => {
+      const label = document.createElement("span");
+      label.className = leads.has(agent) ? "label leader" : "label";
+      label.textContent = leads.has(agent) ? (run.leaders.length > 1 ? `leader ${agent}` : "leader") : agent;
+      view.element.append(label);
+      return [agent, label];
+    });
+  }
+
+  place() {
+    const { view } = this, p = view.moment?.position;
+    if (!p) return;
+    for (const [agent, label] of this.all) {
+      const up = view.flat ? [0, 0.75 * view.run.size, 0] : [0, 0, 0.4 * view.run.size];
+      const at = view.project(...up.map((value, k) => p[3 * agent + k] + value));
+      label.hidden = !at || !this.shown;
+      if (at) label.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px) translate(-50%, -110%)`;
+    }
+  }
+}

@@ -1,0 +1,84 @@
+"""Runs that nobody simulated: recordings of chosen numbers, for tests of what draws them."""
+
+import numpy as np
+
+from echelon.results.recording import Bounds, Modes, Recording, Tracking
+
+PROMISE = {
+    "promised": True,
+    "sentence": "Promised, by linearization: all is well.",
+    "reasons": [],
+    "theorem": None,
+    "kind": "linearization",
+    "rate": 0.5,
+    "coupling": 2.0,
+    "hypotheses": [],
+    "certified_set": None,
+}
+NAMES = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
+
+
+def flown(agents=4, seconds=6.0, rate=50.0, leaders=(0,), **changes):
+    """Quadrotors that spiral to their goals beside a leader on a circle; a tree by default."""
+    times = np.arange(round(seconds * rate) + 1) / rate
+    side = int(np.ceil(np.sqrt(agents)))
+    offsets = np.zeros((agents, 12))
+    offsets[:, 0], offsets[:, 1] = np.divmod(np.arange(agents), side)
+    begin = np.random.default_rng(0).normal(size=(agents, 3))
+    begin[list(leaders)] = 0.0
+    turn = np.exp(-0.8 * times)[:, None, None]
+    states = np.zeros((len(times), agents, 12))
+    lead = np.stack([np.cos(times), np.sin(times), 1.5 + 0.2 * np.sin(2.0 * times)], axis=1)
+    states[:, :, :3] = lead[:, None] + offsets[:, :3] + turn * begin
+    states[:, :, 6:9] = 0.4 * np.sin(times)[:, None, None] * np.array([1.0, -0.5, 4.0])
+    inputs = 0.3 + 0.2 * np.sin(3.0 * times)[:, None, None] * np.ones((1, agents, 4))
+    return recorded(states, inputs, times, offsets, leaders=leaders, **changes)
+
+
+def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position=(0, 1, 2), **more):
+    """A recording with the rest made to fit."""
+    agents = states.shape[1]
+    nearest = np.array([max(k for k in leaders if k <= i) for i in range(agents)])
+    y = states - offsets
+    errors = y - y[:, nearest]
+    inputs_count = inputs.shape[2]
+    own = {
+        "name": "made up",
+        "model": "Quadrotor",
+        "reference": None,
+        "edges": np.array([[max(0, k - 2), k] for k in range(1, agents)]),
+        "mutual": False,
+        "state_units": tuple("m" if name in "xyz" else "" for name in names),
+        "input_names": tuple(f"u{k}" for k in range(inputs_count)),
+        "input_units": ("N",) * inputs_count,
+        "bounds": Bounds(np.eye(inputs_count), np.zeros(inputs_count), np.ones(inputs_count)),
+        "lyapunov": 0.5 * (errors**2).sum(axis=(1, 2)),
+        "lyapunov_rate": None,
+        "metric": None,
+        "limited": np.zeros(agents),
+        "tracking": None,
+        "modes": Modes(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
+        "promise": PROMISE,
+        "horizon": float(times[-1]),
+        "dt": 0.01,
+        "attributes": {"outcome": "completed", "message": "The run reached its horizon."},
+    } | more
+    own.setdefault("weights", np.ones(len(own["edges"])))
+    return Recording(
+        times=times,
+        states=states,
+        inputs=inputs,
+        errors=errors,
+        offsets=offsets,
+        leaders=leaders,
+        nearest=nearest,
+        state_names=names,
+        position=position,
+        **own,
+    )
+
+
+def tracked(run):
+    """A tracking error that shrinks, for the leaders of a recording."""
+    shrinks = np.exp(-run.times)[:, None, None] * np.ones((1, len(run.leaders), 2))
+    return Tracking(shrinks, ("x", "yaw"), ("m", "rad"))

@@ -1,0 +1,238 @@
+"""Figures that a recording is drawn as again: limits, promises, distances, and sizes of a page."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from recordings import PROMISE, flown, tracked
+
+from echelon.core.errors import OutputError
+from echelon.plots.run import NAMES, figures
+from echelon.plots.style import ONE_COLUMN, TWO_COLUMNS
+
+CERTIFIED = PROMISE | {
+    "theorem": "T1",
+    "kind": "proof",
+    "certified_set": {"radius": 9.0, "kind": "proof", "why": ""},
+    "hypotheses": [{"statement": "starts in the certified set", "verdict": "holds"}],
+}
+
+
+@pytest.fixture(scope="module")
+def run():
+    own = flown(seconds=4.0)
+    rate = np.gradient(own.lyapunov, own.times)
+    return dataclasses.replace(own, tracking=tracked(own), lyapunov_rate=rate)
+
+
+@pytest.fixture(scope="module")
+def flock():
+    return flown(60, 2.0, rate=20.0, leaders=tuple(range(0, 60, 20)))
+
+
+def lines_of(figure, place=0):
+    return {line.get_label(): line.get_xydata() for line in figure.axes[place].get_lines()}
+
+
+def test_there_is_a_figure_of_each_name(run):
+    made = figures(run, NAMES)
+    assert tuple(made) == NAMES
+    for name, figure in made.items():
+        for ax in figure.axes:
+            assert ax.get_ylabel() or name in ("inputs", "network"), name
+
+
+def test_inputs_stand_in_percent_of_their_limits_which_are_drawn(run):
+    figure = figures(run, ["inputs"])["inputs"]
+    lines = lines_of(figure)
+    np.testing.assert_allclose(lines["follower 2"][:, 1], 100.0 * run.inputs[:151, 2].max(axis=1))
+    assert set(lines["limit"][:, 1]) == {100.0}
+    low, high = figure.axes[0].get_ylim()
+    assert low < 0.0 and high > 100.0
+    assert figure.axes[0].get_xlim() == (0.0, 3.0)
+
+
+def test_inputs_without_limits_have_their_names_and_units(run):
+    free = dataclasses.replace(run, bounds=None)
+    figure = figures(free, ["inputs"])["inputs"]
+    assert [ax.get_ylabel() for ax in figure.axes] == ["u0 (N)", "u1 (N)", "u2 (N)", "u3 (N)"]
+
+
+def test_the_slope_that_is_promised_is_drawn_from_the_largest_error_on(run):
+    worst = run.formation_errors.max(axis=1)
+    (t0, first), (t1, last) = lines_of(figures(run, ["formation"])["formation"])[
+        "slope promised: \u22120.5 1/s"
+    ]
+    assert first == worst.max() and t0 == run.times[worst.argmax()]
+    assert np.log(last / first) == pytest.approx(-0.5 * (t1 - t0))
+    (t0, first), (t1, last) = lines_of(figures(run, ["lyapunov"])["lyapunov"])[
+        "slope promised: \u22121 1/s"
+    ]
+    assert np.log(last / first) == pytest.approx(-1.0 * (t1 - t0))
+
+
+def test_nothing_is_drawn_of_a_promise_that_is_none(run):
+    none = dataclasses.replace(run, promise=PROMISE | {"promised": False, "rate": None})
+    for name in ("formation", "lyapunov"):
+        assert not [k for k in lines_of(figures(none, [name])[name]) if "promised" in k]
+
+
+def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_so(run):
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(12, 12))
+    P = root @ root.T + np.eye(12)
+    # Errors that shrink as promised in the metric of P, and not a bit faster.
+    shrink = np.exp(-0.5 * run.times)[:, None, None]
+    errors = shrink * rng.normal(size=(1, 4, 12))
+    errors[:, 0] = 0.0
+    proved = dataclasses.replace(run, errors=errors, metric=P, promise=CERTIFIED)
+    bound = proved.error_bound()
+    assert (bound[:, None] >= proved.formation_errors).all()
+    drawn = lines_of(figures(proved, ["formation"])["formation"])["bound, by proof (T1)"]
+    np.testing.assert_array_equal(drawn[:, 1], bound)
+    # Attained by an error along the direction in which the metric sees a position least.
+    worst = np.zeros((1, 4, 12))
+    block = np.linalg.inv(P)
+    direction = np.linalg.eigh(block[:3, :3])[1][:, -1]
+    worst[0, 1] = block[:, :3] @ direction
+    tight = dataclasses.replace(proved, errors=shrink * worst)
+    np.testing.assert_allclose(tight.error_bound(), tight.formation_errors[:, 1], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        {"limited": np.array([0.0, 0.1, 0.0, 0.0])},
+        {"metric": None},
+        {"promise": CERTIFIED | {"theorem": "T2"}},
+        {"promise": CERTIFIED | {"hypotheses": []}},
+        {"promise": CERTIFIED | {"promised": False}},
+        {"promise": CERTIFIED | {"sentence": "This is said without what the scenario adds: wind."}},
+    ],
+)
+def test_no_bound_is_drawn_that_is_not_promised_of_the_run(run, spoiled):
+    proved = dataclasses.replace(run, metric=np.eye(12), promise=CERTIFIED)
+    assert proved.error_bound() is not None
+    assert dataclasses.replace(proved, **spoiled).error_bound() is None
+
+
+def test_distances_are_those_of_linked_agents_with_those_wanted(run):
+    figure = figures(run, ["distances"])["distances"]
+    lines = lines_of(figure)
+    i, j = run.edges[1]
+    apart = np.linalg.norm(run.states[:, i, :3] - run.states[:, j, :3], axis=1)
+    np.testing.assert_allclose(lines[f"{i} to {j}"][:, 1], apart)
+    places = run.states[:, :, :3]
+    away = np.linalg.norm(places[:, :, None] - places[:, None], axis=3) + 1e9 * np.eye(4)
+    least = lines_of(figure, 1)["any two"][:, 1]
+    np.testing.assert_allclose(least, away.min(axis=(1, 2)))
+
+
+def test_the_network_has_every_edge_and_an_arrow_from_who_leads(run):
+    (ax,) = figures(run, ["network"])["network"].axes
+    (drawn,) = [part for part in ax.collections if len(part.get_segments()) == len(run.edges)]
+    places = run.offsets[:, :2]
+    np.testing.assert_allclose(np.stack(drawn.get_segments()), places[run.edges])
+    arrows = [text for text in ax.texts if getattr(text, "arrow_patch", None) is not None]
+    assert len(arrows) == sum(0 in edge for edge in run.edges.tolist())
+    assert {text.get_text() for text in ax.texts} - {""} == {"0", "1", "2", "3"}
+
+
+def test_a_flock_is_bands_a_median_and_its_worst_by_name(flock):
+    lines = lines_of(figures(flock, ["formation"])["formation"])
+    errors = flock.formation_errors[:, list(flock.followers)]
+    np.testing.assert_allclose(lines["median follower"][:, 1], np.median(errors, axis=1))
+    worst = flock.followers[int((errors**2).sum(axis=0).argmax())]
+    assert f"worst: follower {worst}" in lines
+
+
+def test_an_error_of_zero_is_no_tiny_number(flock):
+    still = dataclasses.replace(flock, errors=np.zeros_like(flock.errors))
+    (ax,) = figures(still, ["formation"])["formation"].axes
+    assert ax.get_ylim()[0] >= 1e-3
+
+
+@pytest.mark.parametrize(("page", "width"), [(ONE_COLUMN, 3.5), (TWO_COLUMNS, 7.16)])
+def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, page, width):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    for own, names in ((run, NAMES), (flock, ("formation", "inputs", "trajectories"))):
+        for name, figure in figures(own, names, page).items():
+            assert figure.get_figwidth() <= width
+            assert all(ax.yaxis.label.get_size() == 8.0 for ax in figure.axes)
+            renderer = FigureCanvasAgg(figure).get_renderer()
+            figure.draw(renderer)
+            for ax in figure.axes:
+                parts = [*ax._axis_map.values(), *filter(None, [ax.get_legend()])]
+                for box in filter(None, (part.get_tightbbox(renderer) for part in parts)):
+                    assert box.x0 >= -1 and box.x1 <= figure.bbox.x1 + 1, (name, own.agents)
+
+
+def test_a_figure_that_is_none_is_refused_with_a_guess(run):
+    with pytest.raises(OutputError, match="no figure `formaton` .did you mean `formation`"):
+        figures(run, ["formaton"])
+
+
+def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
+    from test_view import line
+
+    from echelon.results.recording import FORMAT
+
+    (here / "run.nc").write_bytes(stored(line(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
+    code, told, _ = echelon("plot", "run.nc", "--what", "formation,network", "--dpi", "60")
+    assert code == 0
+    assert told == ("- Written to figures: formation, network, each as PNG, PDF, SVG.\n")
+    made = sorted(path.name for path in (here / "figures").iterdir())
+    assert made == sorted(
+        f"{n}.{k}" for n in ("formation", "network") for k in ("png", "pdf", "svg")
+    )
+    assert b"<text" in (here / "figures" / "formation.svg").read_bytes()
+    assert echelon("plot", "run.nc", "--what", "network", "--out", "other", "--dpi", "60")[0] == 0
+    code, _, fault = echelon("plot", "run.nc", "--what", "network", "--out", "other")
+    assert code == 2 and "exists; choose another folder, or `--force`" in fault
+    code, _, fault = echelon("plot", "run.nc", "--dpi", "9")
+    assert code == 2 and fault == "echelon: `--dpi` is 9, and must be from 30 to 1200.\n"
+    code, _, fault = echelon("plot", "run.nc", "--what", "netwrk")
+    assert code == 2 and "(did you mean `network`?)" in fault
+
+
+def stored(run, version):
+    """A file of a recording, without V, limits and modes."""
+    import json
+
+    import xarray as xr
+
+    per_agent = ("time", "agent", "state")
+    leads = np.isin(np.arange(run.agents), run.leaders).astype(np.int8)
+    data = xr.Dataset(
+        {
+            "states": (per_agent, run.states),
+            "error": (per_agent, run.errors),
+            "inputs": (("time", "agent", "input"), run.inputs),
+            "offset": (("agent", "state"), run.offsets),
+            "saturated": ("agent", run.limited),
+            "is_leader": ("agent", leads),
+            "nearest_leader": ("agent", run.nearest),
+            "edge_agents": (("edge", "end"), run.edges),
+            "edge_weight": ("edge", run.weights),
+        },
+        {
+            "time": run.times,
+            "state": list(run.state_names),
+            "state_unit": ("state", list(run.state_units)),
+            "input": list(run.input_names),
+            "input_unit": ("input", list(run.input_units)),
+        },
+        {
+            "model": "Own",
+            "position": " ".join(run.state_names[k] for k in run.position),
+            "format": version,
+            "leader_needs": "nothing",
+            "promise": json.dumps(run.promise),
+            "horizon": run.horizon,
+            "dt": run.dt,
+            "outcome": "completed",
+            "message": "The run reached its horizon.",
+        },
+    )
+    return bytes(data.to_netcdf(None, engine="h5netcdf"))

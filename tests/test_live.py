@@ -1,0 +1,351 @@
+"""The loop that runs live: it is the loop of a run, its knobs are keys, and the page shows it."""
+
+import copy
+import json
+import threading
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from browser import chromium, opened, until
+
+import echelon as ech
+from echelon.core.errors import SimulationError
+from echelon.live import server as served
+from echelon.live import swarm as stepped
+from echelon.live.knobs import Panel
+from echelon.live.promiser import badge_of, first_look
+from echelon.live.server import live, serve_live
+from echelon.live.session import Session
+from echelon.live.swarm import Swarm
+from echelon.scenario.build import build
+from echelon.scenario.scenario import scenario_from_mapping
+from echelon.scenario.yaml import dump_yaml, read_yaml
+from echelon.viewer.serve import serving
+
+GIVEN = {
+    "name": "own",
+    "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
+    "graph": {"edges": [[0, 1], [1, 2], [1, 3], [0, 3]], "leaders": [0]},
+    "formation": {"offsets": {1: [1, 0], 2: [1, 1], 3: [0, 1]}},
+    "reference": {"name": "circle", "radius": 1.0, "rate": 0.5},
+    "follower": {"law": "consensus", "gain": {"method": "riccati"}},
+    "initial": {"spread": {"position": 0.5}},
+    "simulation": {"horizon": 0.4, "dt": 0.01, "store_every": 4, "engine": "jax"},
+}
+
+
+def scenario(**changes):
+    return scenario_from_mapping(copy.deepcopy(GIVEN) | changes)
+
+
+@pytest.fixture(scope="module")
+def panel():
+    own = scenario()
+    return Panel(own, build(own))
+
+
+@pytest.fixture(scope="module")
+def swarm(panel):
+    return Swarm(*panel.built, panel)
+
+
+@pytest.fixture
+def session(panel, swarm):
+    swarm.turn(panel.start)
+    swarm.restart()
+    made = Session(panel.scenario, panel, swarm)
+    yield made
+    made.promiser.end()
+
+
+def flown(swarm, pictures=10):
+    """The states after each of some pictures from the start."""
+    swarm.restart()
+    return np.stack([swarm.advance().states for _ in range(pictures)])
+
+
+# ---- the loop ---------------------------------------------------------------------------------
+
+
+def test_a_live_loop_is_the_loop_of_a_run(panel, swarm):
+    swarm.turn(panel.start)
+    np.testing.assert_allclose(flown(swarm), ech.run(panel.scenario).states[1:], atol=1e-12)
+
+
+KNOBS = {
+    "coupling": {"coupling": 3.0},
+    "feedforward": {"feedforward": 0.0},
+    "size": {"size": 2.0},
+    "turn": {"turn": 30.0},
+    "wind": {"wind": 1.5},
+    "cut": {"cut": frozenset({3})},
+}
+
+
+@pytest.mark.parametrize("name", KNOBS)
+def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, name):
+    """The scenario that `standing` writes is run by the engine from the live loop's start."""
+    knobs = panel.start._replace(**KNOBS[name])
+    parts, settings = build(panel.standing(knobs))
+    wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+    swarm.turn(knobs)
+    np.testing.assert_allclose(flown(swarm), wanted.states[1:], atol=1e-11)
+    assert np.abs(wanted.states[1:] - ech.run(panel.scenario).states[1:]).max() > 1e-3
+
+
+def test_no_knob_compiles_anything_again(panel, swarm, monkeypatch):
+    swarm.turn(panel.start)
+    swarm.advance()
+    traced = []
+    monkeypatch.setattr(stepped, "control", lambda *_: traced.append(1))
+    for change in KNOBS.values():
+        swarm.turn(panel.start._replace(**change))
+        swarm.advance()
+    swarm.kick(1, np.ones(4))
+    swarm.advance(still=True)
+    assert traced == []
+
+
+def test_the_error_is_the_distance_from_the_goal_of_the_turned_formation(panel, swarm):
+    knobs = panel.start._replace(size=2.0, turn=90.0)
+    swarm.turn(knobs)
+    swarm.restart()
+    picture = swarm.advance()
+    # Twice as large and a quarter to the left: (1, 0) goes to (0, 2), (1, 1) to (-2, 2).
+    goal = picture.states[0, :2] + np.array([-2.0, 2.0])
+    away = np.linalg.norm(picture.states[2, :2] - goal)
+    assert picture.errors[2] == pytest.approx(away, rel=1e-12)
+
+
+def test_a_kick_moves_one_agent_and_all_ways_in_turn(session):
+    before = session.swarm.advance(still=True).states
+    first, second = (session.ask({"name": "kick", "value": 2}) for _ in range(2))
+    session.settle()
+    moved = session.swarm.advance(still=True).states - before
+    np.testing.assert_allclose(moved[2], np.array(first["kick"][2]) + second["kick"][2])
+    assert not np.delete(moved, 2, axis=0).any()
+    assert np.hypot(*first["kick"][2][2:]) == pytest.approx(2.0, rel=1e-5)
+    third = session.ask({"name": "kick", "value": 2})
+    assert third["kick"] != first["kick"]
+
+
+def test_a_knob_is_clamped_and_nonsense_is_refused_in_a_sentence(session):
+    assert session.ask({"name": "size", "value": 1e9}) == {"size": 3.0}
+    assert session.ask({"name": "wind", "value": -1e300}) == {"wind": -3.0}
+    for told, sentence in {
+        ("colour", 1.0): "there is no knob `colour`; this scenario has `coupling`",
+        ("turn", "a lot"): "`turn` got `a lot`, and must be a number.",
+        ("turn", float("nan")): "`turn` got `nan`, and must be a number.",
+        ("turn", True): "`turn` got `True`, and must be a number.",
+        ("kick", 9): "`kick` got `9`, and must be the number of an agent.",
+        ("cut", (0, 2)): "`(0, 2)` is no link of the graph.",
+        ("cut", 7): "`7` is no link of the graph.",
+    }.items():
+        with pytest.raises(SimulationError) as fault:
+            session.ask({"name": told[0], "value": told[1]})
+        assert str(fault.value).startswith(sentence)
+
+
+def test_what_was_done_is_saved_and_repeats_to_the_bit(session, swarm):
+    done = {
+        2: [("coupling", 2.5), ("cut", [3, 0])],
+        4: [("kick", 1), ("wind", 0.7)],
+        6: [("restore", [0, 3]), ("size", 1.5), ("turn", -20.0), ("feedforward", 0)],
+    }
+    shown = []
+    for k in range(9):
+        for name, value in done.get(k, ()):
+            session.ask({"name": name, "value": value})
+        session.settle()
+        shown.append(swarm.advance().states)
+    text = session.ask({"name": "save"})["text"]
+    again = scenario_from_mapping(read_yaml(text, "saved").data)
+    assert [event.at for event in again.live] == [0.08, 0.08, 0.16, 0.16, 0.24, 0.24, 0.24, 0.24]
+    panel = Panel(again, build(again))
+    other = Session(again, panel, Swarm(*panel.built, panel))
+    for states in shown:
+        other.settle()
+        np.testing.assert_array_equal(other.swarm.advance().states, states)
+    other.promiser.end()
+    # And what it saves is the same again.
+    assert other.ask({"name": "save"})["text"] == text
+
+
+def test_a_run_refuses_what_was_done_live(echelon, here):
+    (here / "live.yaml").write_text(dump_yaml(GIVEN | {"live": [{"at": 1.0, "coupling": 2.0}]}))
+    code, _, fault = echelon("run", "live.yaml", "--out", "out")
+    assert code == 2 and "live: got 1 events, allowed is none in a run" in fault
+    assert not (here / "out").exists()
+
+
+def test_reset_begins_again_with_the_knobs_as_they_are(session, swarm):
+    session.ask({"name": "coupling", "value": 3.0})
+    session.settle()
+    swarm.advance()
+    session.ask({"name": "kick", "value": 1})
+    session.ask({"name": "reset"})
+    session.settle()
+    assert swarm.steps == 0 and session.knobs.coupling == 3.0
+    assert session.events == [{"at": 0.0, "coupling": 3.0}]
+
+
+# ---- the promise ------------------------------------------------------------------------------
+
+
+def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
+    strong = badge_of(panel, panel.start)
+    assert strong["state"] == "holds" and strong["short"].startswith("promised: ")
+    edge = strong["edge"]
+    near = badge_of(panel, panel.start._replace(coupling=1.05 * edge))
+    assert near["state"] == "edge" and near["short"].endswith(", at its edge")
+    parted = badge_of(panel, panel.start._replace(cut=frozenset({0, 3})))
+    assert parted["state"] == "lost" and "disconnected" in parted["causes"][0]
+
+
+LOOKS = [
+    {"coupling": 0.3},
+    pytest.param({}, marks=pytest.mark.slow),
+    pytest.param({"cut": frozenset({3})}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("change", LOOKS)
+def test_the_first_look_is_the_slowest_mode_that_the_promise_then_tells(panel, change):
+    knobs = panel.start._replace(**change)
+    found = ech.promise(*build(panel.standing(knobs)))
+    assert panel.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
+    assert first_look(panel, knobs)["state"] == "asking"
+
+
+def test_a_growing_mode_is_told_at_once(panel):
+    oscillator = scenario(
+        model={"name": "van-der-pol"},
+        formation={},
+        reference=None,
+        follower={"law": "consensus"},
+        initial={"spread": {"position": 0.1}},
+    )
+    own = Panel(oscillator, build(oscillator))
+    weak = own.start._replace(coupling=0.02 * own.start.coupling)
+    look, found = first_look(own, weak), badge_of(own, weak)
+    assert look["state"] == found["state"] == "lost"
+    assert look["short"] == found["short"] and "a mode grows, +" in look["short"]
+    assert any("raise `coupling`" in cause for cause in found["causes"])
+
+
+# ---- the server and the page ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page():
+    """A session that runs, and where its page is."""
+    session, html = live(scenario())
+    session.start()
+    with serving(serve_live(session, html, 0)) as address:
+        yield session, address
+    session.end()
+
+
+def post(address, told, **headers):
+    data = told if isinstance(told, bytes) else json.dumps(told).encode()
+    request = urllib.request.Request(address + "knob", data, headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, json.loads(answer.read())
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def test_pages_of_others_may_neither_turn_a_knob_nor_read_the_stream(page):
+    session, address = page
+    knob = {"name": "wind", "value": 1.0}
+    for headers in ({"Origin": "http://example.org"}, {"Host": "example.org"}, {"Origin": "null"}):
+        assert post(address, knob, **headers)[0] == 403
+        request = urllib.request.Request(address + "stream", headers=headers)
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=10)
+    assert session.knobs.wind == 0.0
+    assert post(address, knob, Origin=address[:-1]) == (200, {"wind": 1.0})
+    assert post(address, {"name": "wind", "value": 0.0})[0] == 200
+
+
+@pytest.mark.parametrize("told", [b"{", b"[1]", b"x" * 200_000, b"null", {"name": None}])
+def test_a_question_that_is_none_is_answered_and_nothing_ends(page, told):
+    assert post(page[1], told)[0] == 400
+    assert post(page[1], {"name": "pause", "value": False})[0] == 200
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+def test_a_cut_link_disappears_the_error_reacts_and_the_page_says_why(browser, page):
+    _, address = page
+    with opened(browser, address) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 20)
+        until(lambda: shown.evaluate("echelon.promise && echelon.promise.state") == "holds")
+        until(lambda: shown.evaluate("echelon.numbers.worst") < 0.05)
+        # With both links to the leader gone nobody hears it.
+        click_link(shown, 0, 1)
+        until(lambda: [0, 1] not in shown.evaluate("echelon.links"))
+        shown.evaluate("echelon.ask('cut', [0, 3])")
+        until(lambda: shown.evaluate("echelon.promise.state") == "lost")
+        until(lambda: "disconnected" in shown.locator(".notes").inner_text())
+        shown.evaluate("echelon.ask('kick', 1)")
+        until(lambda: shown.evaluate("echelon.numbers.worst") > 0.3)
+        for pair in ([0, 1], [0, 3]):
+            shown.evaluate("(pair) => echelon.ask('restore', pair)", pair)
+        until(lambda: len(shown.evaluate("echelon.links")) == 4)
+        until(lambda: shown.evaluate("echelon.numbers.worst") < 0.05)
+
+
+def click_link(shown, i, j):
+    """Click the middle of a link, wherever it is now."""
+    shown.evaluate("echelon.ask('pause', true)")
+    until(lambda: shown.evaluate("echelon.live.paused"))
+    ends = np.array([shown.evaluate(f"echelon.whereOnScreen({k})") for k in (i, j)])
+    box = shown.locator("#scene").bounding_box()
+    shown.mouse.click(box["x"] + ends[:, 0].mean(), box["y"] + ends[:, 1].mean())
+    shown.evaluate("echelon.ask('pause', false)")
+
+
+def test_a_slider_turns_its_knob_and_the_page_shows_places_that_are_the_loops(browser, page):
+    session, address = page
+    with opened(browser, address, 420, 800) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 3)
+        assert shown.evaluate("document.documentElement.scrollWidth") <= 420
+        shown.get_by_role("slider", name="formation size").fill("900")
+        until(lambda: session.knobs.size > 2.0)
+        shown.evaluate("echelon.ask('pause', true)")
+        until(lambda: shown.evaluate("echelon.live.paused"))
+        time = shown.evaluate("echelon.time")
+        until(lambda: shown.evaluate("echelon.time") == time and session.paused)
+        states = session.swarm.advance(still=True).states
+        for agent in range(4):
+            place = shown.evaluate(f"echelon.position({agent})")
+            assert place[:2] == pytest.approx(states[agent, :2], abs=1e-5)
+        shown.evaluate("echelon.ask('pause', false)")
+        shown.evaluate("echelon.ask('size', 1.0)")
+        until(lambda: session.knobs.size == 1.0)
+
+
+def test_a_page_that_is_closed_ends_nothing_and_nobody_watching_stops_the_clock(browser, page):
+    session, address = page
+    with opened(browser, address) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 3)
+    until(lambda: session.watchers == 0)
+    steps = session.swarm.steps
+    threading.Event().wait(0.3)
+    assert session.swarm.steps <= steps + 2 * session.swarm.count
+    with opened(browser, address) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 3)
+
+
+def test_what_is_too_large_to_be_live_is_refused_with_what_would_be(monkeypatch):
+    monkeypatch.setattr(served, "_SLOWEST", 0.0)
+    with pytest.raises(SimulationError, match="4 agents are too many to be live here: 0.04 s take"):
+        live(scenario())
