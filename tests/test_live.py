@@ -81,6 +81,7 @@ KNOBS = {
     "turn": {"turn": 30.0},
     "wind": {"wind": 1.5},
     "cut": {"cut": frozenset({3})},
+    "method": {"method": "inner-loop", "coupling": 1.0},
 }
 
 
@@ -106,6 +107,18 @@ def test_no_knob_compiles_anything_again(panel, swarm, monkeypatch):
     swarm.kick(1, np.ones(4))
     swarm.advance(still=True)
     assert traced == []
+
+
+def test_another_method_brings_its_gain_and_its_coupling(session):
+    session.ask({"name": "method", "value": "inner-loop"})
+    session.settle()
+    found = build(scenario(follower={"gain": {"method": "inner-loop"}})).parts.drive.gain
+    own = session.swarm.loop.follower.law.gain
+    np.testing.assert_array_equal(own.P, found.P)
+    np.testing.assert_array_equal(own.inner, found.inner)
+    assert session.knobs.coupling == pytest.approx(found.coupling, abs=1e-9)
+    with pytest.raises(SimulationError, match="no method `best` here"):
+        session.ask({"name": "method", "value": "best"})
 
 
 def test_the_error_is_the_distance_from_the_goal_of_the_turned_formation(panel, swarm):

@@ -15,6 +15,7 @@ from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
+from echelon.gains.gain import Gain
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.live.knobs import Knobs, Panel
 from echelon.models.model import ControlAffine
@@ -90,7 +91,10 @@ class Swarm:
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
         loop = assemble(problem, drive.leader, drive.follower)
-        dimmed = Dimmed(loop.follower, np.asarray(1.0), loop.follower.feedforward)
+        law = loop.follower
+        if panel.start.coupling is not None:
+            law = eqx.tree_at(_inner, law, self._inner(panel.gain(panel.start)), is_leaf=_is_none)
+        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward)
         self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.states, self.measured = problem.states, list(problem.meter.measured)
@@ -131,9 +135,28 @@ class Swarm:
         wind = self.panel.wind(knobs)
         loop = eqx.tree_at(lambda each: each.motion.wind.constant, loop, wind)
         if knobs.coupling is not None:
-            at = lambda each: each.follower.law.gain.coupling  # noqa: E731 - a place in a tree
-            loop = eqx.tree_at(at, loop, np.asarray(knobs.coupling))
+            loop = self._with_gain(loop, knobs)
         self.loop = loop
+
+    def _with_gain(self, loop: Loop, knobs: Knobs) -> Loop:
+        """Return the loop with the gain of the knobs."""
+        gain = self.panel.gain(knobs)
+        assert gain is not None
+
+        def places(each: Any) -> tuple[Any, ...]:
+            own = each.follower.law.gain
+            return own.P, own.R, own.R_inverse, own.inner, own.coupling
+
+        numbers = (gain.P, gain.R, gain.R_inverse, self._inner(gain), np.asarray(knobs.coupling))
+        return eqx.tree_at(places, loop, numbers)
+
+    @staticmethod
+    def _inner(gain: Gain | None) -> Array:
+        """Return the inner loop of a gain, zero without one, so that either compiles to one."""
+        assert gain is not None
+        if gain.inner is not None:
+            return gain.inner
+        return np.zeros((len(gain.R), len(gain.P)))
 
     def kick(self, agent: int, by: Array) -> None:
         """Change the state of an agent by (n,), all at once."""
@@ -153,6 +176,14 @@ class Swarm:
             errors = np.linalg.norm(away, axis=1)
         time = self.steps * self.settings.dt
         return Picture(time, states, np.asarray(inputs, np.float64), errors, self.offsets)
+
+
+def _inner(law: Any) -> Any:
+    return law.gain.inner
+
+
+def _is_none(node: object) -> bool:
+    return node is None
 
 
 @eqx.filter_jit
