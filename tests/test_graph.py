@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from oracles import adjacency, connected, laplacian, relabelled
 
 from echelon.core import errors, numerics
+from echelon.network.bound import _quotients, rounded_bound
 from echelon.network.graph import Graph
 from echelon.verifier.exact import is_positive_definite
 
@@ -333,6 +334,23 @@ def test_the_bound_of_a_long_line_is_that_of_its_closed_form():
     exact = 2.0 - 2.0 * np.cos(np.pi / (2 * (n - 1) + 1))
     spectrum = Graph.path(n).spectrum()
     assert exact * (1 - 1e-8) < spectrum.proved <= exact * (1 + 1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("decades", [0.0, 4.0])
+def test_the_bound_in_floats_is_below_the_exact_one_and_near(seed, decades):
+    rng = np.random.default_rng(seed)
+    graph = Graph.grid(9, 14, leaders=[0, 30])
+    weights = 10.0 ** rng.uniform(-decades, decades, len(graph.edges))
+    graph = Graph([(i, j, w) for (i, j), w in zip(graph.edges, weights, strict=True)], [0, 30], 126)
+    L = graph.grounded_laplacian().toarray()
+    # Near the eigenvector, and far from it.
+    vector = np.abs(np.linalg.eigh(L)[1][:, 0]) * rng.uniform(1.0 - 1e-9 * 10.0**seed, 1.0, len(L))
+    found = rounded_bound(graph._grounded(), vector)
+    exact = max(Fraction(0), _quotients(graph._grounded(), list(map(Fraction, vector.tolist())))[0])
+    assert Fraction(found) <= exact
+    slack = 1e-12 * np.abs(weights).max()
+    assert found >= float(exact) - slack
 
 
 def test_both_ends_of_a_line_of_20000_are_those_of_its_closed_form():

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 import echelon as ech
+from echelon.core.linear import flows
 from echelon.core.words import Kind
 from echelon.promises.statement import Hypothesis
 
@@ -84,3 +86,12 @@ def test_the_inner_loop_does_not_chatter_at_the_papers_own_step(seed):
     run = ech.run(ech.load_scenario("paper", [*changes, "report.steady_window=2"]))
     assert run.chatter.max() < 20 and run.saturated.max() < 0.01
     assert "from beyond one limit" not in ech.report(run)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.1, 3.0, 100.0])
+def test_flows_are_exponentials(scale):
+    draws = np.random.default_rng(1)
+    rates = scale * (draws.normal(size=(5, 3, 6, 6)) - 2.0 * np.eye(6))
+    for found, wanted in zip(flows(rates), scipy.linalg.expm(rates), strict=True):
+        size = np.abs(wanted).max(axis=(1, 2), keepdims=True)
+        np.testing.assert_allclose(found / size, wanted / size, rtol=0, atol=1e-11)

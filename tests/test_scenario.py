@@ -121,7 +121,13 @@ def test_defaults():
         },
         "formation": {"offsets": None, "name": None, "spacing": 1.0, "columns": None},
         "reference": None,
-        "leader": {"law": "passive", "reacts": False, "start_error": {}, "gain": None},
+        "leader": {
+            "law": "passive",
+            "reacts": False,
+            "start_error": {},
+            "gain": None,
+            **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer")),
+        },
         "follower": {
             "law": "consensus",
             "gain": {
@@ -137,6 +143,7 @@ def test_defaults():
                 "python": None,
                 "file": None,
             },
+            **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer", "hears")),
             "feedforward": "relay",
             "trim": True,
         },
@@ -239,7 +246,11 @@ def test_the_table_of_methods_says_what_their_classes_say(name):
 @pytest.mark.parametrize("role", ["leader", "follower"])
 def test_the_table_of_laws_says_what_their_classes_say(role):
     for name, entry in getattr(registry, f"{role.upper()}_LAWS").items():
-        offered = {"leader": ("gain",), "follower": ("gain", "feedforward", "trim")}[role]
+        stopping = ("roots", "rate", "coupling", "speed", "observer")
+        offered = {
+            "leader": ("gain", *stopping),
+            "follower": ("gain", "feedforward", "trim", *stopping, "hears"),
+        }[role]
         taken = set(accepted(resolve(entry))) & {*offered}
         assert {*entry.needs, *entry.takes} == taken, name
 

@@ -31,6 +31,8 @@ from .archive.run import (
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome
+from .engine.agent import Agent as Agent
+from .engine.agent import Message as Message
 from .engine.gradient import gradient as gradient
 from .engine.laws import Laws as Laws
 from .engine.parts import Parts as Parts

@@ -35,6 +35,13 @@ class Feedforward(Word):
     PARENT = "its parent's input of the same step"
 
 
+class Hears(Word):
+    """Which of its neighbours an agent under the law `stopping-point` hears."""
+
+    ALL = "all of its neighbours"
+    LEADERWARD = "the neighbours that are nearer to a leader"
+
+
 ENGINES = ("auto", "jax", "native")
 """What may step agents under laws."""
 
@@ -66,6 +73,7 @@ class Theorem(Word):
     T1 = "errors of all sizes shrink while all agents stay in"
     T2 = "small errors shrink while the leader stays in"
     A5 = "the drift does not expand P while all agents stay in"
+    T5 = "stopping points agree from anywhere, and each agent stays in its tube"
 
     def __str__(self) -> str:
         """Return the theorem's name as the theory page has it."""

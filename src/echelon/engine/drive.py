@@ -198,6 +198,13 @@ class Drive(eqx.Module):
         """Return what is allowed but probably not meant, a sentence each."""
         return ()
 
+    def accept(self, problem: Problem) -> None:
+        """Check the starts of a run under a drive that is prepared.
+
+        Raises:
+            LawError: an agent starts where its law has no meaning.
+        """
+
     def start(self, model: ControlAffine) -> State:
         """Return the state (n,) in which leaders begin, the trim unless replaced."""
         # By way of NumPy, so that a trim of whole numbers becomes one of floats.

@@ -1,7 +1,7 @@
 """Which loops are alike but for numbers, so that one program steps them all."""
 
 from collections.abc import Hashable, Sequence
-from typing import Any
+from typing import Any, final
 
 import jax
 import jax.numpy as jnp
@@ -12,27 +12,37 @@ from echelon.engine.own import bare, is_number
 from echelon.engine.settings import Settings
 
 
-def family_of(loop: Loop, settings: Settings) -> Hashable:
-    """Return what is the same for all loops that one program can step, each with its own numbers.
+@final
+class Families:
+    """Tells families apart; what a kind of loop reads of its numbers is traced once."""
 
-    Their trees, all that is no number, the draws' times, and the numbers that a reference, a
-    memory at its beginning, the weights or the difference of two states rest on.
-    """
-    leaves, tree = jax.tree.flatten(bare(loop))
-    fixed = _fixed(loop, leaves, tree)
-    kept = tuple(_bytes(leaf) for leaf, one in zip(leaves, fixed, strict=True) if one)
-    shapes = tuple(np.shape(leaf) for leaf in leaves)
-    wind = loop.motion.wind
-    draws = None if wind is None else (jax.tree.structure(wind), int(wind.window))
-    key = (tree, kept, shapes, draws, settings)
-    try:
-        hash(key)
-    except TypeError:
-        return id(loop)
-    return key
+    def __init__(self) -> None:
+        """Begin with no kind known."""
+        self._fixed: dict[Hashable, list[bool]] = {}
+
+    def of(self, loop: Loop, settings: Settings) -> Hashable:
+        """Return what is the same for all loops that one program can step, each with own numbers.
+
+        Their trees, all that is no number, the draws' times, and the numbers that a reference, a
+        memory at its beginning, the weights or the difference of two states rest on.
+        """
+        leaves, tree = jax.tree.flatten(bare(loop))
+        wind = loop.motion.wind
+        draws = None if wind is None else (jax.tree.structure(wind), int(wind.window))
+        shapes = tuple(np.shape(leaf) for leaf in leaves)
+        words = tuple(_bytes(leaf) for leaf in leaves if not is_number(leaf))
+        kind = (tree, words, shapes, draws, settings)
+        try:
+            hash(kind)
+        except TypeError:
+            return id(loop)
+        if kind not in self._fixed:
+            self._fixed[kind] = _fixed(leaves, tree)
+        pairs = zip(leaves, self._fixed[kind], strict=True)
+        return kind, tuple(_bytes(leaf) for leaf, fixed in pairs if fixed)
 
 
-def _fixed(loop: Loop, leaves: Sequence[Any], tree: Any) -> list[bool]:
+def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
     """Return which leaves must be the same in all loops."""
     numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
 

@@ -4,7 +4,13 @@ from typing import TYPE_CHECKING, final
 
 import jax
 
-from echelon.core.errors import EchelonError, MissingExtraError, SimulationError, check_kind
+from echelon.core.errors import (
+    EchelonError,
+    LawError,
+    MissingExtraError,
+    SimulationError,
+    check_kind,
+)
 from echelon.core.types import Array, State
 from echelon.core.words import Feedforward
 from echelon.engine.by_jax import JaxStepper
@@ -72,8 +78,23 @@ class Laws(Drive):
             LawError: one does not fit the model or the graph.
         """
         leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
+        follower = follower.following(leader, model)
         same = leader is self.leader and follower is self.follower
         return self if same else Laws(leader, follower)
+
+    def accept(self, problem: Problem) -> None:
+        """Check the starts of leaders and followers by their laws.
+
+        Raises:
+            LawError: one is refused.
+        """
+        graph = problem.graph
+        for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
+            refused = law.refusals(problem.model, problem.states[list(agents)])
+            for place, text in refused:
+                raise LawError(
+                    f"agent {agents[place]} starts where its law has no meaning: {text}."
+                )
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and what of the reference the leaders cannot do."""

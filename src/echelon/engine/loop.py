@@ -45,11 +45,12 @@ class Loop(eqx.Module):
 
 
 class _Acted(NamedTuple):
-    """What some agents wanted and got, inputs (K, m), and their next memories."""
+    """What some agents wanted and got, inputs (K, m), their next memories, and what they tell."""
 
     wanted: Inputs
     inputs: Inputs
     memory: Memory
+    told: jax.Array
 
 
 class Moment(NamedTuple):
@@ -78,7 +79,7 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         meter=problem.meter,
         leader=without_certificates(leader),
         follower=without_certificates(follower),
-        exchange=graph.exchange(),
+        exchange=graph.exchange(follower.leaderward),
         offsets=np.asarray(problem.formation.offsets),
         leaders=leaders,
         followers=followers,
@@ -106,11 +107,8 @@ def _levels(graph: Graph) -> Array:
 def begin(loop: Loop, states: States) -> Moment:
     """Return the moment at which a run begins from states (N, n)."""
 
-    # `init` is of one agent; all begin alike.
     def remember(law: Law, who: Array) -> Memory:
-        return jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (len(who), *jnp.shape(leaf))), law.init()
-        )
+        return jax.vmap(lambda x: law.begin(loop.model, x))(jnp.asarray(states)[who])
 
     return Moment(
         step=jnp.zeros((), jnp.int32),
@@ -137,25 +135,23 @@ class Control(NamedTuple):
 def control(loop: Loop, now: Moment) -> Control:
     """Return what all agents do from a moment on."""
     x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
-    y = x - offsets
-    # What was sent is what is: this network neither delays nor loses.
-    z = loop.exchange(y, y, jax.vmap(loop.model.difference))
+    z = _disagreement(loop, now, offsets)
     # From the step number, since a sum of many dt would gather rounding.
     t = now.step.astype(x.dtype) * loop.motion.dt
 
     def act(law: Law, who: Any, sent: jax.Array, memory: Memory) -> _Acted:
         # One time for all; of everything else, an agent sees its own row and no other.
-        def one(x: Any, offset: Any, z: Any, sent: Any, memory: Memory) -> tuple[Any, Memory]:
-            return law.update(loop.model, LocalView(t, x, offset, z, sent), memory)
+        def one(x: Any, offset: Any, z: Any, sent: Any, memory: Memory) -> _Acted:
+            view = LocalView(t, x, offset, z, sent, loop.motion.dt)
+            return _Acted(*act_alone(loop, law, view, memory))
 
-        wanted, memory = jax.vmap(one)(x[who], offsets[who], z[who], sent, memory)
-        return _Acted(wanted, loop.motion.deliver(wanted), memory)
+        return jax.vmap(one)(x[who], offsets[who], z[who], sent, memory)
 
     # Nobody is before a leader whose input it could be sent.
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
     led = act(loop.leader, loop.leaders, silence, now.leader_memory)
     if loop.levels is None:
-        sent = _broadcast(loop, x[loop.leaders], led.inputs)[loop.sender]
+        sent = led.told[loop.sender]
         followed = act(loop.follower, loop.followers, sent, now.follower_memory)
     else:
         followed = _by_depth(loop, now, led, act)
@@ -163,6 +159,43 @@ def control(loop: Loop, now: Moment) -> Control:
     wanted = jnp.concatenate([led.wanted, followed.wanted])[loop.order]
     limited, cut = what_limits_did(u, wanted)
     return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory)
+
+
+def _disagreement(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array:
+    """Return z of what neighbours hear of each other, (N, n) of states or (N, s) of signals."""
+    said = signals(loop, now, offsets)
+    # What was sent is what is: this network neither delays nor loses.
+    if said is not None:
+        return loop.exchange(said, said)
+    y = now.states - offsets
+    return loop.exchange(y, y, jax.vmap(loop.model.difference))
+
+
+@eqx.filter_jit
+def signals(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array | None:
+    """Return what neighbours hear of the agents (N, s); None where it is their states."""
+    x = jnp.asarray(now.states)
+
+    def said(law: Law, who: Array, memory: Memory) -> jax.Array | None:
+        return jax.vmap(lambda *known: law.signal(loop.model, *known))(x[who], offsets[who], memory)
+
+    heard = said(loop.follower, loop.followers, now.follower_memory)
+    if heard is None:
+        return None
+    led = said(loop.leader, loop.leaders, now.leader_memory)
+    assert led is not None, "a law with a signal takes a leader that gives it"
+    return jnp.concatenate([led, heard])[loop.order]
+
+
+def act_alone(
+    loop: Loop, law: Law, view: LocalView, memory: Memory
+) -> tuple[Input, Input, Memory, jax.Array]:
+    """Return what one agent wants and gets, its next memory, and what it tells its followers."""
+    wanted, memory = law.update(loop.model, view, memory)
+    # After the limits: what a leader could not do its followers must not copy (theory page).
+    got = loop.motion.deliver_one(wanted)
+    memory = law.settle(loop.model, view, wanted, got, memory)
+    return wanted, got, memory, tell(loop, view.x, loop.model.normalized(got), memory)
 
 
 def what_limits_did(u: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -178,36 +211,29 @@ def what_limits_did(u: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Arr
 def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) -> _Acted:
     """Let the followers act level by level, each sent what its parent has just done."""
     followers, parents = jnp.asarray(loop.followers), jnp.asarray(loop.parents)
-    u = jnp.zeros((len(now.states), led.inputs.shape[1]), led.inputs.dtype)
-    u = u.at[loop.leaders].set(led.inputs)
-    nothing = jnp.zeros((len(followers), u.shape[1]), u.dtype)
+    told = jnp.zeros((len(now.states), led.told.shape[1]), led.told.dtype)
+    told = told.at[loop.leaders].set(led.told)
+    nothing = jnp.zeros((len(followers), led.inputs.shape[1]), led.inputs.dtype)
 
-    def level(done: tuple[Inputs, _Acted], places: jax.Array) -> tuple[Any, None]:
-        u, all_ = done
+    def level(done: tuple[jax.Array, _Acted], places: jax.Array) -> tuple[Any, None]:
+        told, all_ = done
         who = followers[places]
-        sent = _broadcast(loop, now.states[parents[who]], u[parents[who]])
         memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
-        acted = act(loop.follower, who, sent, memory)
+        acted = act(loop.follower, who, told[parents[who]], memory)
         # Where a level repeats an agent, the same is written twice.
         all_ = jax.tree.map(lambda a, b: a.at[places].set(b), all_, acted)
-        return (u.at[who].set(acted.inputs), all_), None
+        return (told.at[who].set(acted.told), all_), None
 
     # Every follower is in one level, so that no zero of these is left.
-    start = _Acted(nothing, nothing, now.follower_memory)
-    return jax.lax.scan(level, (u, start), jnp.asarray(loop.levels))[0][1]
+    start = _Acted(nothing, nothing, now.follower_memory, told[followers])
+    return jax.lax.scan(level, (told, start), jnp.asarray(loop.levels))[0][1]
 
 
-def _broadcast(loop: Loop, x: States, u: Inputs) -> jax.Array:
-    """Return what agents at x (K, n) with delivered inputs u (K, m) send to followers."""
-    # After the limits: what a leader could not do its followers must not copy (theory page).
-    return jax.vmap(lambda x, v: tell(loop, x, v))(x, loop.model.normalized(u))
-
-
-def tell(loop: Loop, x: State, v: Input) -> jax.Array:
-    """Return what an agent at x with normalized input v sends to followers."""
+def tell(loop: Loop, x: State, v: Input, memory: Memory) -> jax.Array:
+    """Return what an agent at x with normalized input v and its next memory sends to followers."""
     if loop.follower.feedforward is Feedforward.NONE:
         return jnp.zeros_like(v)
-    return loop.follower.broadcast(loop.model, x, v)
+    return loop.follower.message(loop.model, x, v, memory)
 
 
 def step(loop: Loop, now: Moment, acted: Control) -> Moment:

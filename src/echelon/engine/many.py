@@ -6,9 +6,9 @@ others run one after the other.
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
 import equinox as eqx
@@ -18,7 +18,7 @@ from echelon.core.errors import EchelonError, MissingExtraError, Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk
-from echelon.engine.family import family_of
+from echelon.engine.family import Families
 from echelon.engine.grid import Grid
 from echelon.engine.initial import Starts
 from echelon.engine.laws import Laws, worth_native
@@ -46,6 +46,7 @@ class _Case(NamedTuple):
     prepared: Prepared
     starts: Starts
     loop: Loop | None
+    family: Hashable
 
 
 class _Job(NamedTuple):
@@ -70,7 +71,7 @@ class Fleet:
         """Begin with nothing prepared."""
         self.threads = threads or _processors()
         self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
-        self.kernels = Kernels()
+        self.kernels, self.kinds = Kernels(), Families()
         self._cases: WeakKeyDictionary[Parts, dict[Settings, _Case]] = WeakKeyDictionary()
 
     def fly(self, runs: Sequence[Run], told: Told | None = None) -> Iterator[Result | EchelonError]:
@@ -90,15 +91,14 @@ class Fleet:
 
     def _families(self, runs: Sequence[Run]) -> list[list[_Job]]:
         """Return the runs that can be stepped together, family by family."""
-        families: dict[Any, list[_Job]] = {}
+        families: dict[Hashable, list[_Job]] = {}
         for place, (parts, settings) in enumerate(runs):
             try:
                 job = self._job(place, parts, settings)
             except EchelonError:
                 job = None  # `simulate` says it again
             if job is not None:
-                key = family_of(job.loop, settings._replace(seed=0))
-                families.setdefault(key, []).append(job)
+                families.setdefault(job.case.family, []).append(job)
         return [jobs for jobs in families.values() if _fit(jobs)]
 
     def _job(self, place: int, parts: Parts, settings: Settings) -> _Job | None:
@@ -122,10 +122,11 @@ class Fleet:
             check_memory(parts, settings)
             drive = prepared.parts.drive
             with precision("float64"):
-                loop = None
+                loop = family = None
                 if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
-                known[settings] = _Case(prepared, Starts(prepared.parts), loop)
+                    family = self.kinds.of(loop, settings)
+                known[settings] = _Case(prepared, Starts(prepared.parts), loop, family)
         return known[settings]
 
     # ---- flights ----

@@ -42,7 +42,11 @@ class Motion(eqx.Module):
 
     def deliver(self, inputs: Inputs) -> Inputs:
         """Return what the actuators make of wanted physical inputs (N, m)."""
-        return jax.vmap(self.plant.limit)(inputs) if self.limits else inputs
+        return jax.vmap(self.deliver_one)(inputs)
+
+    def deliver_one(self, u: Input) -> Input:
+        """Return what the actuators make of one agent's wanted physical input (m,)."""
+        return self.plant.limit(u) if self.limits else u
 
     def advance(self, states: States, inputs: Inputs, step: jax.Array) -> States:
         """Return the states (N, n) one dt later.

@@ -11,10 +11,10 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin
+from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm
-from echelon.engine.scalars import Rows, body_of
+from echelon.engine.scalars import Rows, body_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.kernels import SLOTS, Code, Plan, aligned, program
 from echelon.laws.law import Law, Memory
@@ -56,7 +56,7 @@ def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
         lanes=_LANES[bits],
         together=together,
         rows=rows.total,
-        width=n,
+        width=n + signals_of(loop),
         first=body_of(own, bits, rows, True, wanted),
         others=body_of(own, bits, rows, False, wanted),
         tell=rows.tell.start,
@@ -190,10 +190,14 @@ class NativeStepper(Stepper):
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
-        n = len(self.loop.offsets)
-        first = jax.tree.map(np.asarray, begin(self.loop, jnp.asarray(self.states[:n])))
-        many = jax.tree.map(lambda leaf: np.concatenate([leaf] * len(self.loops)), first[1:])
-        return Moment(first.step, *many)._replace(states=np.asarray(self.states, self.dtype))
+        parts = np.split(np.asarray(self.states), len(self.loops))
+        # Where nothing is remembered all begin alike.
+        loops = self.loops if len(self.rows.memory) else self.loops[:1]
+        found = [begin(loop, jnp.asarray(x)) for loop, x in zip(loops, parts)]
+        found = [jax.tree.map(np.asarray, moment) for moment in found]
+        found *= len(self.loops) // len(found)
+        many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(each[1:] for each in found))
+        return Moment(found[0].step, *many)._replace(states=np.asarray(self.states, self.dtype))
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
@@ -300,7 +304,7 @@ class NativeStepper(Stepper):
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
         self._write(rows.own, np.repeat(self.own.values, len(self.loop.offsets), axis=0))
-        self._show(x - offsets)
+        self._show(np.concatenate([x - offsets, *self._signals(now, offsets)], axis=1))
         memory = np.zeros((len(x), len(rows.memory)))
         for who, tree in ((self.leaders, now.leader_memory), (self.followers, now.follower_memory)):
             leaves = [np.asarray(leaf).reshape(len(who), -1) for leaf in jax.tree.leaves(tree)]
@@ -309,8 +313,24 @@ class NativeStepper(Stepper):
         self._write(rows.memory, memory)
         self._drawn = -1
 
+    def _signals(self, now: Moment, offsets: Array) -> list[Array]:
+        """Return what neighbours hear of all agents beside their states, (N, s), if anything."""
+        if not signals_of(self.loop):
+            return []
+        counts = [len(self.loop.offsets), len(self.loop.leaders), len(self.loop.followers)]
+        found = list[Array]()
+        for k, loop in enumerate(self.loops):
+            all_, led, others = (slice(k * count, (k + 1) * count) for count in counts)
+            mine = now._replace(
+                states=now.states[all_],
+                leader_memory=jax.tree.map(lambda leaf, led=led: leaf[led], now.leader_memory),
+                follower_memory=jax.tree.map(lambda leaf, o=others: leaf[o], now.follower_memory),
+            )
+            found.append(np.asarray(signals(loop, mine, jnp.asarray(offsets[all_]))))
+        return [np.concatenate(found)]
+
     def _show(self, values: Array) -> None:
-        """Write what neighbours read of all agents, (N, n)."""
+        """Write what neighbours read of all agents, (N, n), or more beside their states."""
         shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         if self.plan.together:
             self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)

@@ -147,7 +147,7 @@ class Swarm(Places):
             heavy,
             ((held // lanes) * rows * lanes + held % lanes).astype(np.int32),
             (self.of[nearest] * far).astype(np.int32),
-            *edge_blocks(loop, self, dtype),
+            *edge_blocks(loop, self, dtype, width),
         )
 
     def spacing(self, edges: Array) -> Array:
@@ -233,8 +233,10 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     return first, positions, np.where(there, weights[edge], 0.0)
 
 
-def edge_blocks(loop: Loop, places: Places, dtype: np.dtype) -> tuple[Array, Array]:
+def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, width: int) -> tuple[Array, Array]:
     """Return the edges in blocks for the sums of how far distances are off.
+
+    Neighbours read `width` numbers of each agent.
 
     Returns:
         Rows (blocks, q + 2, lanes): the differences of the goals, the distances that they make, and
@@ -243,7 +245,7 @@ def edge_blocks(loop: Loop, places: Places, dtype: np.dtype) -> tuple[Array, Arr
     """
     meter, lanes = loop.meter, places.lanes
     edges, q = np.asarray(meter.edges), len(meter.measured)
-    blocks, far = -(-len(edges) // lanes), stride(np.shape(loop.offsets)[1], lanes)
+    blocks, far = -(-len(edges) // lanes), stride(width, lanes)
     goals = np.asarray(meter.offsets)[:, list(meter.measured)]
     apart = np.resize(goals[edges[:, 0]] - goals[edges[:, 1]], (blocks * lanes, q))
     rows = aligned((blocks, q + 2, lanes), dtype)

@@ -50,6 +50,7 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
             settings,
             initial_states(parts, settings.seed),
         )
+        parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)
     warnings += formation_warnings(model, formation)
     # Model and drive may say the same; a dictionary keeps the first, and the order.

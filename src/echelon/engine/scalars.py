@@ -3,6 +3,7 @@
 It is traced from the same laws, model, integrator and meter that `loop` runs.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.engine.loop import Loop, tell, what_limits_did
+from echelon.engine.loop import Loop, act_alone, what_limits_did
 from echelon.engine.own import Own
 from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes
 from echelon.laws.law import Law, LocalView, Memory
@@ -85,7 +86,27 @@ def memory_size(law: Law) -> int:
 def told_by(loop: Loop) -> int:
     """Return how many numbers an agent sends besides its state."""
     n, m = len(loop.model.state_names), len(loop.model.input_names)
-    return jax.eval_shape(lambda x, v: tell(loop, x, v), jnp.zeros(n), jnp.zeros(m)).shape[0]
+    known = jnp.zeros(n), jnp.zeros(signals_of(loop) or n), jnp.zeros(m)
+
+    def told(x: Any, z: Any, sent: Any) -> Any:
+        view = LocalView(x[0], x, x, z, sent, loop.motion.dt)
+        return act_alone(loop, loop.leader, view, loop.leader.init())[3]
+
+    return jax.eval_shape(told, *known).shape[0]
+
+
+def signals_of(loop: Loop) -> int:
+    """Return how many numbers neighbours hear of an agent besides its state."""
+    nothing = jnp.zeros(len(loop.model.state_names))
+    law = loop.follower
+    said = jax.eval_shape(lambda: _said(loop, law, nothing, nothing, law.init()))
+    return said.shape[0]
+
+
+def _said(loop: Loop, law: Law, x: Any, offset: Any, memory: Memory) -> Any:
+    """Return the signal of an agent, of no numbers where it has none."""
+    signal = law.signal(loop.model, x, offset, memory)
+    return jnp.zeros(0, x.dtype) if signal is None else signal
 
 
 class _Known(NamedTuple):
@@ -122,6 +143,8 @@ class _Done(NamedTuple):
     unsettled: Any
     inside: Any
     chatter: Any
+    said: Any
+    saying: Any
 
 
 def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
@@ -130,19 +153,19 @@ def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
 
     def act(known: _Known) -> _Done:
         x, offset = known.x, known.offset
-        view = LocalView(known.t, x, offset, known.z, known.told)
-        asked, memory = law.update(model, view, known.memory)
-        u = motion.plant.limit(asked) if motion.limits else asked
+        view = LocalView(known.t, x, offset, known.z, known.told, motion.dt)
+        asked, u, memory, told = act_alone(loop, law, view, known.memory)
         limited, cut = what_limits_did(u, asked)
         read = meter.of_agent(known.step, known.steady, x, offset, known.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
         if known.wanted is not None:
             tracking, outputs = meter.of_leader(known.steady, x, offset, known.wanted)
+        state = motion.move(x, u, known.push, known.noise)
         return _Done(
-            state=motion.move(x, u, known.push, known.noise),
+            state=state,
             memory=memory,
             cut=cut,
-            tell=tell(loop, x, model.normalized(u)),
+            tell=told,
             input=u,
             errors=read.errors,
             tracking=tracking,
@@ -152,6 +175,8 @@ def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
             unsettled=read.unsettled,
             inside=read.inside,
             chatter=jnp.where((cut * known.before < 0.0).any(), 1.0, 0.0),
+            said=_said(loop, law, x, offset, known.memory),
+            saying=_said(loop, law, state, offset, memory),
         )
 
     return act
@@ -179,7 +204,7 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
         return _agent(whole, whole.leader if leads else whole.follower)(known)
 
     found = lower(act, graph, [own.leaves(_leaves(graph, "row", rows.own)), known])
-    shapes = jax.tree.structure(_Done(*[0] * 13)._replace(memory=law.init()))
+    shapes = jax.tree.structure(_Done(*[0] * 15)._replace(memory=law.init()))
     done: _Done = shapes.unflatten([nodes(graph, part) for part in found])
     remembered = jax.tree.leaves(done.memory, is_leaf=lambda part: isinstance(part, list))
     stores = {"state": done.state, "cut": done.cut, "memory": sum(remembered, start=[])}
@@ -188,28 +213,31 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
     sums = {name: getattr(done, name) for name in ("errors", "effort", "limited", "chatter")}
     if leads and follows:
         sums |= {"tracking": done.tracking, "outputs": done.outputs}
-    n = len(known.x)
-    # Of the model as it is: how far two states are apart is the same for all formations.
-    [difference] = lower(
-        loop.model.difference,
-        graph,
-        [_leaves(graph, kind, range(n)) for kind in ("own", "their")],
-    )
+    apart = functools.partial(map, functools.partial(graph.make, "apart"))
     return Body(
         stores=_placed(rows, stores),
         sums=_placed(rows, sums),
         greatest=_placed(rows, {"unsettled": done.unsettled}),
         least=_placed(rows, {"inside": done.inside}),
         shown=_placed(rows, {"input": done.input}),
-        now=[graph.make("apart", a, b) for a, b in zip(known.x, known.offset, strict=True)],
-        mirror=[graph.make("apart", a, b) for a, b in zip(done.state, known.offset, strict=True)],
-        difference=nodes(graph, difference),
+        now=[*apart(known.x, known.offset), *done.said],
+        mirror=[*apart(done.state, known.offset), *done.saying],
+        difference=_difference(loop, graph, len(known.x), len(done.said)),
     )
+
+
+def _difference(loop: Loop, graph: Graph, states: int, signals: int) -> list[Node]:
+    """Return the differences of what neighbours read: of states by the model, of signals plain."""
+    # Of the model as it is: how far two states are apart is the same for all formations.
+    own, their = (_leaves(graph, kind, range(states + signals)) for kind in ("own", "their"))
+    [found] = lower(loop.model.difference, graph, [own[:states], their[:states]])
+    plain = zip(own[states:], their[states:], strict=True)
+    return [*nodes(graph, found), *(graph.make("sub", a, b) for a, b in plain)]
 
 
 def _known(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follows: bool) -> _Known:
     """Return what a step rests on as leaves of a graph."""
-    n = len(rows.state)
+    n, signals = len(rows.state), signals_of(loop)
 
     def row(places: range) -> np.ndarray:
         return _leaves(graph, "row", places)
@@ -223,7 +251,7 @@ def _known(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follows:
         wanted=_leaves(graph, "table", range(n), True) if leads and follows else None,
         x=x,
         offset=offset,
-        z=_leaves(graph, "z", range(n)),
+        z=_leaves(graph, "z", range(n, n + signals) if signals else range(n)),
         # Nobody is before a leader whose input it could be sent.
         told=np.zeros(len(rows.input)) if leads else _leaves(graph, "told", range(len(rows.tell))),
         memory=_shaped(row(rows.memory[:size]), law.init()),

@@ -94,17 +94,19 @@ def _memory(law: Law) -> Any:
 def _view(law: Law, model: ControlAffine) -> LocalView:
     """Return what an agent may know, zeros all, with what it is sent in the shape it is sent in."""
     x, sent = jnp.zeros(len(model.state_names)), jnp.zeros(len(model.input_names))
+    signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
+    z = x if signal is None else jnp.zeros(signal.shape)
     if law.feedforward is not Feedforward.NONE:
         said = traced(
             LawError,
             f"`broadcast` of `{type(law).__name__}`",
-            lambda x, v: law.broadcast(model, x, v),
+            lambda x, v: law.message(model, x, v, _memory(law)),
             x,
             sent,
             advice=_ADVICE,
         ).result
         sent = jnp.zeros(said.shape)
-    return LocalView(jnp.zeros(()), x, x, x, sent)
+    return LocalView(jnp.zeros(()), x, x, z, sent)
 
 
 def _form(memory: Any) -> Any:

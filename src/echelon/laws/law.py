@@ -1,6 +1,7 @@
 """The interface of a control law, and all that one agent may know when it runs one."""
 
 import abc
+from collections.abc import Iterator
 from typing import Any, TypeAlias, final
 
 import equinox as eqx
@@ -29,9 +30,11 @@ class LocalView(eqx.Module):
         t: time, s.
         x: own state (n,).
         offset: own goal offset xi (n,).
-        disagreement: z = e + d (n,), from what the neighbours sent.
+        disagreement: z = e + d (n,), from what the neighbours sent; of signals where the law has
+            some.
         feedforward: what the agent's leader or parent sent, or zeros (m,): a normalized input (m,)
-            unless the law's `broadcast` says otherwise.
+            unless the law's `message` says otherwise.
+        period: how long the input will be held, s; 0 where nobody says.
 
     Raises:
         LawError: it is made of numbers where JAX computes in float32.
@@ -40,8 +43,9 @@ class LocalView(eqx.Module):
     t: Scalar
     x: State
     offset: State
-    disagreement: State
+    disagreement: Float[jax.Array, " s"]
     feedforward: Float[jax.Array, " k"]
+    period: Scalar | float = 0.0
 
     def __check_init__(self) -> None:
         """Refuse to lose digits without a word."""
@@ -62,9 +66,11 @@ class Law(eqx.Module):
     Attributes:
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
+        leaderward: whether followers hear those neighbours alone that are nearer to a leader.
     """
 
     feedforward = Feedforward.NONE
+    leaderward = False
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -97,9 +103,42 @@ class Law(eqx.Module):
         """
         return self
 
+    def following(self, leader: "Law", model: ControlAffine) -> "Law":
+        """Return a follower's prepared law, completed with what it must know of its leader's.
+
+        Raises:
+            LawError: it cannot follow a leader under that law.
+        """
+        return self
+
     def init(self) -> Memory:
         """Return one agent's memory before the first step; none unless replaced."""
         return None
+
+    def begin(self, model: ControlAffine, x: State) -> Memory:
+        """Return the memory of an agent that begins at x, in the form of `init`."""
+        return self.init()
+
+    def signal(
+        self, model: ControlAffine, x: State, offset: State, memory: Memory
+    ) -> Float[jax.Array, " s"] | None:
+        """Return what neighbours hear of an agent, of which z is made; None for x - offset."""
+        return None
+
+    def settle(
+        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
+    ) -> Memory:
+        """Return the memory once the actuators have made `got` of the `wanted` input (m,)."""
+        return memory
+
+    def message(
+        self, model: ControlAffine, x: State, v: Input, memory: Memory
+    ) -> Float[jax.Array, " k"]:
+        """Return what followers under this law are sent, of an agent with its memory after a step.
+
+        It is `broadcast` of the state and the input alone unless replaced.
+        """
+        return self.broadcast(model, x, v)
 
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return what followers under this law are sent of an agent at x with normalized input v.
@@ -108,6 +147,10 @@ class Law(eqx.Module):
         beyond that loop.
         """
         return v
+
+    def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
+        """Yield which of some starts (K, n) the law cannot take, by row, and why in words."""
+        yield from ()
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Return what is allowed but probably not meant, a sentence each."""

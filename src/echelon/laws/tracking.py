@@ -16,6 +16,7 @@ from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+from echelon.network.spectrum import Spectrum
 from echelon.references.flatness import follow_at
 from echelon.references.guide import Guide
 from echelon.references.reference import check_kind_of, check_reference
@@ -96,8 +97,8 @@ def tracking_gain(law: Law, model: ControlAffine, graph: Graph, gain: Gain | Non
     Raises:
         LawError: it does not fit the model.
     """
-    if gain is None:
-        gain = Riccati(coupling=1.0).solve(model, graph.spectrum())
-    check_gain_fits(law, model, gain.P.shape, gain.R.shape)
     # The coupling makes up for lambda_min of a network, and a leader hears its reference directly.
+    if gain is None:
+        gain = Riccati(coupling=1.0).solve(model, Spectrum(np.ones(1), 1, 1.0))
+    check_gain_fits(law, model, gain.P.shape, gain.R.shape)
     return gain if gain.coupling == 1.0 else eqx.tree_at(lambda g: g.coupling, gain, 1.0)

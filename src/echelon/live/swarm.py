@@ -19,6 +19,8 @@ from echelon.gains.gain import Gain
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.live.knobs import Knobs, Panel
 from echelon.models.model import ControlAffine
+from echelon.network.exchange import Exchange
+from echelon.network.graph import Graph
 from echelon.world.disturbance import Disturbance
 from echelon.world.world import World
 
@@ -49,9 +51,23 @@ class Dimmed(Law):
         )
         return self.law.update(model, dimmed, memory)
 
-    def broadcast(self, model: ControlAffine, x: State, v: Input) -> Any:
+    def begin(self, model: ControlAffine, x: State) -> Memory:
+        """Return what the law begins with at x."""
+        return self.law.begin(model, x)
+
+    def signal(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> Any:
+        """Return what neighbours hear."""
+        return self.law.signal(model, x, offset, memory)
+
+    def settle(
+        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
+    ) -> Memory:
+        """Return the memory once the actuators have acted."""
+        return self.law.settle(model, view, wanted, got, memory)
+
+    def message(self, model: ControlAffine, x: State, v: Input, memory: Memory) -> Any:
         """Return what the law sends."""
-        return self.law.broadcast(model, x, v)
+        return self.law.message(model, x, v, memory)
 
 
 class Picture(NamedTuple):
@@ -100,6 +116,7 @@ class Swarm:
         self.states, self.measured = problem.states, list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
+        self.edge = _edges_of(loop.exchange, parts.graph)
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
         self.restart()
@@ -123,10 +140,7 @@ class Swarm:
         """Let the loop run with the knobs so."""
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
-        edges = len(weights) // 2
-        for edge in knobs.cut:
-            # Both directions of an edge.
-            weights[[edge, edges + edge]] = 0.0
+        weights[np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
             lambda each: (each.offsets, each.exchange.weights, each.follower.share),
             self.loop,
@@ -176,6 +190,13 @@ class Swarm:
             errors = np.linalg.norm(away, axis=1)
         time = self.steps * self.settings.dt
         return Picture(time, states, np.asarray(inputs, np.float64), errors, self.offsets)
+
+
+def _edges_of(heard: Exchange, graph: Graph) -> Array:
+    """Return which edge each of the ways goes along on which agents hear each other."""
+    places = {tuple(sorted(pair)): k for k, pair in enumerate(graph.edges.tolist())}
+    pairs = zip(np.asarray(heard.receivers).tolist(), np.asarray(heard.senders).tolist())
+    return np.array([places[i, j] if i < j else places[j, i] for i, j in pairs])
 
 
 def _inner(law: Any) -> Any:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from echelon.core.errors import ModelError
 from echelon.core.limits import excess_states
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, check_not_negative
+from echelon.models.model import ControlAffine, FlatChains, check_not_negative
 
 _AXES = ("x", "y", "z")
 
@@ -38,6 +38,7 @@ class SingleIntegrator(ControlAffine):
     dimension: int = eqx.field(default=2, static=True)
 
     flat_order = 1
+    flat_bounds = ()
 
     def __check_init__(self) -> None:
         """Refuse a dimension below one."""
@@ -74,6 +75,11 @@ class SingleIntegrator(ControlAffine):
         return self.state_names
 
     @property
+    def flat_chains(self) -> FlatChains:
+        """One chain of one integrator an axis."""
+        return FlatChains((1,) * self.dimension, (0,) * self.dimension)
+
+    @property
     def flat_outputs(self) -> tuple[str, ...]:
         """The axes, up to three."""
         # A reference has three coordinates of space.
@@ -103,6 +109,7 @@ class DoubleIntegrator(ControlAffine):
     drag: float = 0.0
 
     flat_order = 2
+    flat_bounds = ()
 
     def __check_init__(self) -> None:
         """Refuse a dimension below one or a negative drag."""
@@ -145,6 +152,11 @@ class DoubleIntegrator(ControlAffine):
     def position(self) -> tuple[str, ...]:
         """The axes."""
         return _axes(self.dimension)
+
+    @property
+    def flat_chains(self) -> FlatChains:
+        """One chain of two integrators an axis."""
+        return FlatChains((2,) * self.dimension, (0,) * self.dimension)
 
     @property
     def flat_outputs(self) -> tuple[str, ...]:

@@ -65,6 +65,42 @@ class Limits(NamedTuple):
     high: tuple[float, ...]
 
 
+class FlatChains(NamedTuple):
+    """Which derivatives of its flat outputs a model's inputs reach first, and behind what.
+
+    Attributes:
+        degrees: of each flat output.
+        integrators: to be put before each input for that.
+    """
+
+    degrees: tuple[int, ...]
+    integrators: tuple[int, ...]
+
+
+class FlatBound(NamedTuple):
+    """A border of the flat coordinates: a derivative of a flat output stays above a value.
+
+    `within` says in words what else of the state that bounds.
+    """
+
+    output: str
+    derivative: int
+    above: float
+    within: str
+
+
+class Flattened(NamedTuple):
+    """A state in flat coordinates.
+
+    Attributes:
+        values: (r, m), the flat outputs and their derivatives below the inputs', else zero.
+        invert: wanted highest derivatives (m,) -> the normalized inputs (m,) behind integrators.
+    """
+
+    values: jax.Array
+    invert: Callable[[jax.Array], Input]
+
+
 class ControlAffine(eqx.Module):
     """One agent, xdot = f(x) + g(x) u with output y = h(x).
 
@@ -131,6 +167,13 @@ class ControlAffine(eqx.Module):
     flat_order: ClassVar[int] = 0
     """How many time derivatives of the reference `flat` needs."""
 
+    flat_chains: ClassVar[FlatChains | None] = None
+    """The chains of integrators that feedback makes of the agent; found at samples where None."""
+
+    flat_bounds: ClassVar[tuple[FlatBound, ...] | None] = None
+    """Where the flat coordinates of `flat_chains` end: nowhere where there are none, by the model's
+    own word; None where it does not say."""
+
     @abc.abstractmethod
     def drift(self, x: State) -> State:
         """Return f(x)."""
@@ -156,6 +199,20 @@ class ControlAffine(eqx.Module):
             f"model `{type(self).__name__}` cannot track a reference since it defines no `flat`; "
             "use the law `passive` for its leader, or add `flat_outputs`, `flat_order` and `flat`."
         )
+
+    def flatten(self, x: State, e: jax.Array) -> Flattened | None:
+        """Return the flat coordinates of a state whose `flat_chains` hold e; None for none known.
+
+        What is not known is found by automatic differentiation.
+        """
+        return None
+
+    def switch_on(self, x: State, ahead: jax.Array) -> jax.Array | None:
+        """Return what integrators before inputs hold first at a state (n,); None leaves it open.
+
+        `ahead` (r, m) are the flat outputs of what the agent follows, and their derivatives.
+        """
+        return None
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y; to be replaced where a coordinate is an angle that winds."""

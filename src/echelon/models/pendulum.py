@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from echelon.core.types import InputMap, State
-from echelon.models.model import ControlAffine, check_not_negative, check_positive
+from echelon.models.model import ControlAffine, FlatChains, check_not_negative, check_positive
 
 
 class Pendulum(ControlAffine):
@@ -20,6 +20,7 @@ class Pendulum(ControlAffine):
     state_units = ("rad", "rad/s")
     input_names = ("torque",)
     input_units = ("rad/s^2",)
+    flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
     def __check_init__(self) -> None:
         """Refuse a stiffness that is not positive or a negative damping."""

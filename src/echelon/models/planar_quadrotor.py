@@ -6,7 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, Limits, check_positive, diagonal
+from echelon.models.model import (
+    ControlAffine,
+    FlatBound,
+    FlatChains,
+    Limits,
+    check_positive,
+    diagonal,
+)
 from echelon.models.rotors import attitude_priority, fits
 
 # Right and left pairs of motors; each pair counts as one rotor with twice the thrust.
@@ -45,6 +52,7 @@ class PlanarQuadrotor(ControlAffine):
     flat_outputs = ("y", "z")
     # The path's second derivative sets the roll, whose second derivative is the torque.
     flat_order = 4
+    flat_chains = FlatChains((4, 4), (2, 0))
 
     def __check_init__(self) -> None:
         """Refuse parameters that are not positive."""
@@ -68,6 +76,11 @@ class PlanarQuadrotor(ControlAffine):
         # T = f1 + f2 and tau = arm (f1 - f2), solved for the thrusts.
         rows = tuple((0.5, sign / (2.0 * self.arm)) for sign in _LEFT)
         return Limits(rows, (0.0,) * 2, (self.motor_thrust,) * 2)
+
+    @property
+    def flat_bounds(self) -> tuple[FlatBound, ...]:
+        """Thrust stays above 0, and roll within 90 deg, where z'' stays above -g."""
+        return (FlatBound("z", 2, -self.gravity, "roll within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x): the rates, and free fall."""

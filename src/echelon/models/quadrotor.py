@@ -14,9 +14,20 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
-from echelon.models.model import ControlAffine, Limits, Rows, check_positive, diagonal, wound
+from echelon.models.model import (
+    ControlAffine,
+    FlatBound,
+    FlatChains,
+    Flattened,
+    Limits,
+    Rows,
+    check_positive,
+    diagonal,
+    wound,
+)
 from echelon.models.rigid_body import (
     attitude_along,
+    body_axes,
     body_rates,
     check_inertia,
     check_moments,
@@ -99,6 +110,7 @@ class Quadrotor(ControlAffine):
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the torque.
     flat_order = 4
+    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
     state_groups = {
         "position": ("x", "y", "z"),
         "velocity": ("vx", "vy", "vz"),
@@ -225,6 +237,36 @@ class Quadrotor(ControlAffine):
             jnp.concatenate([position, velocity, attitude(now), omega]),
             jnp.concatenate([thrust[None], torque]),
         )
+
+    @property
+    def flat_bounds(self) -> tuple[FlatBound, ...]:
+        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
+        # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three can pass 0 unless it does.
+        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
+
+    def flatten(self, x: State, e: jax.Array) -> Flattened:
+        """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""
+        # With a = T/m, p^(2) = a R e3 - g e3, and R' = R [omega]x makes p^(3) = R (a q, -a p, a')
+        # and p^(4) = R (2 a' q + a q' + a p r, -2 a' p - a p' + a q r, a'' - a (p^2 + q^2)).
+        (p, q, r), a, rate = x[9:12], self.gravity + e[0], e[1]
+        axes, turning = body_axes(x[6:9]), euler_rates(x[6:9], x[9:12])
+        fall = jnp.array([0.0, 0.0, -self.gravity], x.dtype)
+        jerk = axes @ jnp.stack([a * q, -a * p, rate])
+        path = jnp.stack([x[:3], x[3:6], axes[:, 2] * a + fall, jerk])
+        heading = jnp.pad(jnp.stack([x[8], turning[2]]), (0, 2))
+
+        def invert(tops: jax.Array) -> Input:
+            snap = tops[:3] @ axes
+            (sr, sp), (cr, cp) = jnp.sin(x[6:8]), jnp.cos(x[6:8])
+            p_dot = q * r - (2.0 * rate * p + snap[1]) / a
+            q_dot = (snap[0] - 2.0 * rate * q) / a - p * r
+            # yaw' is (sin(roll) q + cos(roll) r) / cos(pitch), and tops[3] its rate.
+            known = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
+            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - known) / cr])
+            spin = spin - free_spin(self.inertia, x[9:12])
+            return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
+
+        return Flattened(jnp.concatenate([path, heading[:, None]], axis=1), invert)
 
     def limit(self, u: Input) -> Input:
         """Return what four motors within [0, motor_thrust] deliver.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from echelon.core.numerics import derivatives as derivatives_of
 from echelon.core.types import Input, InputMap, Output, Scalar, State
-from echelon.models.model import ControlAffine, check_positive
+from echelon.models.model import ControlAffine, FlatBound, FlatChains, check_positive
 from echelon.models.rigid_body import attitude_along, lift_along, thrust_axis
 
 _GROUPS = {
@@ -60,11 +60,17 @@ class QuadrotorEuler(ControlAffine):
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the input.
     flat_order = 4
+    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
     weights = (_WEIGHTS, (1 / 25,) + (1 / 400,) * 3)
 
     def __check_init__(self) -> None:
         """Refuse a gravity that is not positive."""
         check_positive(self, gravity=self.gravity)
+
+    @property
+    def flat_bounds(self) -> tuple[FlatBound, ...]:
+        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
+        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
@@ -112,11 +118,17 @@ class QuadrotorThrust(ControlAffine):
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the input.
     flat_order = 4
+    flat_chains = FlatChains((4, 4, 4, 2), (1, 0, 0, 0))
     weights = ((*_WEIGHTS, 0.04), (1 / 25,) + (1 / 400,) * 3)
 
     def __check_init__(self) -> None:
         """Refuse a gravity that is not positive."""
         check_positive(self, gravity=self.gravity)
+
+    @property
+    def flat_bounds(self) -> tuple[FlatBound, ...]:
+        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
+        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

@@ -64,6 +64,14 @@ def thrust_axis(zeta: Vector) -> Vector:
     return jnp.stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
 
 
+def body_axes(zeta: Vector) -> Float[jax.Array, "3 3"]:
+    """Return R, whose columns are the body's axes in the world frame."""
+    (sr, sp, sy), (cr, cp, cy) = jnp.sin(zeta), jnp.cos(zeta)
+    ahead = jnp.stack([cp * cy, cp * sy, -sp])
+    left = jnp.stack([sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp])
+    return jnp.stack([ahead, left, thrust_axis(zeta)], axis=1)
+
+
 def euler_rates(zeta: Vector, omega: Vector) -> Vector:
     """Return zetadot = W(zeta) omega (rad/s) from the body rate; singular at pitch +-90 deg."""
     sr, cr = jnp.sin(zeta[0]), jnp.cos(zeta[0])

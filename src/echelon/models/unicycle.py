@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, State
-from echelon.models.model import ControlAffine, check_positive, diagonal, wound
+from echelon.models.model import ControlAffine, FlatChains, check_positive, diagonal, wound
 
 
 def _drive(derivatives: jax.Array) -> tuple[State, Input]:
@@ -31,6 +31,11 @@ class Unicycle(ControlAffine):
     state_groups = {"position": ("x", "y")}
     flat_outputs = ("x", "y")
     flat_order = 2
+    flat_chains = FlatChains((2, 2), (1, 0))
+
+    def switch_on(self, x: State, ahead: jax.Array) -> jax.Array:
+        """Return the speed of what it follows."""
+        return jnp.hypot(*ahead[1])[None]
 
     def drift(self, x: State) -> State:
         """Return f = 0."""

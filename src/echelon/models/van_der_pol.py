@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from echelon.core.types import InputMap, State
-from echelon.models.model import ControlAffine, check_not_negative
+from echelon.models.model import ControlAffine, FlatChains, check_not_negative
 
 
 class VanDerPol(ControlAffine):
@@ -13,6 +13,7 @@ class VanDerPol(ControlAffine):
 
     state_names = ("position", "velocity")
     input_names = ("force",)
+    flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
 
     def __check_init__(self) -> None:
         """Refuse a damping that is negative or not finite."""

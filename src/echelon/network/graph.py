@@ -69,8 +69,8 @@ class Graph:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         self._check_connected()
         self._spectrum: Spectrum | None = None
-        # Gains and runs share a graph, and its spectrum is kept: what cannot change cannot go
-        # stale.
+        self._nearest: tuple[int, ...] = ()
+        # Runs share a graph, and its spectrum is kept: what cannot change cannot go stale.
         for array in (self.edges, self.weights):
             array.setflags(write=False)
 
@@ -256,9 +256,11 @@ class Graph:
 
     def nearest_leader(self) -> tuple[int, ...]:
         """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
-        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
-        # `argmin` takes the first of equals, and leaders are sorted.
-        return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
+        if not self._nearest:
+            hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+            # `argmin` takes the first of equals, and leaders are sorted.
+            self._nearest = tuple(self.leaders[k] for k in np.atleast_2d(hops).argmin(axis=0))
+        return self._nearest
 
     def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
         """Return the agents by how far they are from the leaders, each with its earlier neighbours.
@@ -299,14 +301,16 @@ class Graph:
         parents[child] = parent
         return tuple(parents.tolist())
 
-    def exchange(self) -> "Exchange":
-        """Return the computation of the disagreement on this graph, ready for JAX."""
-        i, j = self.edges.T
-        return Exchange(
-            receivers=np.concatenate([i, j]),
-            senders=np.concatenate([j, i]),
-            weights=np.concatenate([self.weights, self.weights]),
-        )
+    def exchange(self, leaderward: bool = False) -> "Exchange":
+        """Return the computation of the disagreement; leaderward, of those nearer a leader."""
+        (i, j), weights = self.edges.T, self.weights
+        receivers, senders = np.concatenate([i, j]), np.concatenate([j, i])
+        weights = np.concatenate([weights, weights])
+        if leaderward:
+            depth = self.depths()
+            nearer = depth[senders] < depth[receivers]
+            receivers, senders, weights = receivers[nearer], senders[nearer], weights[nearer]
+        return Exchange(receivers=receivers, senders=senders, weights=weights)
 
     def disagreement(self, y: States) -> States:
         """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""

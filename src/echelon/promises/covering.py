@@ -27,7 +27,8 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     if promise.theorem is None or not len(result.times):
         return
     what = "proof" if promise.kind is Kind.PROOF else "promise on the domain"
-    left, limited = first_exit(result, promise), float(result.saturated.max())
+    left = None if promise.region is None else first_exit(result, promise)
+    limited = float(result.saturated.max())
     against, remedy = promise.without, "leave it out to see what it costs"
     if left is not None:
         against = f"agent {left.agent} left the domain at {left.time:.4g} s (`{left.name}`)"
@@ -43,6 +44,8 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
 
 def _stayed(promise: Promise) -> str:
     """Return why a run is covered that stayed in the domain."""
+    if promise.theorem is Theorem.T5:
+        return f"no limit acted, and from these starts {promise.hypotheses[Hypothesis.STARTS].text}"
     if promise.theorem is Theorem.T2:
         return "the leader stayed in the domain, and small errors about it shrink"
     starts = promise.hypotheses[Hypothesis.STARTS]

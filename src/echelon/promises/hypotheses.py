@@ -31,14 +31,19 @@ _LINEAR = Kind.LINEARIZATION
 
 def hypotheses(case: Case) -> Iterator[Statement]:
     """Yield what any promise of the loop near the trim rests on."""
-    yield _trim_applied(case)
-    yield _trim_held(case)
-    yield _exact(case)
-    yield _agreement(case)
+    yield from agent_lines(case)
     yield _symmetric(case)
     yield _smooth(case)
     yield _matched(case)
     yield from modes(case)
+
+
+def agent_lines(case: Case) -> Iterator[Statement]:
+    """Yield what any promise asks of the agents and their leaders."""
+    yield _trim_applied(case)
+    yield _trim_held(case)
+    yield _exact(case)
+    yield _agreement(case)
 
 
 # ---- the agents and their leaders ---------------------------------------------------------------

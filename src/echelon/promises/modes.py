@@ -26,7 +26,7 @@ def _linear(case: Case) -> Iterator[Statement]:
     yield _coupled(case)
     yield _decaying(case)
     yield _along(case)
-    yield _held(case)
+    yield held(case)
 
 
 # ---- where the model bends ----------------------------------------------------------------------
@@ -140,7 +140,7 @@ def _along(case: Case) -> Statement:
     return Statement(name, Verdict.FAILS, Kind.SAMPLES, found.rate, shown, text, remedy, text)
 
 
-def _held(case: Case) -> Statement:
+def held(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
     name, loop, settings = Hypothesis.STEP, case.loop, case.settings
     if not (loop.every and case.governed):

@@ -11,10 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 
 from echelon.core import linear
-from echelon.core.linear import held_radius
+from echelon.core.linear import flows, held_radius, held_step
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
@@ -93,9 +92,9 @@ class Slopes(NamedTuple):
     def _exponent(self, span: float) -> float:
         """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
         J = self.A[:, None] - self.B[:, None] @ self.gains
-        flows = scipy.linalg.expm(span * J)
-        product, logs = flows[0], np.zeros(J.shape[1])
-        for flow in flows[1:]:
+        each = flows(span * J)
+        product, logs = each[0], np.zeros(J.shape[1])
+        for flow in each[1:]:
             sizes = np.linalg.norm(product, axis=(1, 2))
             # Sizes apart, since a product of two hundred would be beyond all numbers.
             logs += np.log(sizes)
@@ -115,6 +114,13 @@ class Slopes(NamedTuple):
             return 0.0
         A, B, gains = self.A[:, None], self.B[:, None], self.gains
         return held_radius(A, B, gains, settings.dt, settings.integrator)
+
+    def decaying(self, settings: Settings) -> Array:
+        """Return about which states, (K,), held steps decay wherever the loops themselves do."""
+        A, B, gains = self.A[:, None], self.B[:, None], self.gains
+        F, G = held_step(A, B, settings.dt, settings.integrator)
+        radii = np.abs(np.linalg.eigvals(F - G @ gains)).max(axis=(1, 2))
+        return (self.growth() >= 0.0) | (radii < 1.0)
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which every loop decays; infinite of none."""
@@ -175,12 +181,34 @@ def longest_step(loop: Loop, frozen: Frozen | None, settings: Settings) -> float
     return min(steps)
 
 
+class _Rows(NamedTuple):
+    """What K agents are asked with: times, their leader's states and inputs, their own states."""
+
+    times: Array
+    leaders: Array
+    inputs: Array
+    states: Array
+
+
 class _Path(NamedTuple):
-    """Moments (K,), the leader's states (K, n) then, and its normalized inputs (K, m)."""
+    """Moments (K,), the leader's states (K, n) then, its normalized inputs (K, m), and its trim."""
 
     times: Array
     states: Array
     inputs: Array
+    trim: Array
+
+    @property
+    def rows(self) -> _Rows:
+        """What followers at the leader's own states are asked with."""
+        return _Rows(self.times, self.states, self.inputs, self.states)
+
+    def at_start(self, states: Array) -> _Rows:
+        """Return what followers in states (K, n) are asked with at the beginning."""
+        led = self.states[0] if len(self.times) else self.trim
+        sent = self.inputs[0] if len(self.times) else np.zeros(self.inputs.shape[1])
+        leaders, inputs = (np.tile(one, (len(states), 1)) for one in (led, sent))
+        return _Rows(np.zeros(len(states)), leaders, inputs, states)
 
 
 def frozen_of(
@@ -196,21 +224,38 @@ def frozen_of(
     path = _path(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
-    few = starts[np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))]
-    first = path.inputs[:1] if len(path.times) else np.zeros((1, len(parts.model.input_names)))
-    led = path.states[:1] if len(path.times) else trim[None]
-    rows = _Rows(
-        np.append(path.times, np.zeros(len(few))),
-        np.concatenate([path.states, np.repeat(led, len(few), axis=0)]),
-        np.concatenate([path.inputs, np.repeat(first, len(few), axis=0)]),
-        np.concatenate([path.states, few]),
-    )
+    few = starts[_few(starts)]
+    both = zip(path.rows, path.at_start(few), strict=True)
+    rows = _Rows._make(map(np.concatenate, both))
     count, all_ = len(path.times), _followers(parts, loop, rows)
     along, begun = (Slopes(*(x[part] for x in all_)) for part in (slice(count), slice(count, None)))
     found = Frozen(path.times, along, _leader(parts.model, parts.drive.leader, along), begun, "")
     if not count or not found.growth().lost:
         return found
     return found._replace(blamed=_blamed(parts, loop, path, found))
+
+
+def frozen_at(
+    parts: Parts, settings: Settings, loop: Loop, leaders: Leaders, states: Array
+) -> Slopes:
+    """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
+
+    They are those of `frozen_of`, the same number of each run after the other.
+    """
+    starts = states - parts.formation.offsets
+    starts = starts[:, _few(starts[0])]
+    rows = _path(parts, settings, leaders).at_start(starts.reshape(-1, starts.shape[2]))
+    size = _MOMENTS + _STARTS
+    found = [
+        _followers(parts, loop, _Rows._make(part[k : k + size] for part in rows))
+        for k in range(0, len(rows.times), size)
+    ]
+    return Slopes._make(map(np.concatenate, zip(*found, strict=True)))
+
+
+def _few(starts: Array) -> Array:
+    """Return which agents' starts (N, n) are looked at."""
+    return np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))
 
 
 # ---- where the leader goes ----------------------------------------------------------------------
@@ -224,16 +269,16 @@ def _path(parts: Parts, settings: Settings, leaders: Leaders) -> _Path:
     wanted = parts.drive.reference_states(model, twice)
     if wanted is not None:
         v = np.asarray(_inputs(model, wanted[:_MOMENTS], wanted[_MOMENTS:]))
-        path = _Path(times, np.asarray(wanted[:_MOMENTS]), v)
-        known = np.isfinite(path.states).all(axis=1) & np.isfinite(v).all(axis=1)
-        return _Path(*(part[known] for part in path))
+        states = np.asarray(wanted[:_MOMENTS])
+        known = np.isfinite(states).all(axis=1) & np.isfinite(v).all(axis=1)
+        return _Path(times[known], states[known], v[known], trim)
     own = None
     if leaders.rest and not (leaders.starts == trim).all():
         own = own_paths(parts, settings, leaders.starts[:1])
     if own is None:
-        return _Path(np.zeros(0), np.zeros((0, len(trim))), np.zeros((0, m)))
+        return _Path(np.zeros(0), np.zeros((0, len(trim))), np.zeros((0, m)), trim)
     frames = np.linspace(0, len(own) - 1, _MOMENTS).round().astype(int)
-    return _Path(times, own[frames, 0], np.zeros((_MOMENTS, m)))
+    return _Path(times, own[frames, 0], np.zeros((_MOMENTS, m)), trim)
 
 
 @eqx.filter_jit
@@ -248,15 +293,6 @@ def _inputs(model: ControlAffine, now: States, soon: States) -> jax.Array:
 
 
 # ---- the laws there -----------------------------------------------------------------------------
-
-
-class _Rows(NamedTuple):
-    """What K agents are asked with: times, their leader's states and inputs, their own states."""
-
-    times: Array
-    leaders: Array
-    inputs: Array
-    states: Array
 
 
 def _followers(parts: Parts, loop: Loop, rows: _Rows) -> Slopes:

@@ -6,14 +6,18 @@ integrator, feed-forward, limits and starts that run; what a gain says of itself
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, cast, final
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from echelon.certificates.certificate import RegionCertificate
 from echelon.core.numerics import precision
+from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
+from echelon.engine.initial import Starts
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.settings import Settings
@@ -22,11 +26,14 @@ from echelon.promises.case import Case
 from echelon.promises.certified_set import CertifiedSet, certified_set, set_lines
 from echelon.promises.claims import claims_line
 from echelon.promises.closed_loop import Loop, loop_of
-from echelon.promises.hypotheses import hypotheses
+from echelon.promises.hypotheses import agent_lines, hypotheses
 from echelon.promises.leaders import leaders_of
-from echelon.promises.path import Frozen, frozen_of, longest_step
+from echelon.promises.modes import held
+from echelon.promises.path import Frozen, Slopes, frozen_at, frozen_of, longest_step
 from echelon.promises.region import region_of, slopes_beside, weaken
 from echelon.promises.statement import Cause, Hypothesis, Statement
+from echelon.promises.stopping import Stopping, condition_lines, drift_reason, stopping_of
+from echelon.promises.tube import Tube, tube_of
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -46,6 +53,8 @@ class Promise:
         without: what acts on the agents that is left out, in words; empty without any.
         own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         frozen: the laws away from the trim; None where they are not looked at.
+        tube: what T5 promises; None under other laws, or where it promises nothing.
+        hold: the longest step that T5 allows, s; None under other laws.
     """
 
     loop: Loop
@@ -57,6 +66,8 @@ class Promise:
     without: str
     own: float | None
     frozen: Frozen | None
+    tube: Tube | None = None
+    hold: float | None = None
 
     @property
     def linear(self) -> bool:
@@ -75,15 +86,19 @@ class Promise:
         return not self.reasons
 
     @property
+    def _ground(self) -> RegionCertificate | Tube | None:
+        return (self.tube or self.region) if self.promised else None
+
+    @property
     def theorem(self) -> Theorem | None:
         """The theorem behind the promise; None where it is the linearization alone, or nothing."""
-        region = self.region if self.promised else None
+        region = self._ground
         return None if region is None else region.theorem
 
     @property
     def kind(self) -> Kind:
         """The kind of argument behind the promise."""
-        region = self.region if self.promised else None
+        region = self._ground
         return Kind.LINEARIZATION if region is None else region.kind
 
     @property
@@ -94,7 +109,8 @@ class Promise:
         """
         if not self.promised:
             return None
-        return -self.loop.slowest if self.region is None else self.region.rate
+        ground = self._ground
+        return -self.loop.slowest if ground is None else ground.rate
 
     @property
     def edge(self) -> float | None:
@@ -104,6 +120,8 @@ class Promise:
     @property
     def slowest(self) -> float | None:
         """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
+        if self.tube is not None:
+            return -self.tube.rate
         return self.loop.slowest if self.linear else None
 
     @property
@@ -113,6 +131,8 @@ class Promise:
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
+        if self.hold is not None:
+            return self.hold
         return longest_step(self.loop, self.frozen, settings)
 
     @property
@@ -142,6 +162,10 @@ class Promise:
 
     def _promised(self) -> str:
         region = self.region
+        if self.tube is not None:
+            text = self.tube.sentence()
+            without = f" This is said without what the scenario adds: {self.without}."
+            return text + without if self.without else text
         if self.linear:
             text = "by linearization: followers that start near enough to their goals, with the "
             text += f"leader near enough to the trim, converge to them{self.condition}"
@@ -194,6 +218,7 @@ class Promise:
                 "kind": str(found.kind),
                 "why": found.why,
             },
+            "anywhere": None if self.tube is None else self.tube.as_mapping(),
             "hypotheses": [each.as_mapping() for each in self.hypotheses.values()],
         }
 
@@ -220,12 +245,68 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     return known[settings]
 
 
+def promises(parts: Parts, settings: Sequence[Settings]) -> Iterator[Promise]:
+    """Yield what is promised of parts under settings that differ in the seed alone.
+
+    Each is what `promise` returns; what no seed changes is computed once.
+
+    Raises:
+        EchelonError: as in `promise`.
+    """
+    alike = (s for s in _kept.get(parts, {}) if s._replace(seed=0) == settings[0]._replace(seed=0))
+    first, prepared = promise(parts, next(alike, settings[0])), prepare(parts, settings[0])
+    if _asks_where(prepared.parts, first.loop) and first.frozen is None:
+        # Nobody leaves the trim, and a seed may be what does.
+        yield from (promise(parts, each) for each in settings)
+        return
+    with precision("float64"):
+        states = np.stack(list(map(Starts(prepared.parts), (each.seed for each in settings))))
+        leaders, slopes = leaders_of(prepared.parts, states[0]), None
+        decays: Array = np.ones((len(states), 1), bool)
+        if first.frozen is not None:
+            slopes = frozen_at(prepared.parts, settings[0], first.loop, leaders, states)
+            decays = slopes.decaying(settings[0]).reshape(len(states), -1)
+    case = Case(prepared.parts, settings[0], first.loop, leaders, first.region, None, first.frozen)
+    for k, each in enumerate(settings):
+        began = None if slopes is None else Slopes(*(_part(x, k, len(states)) for x in slopes))
+        yield _started(first, case._replace(settings=each), states[k], began, bool(decays[k].all()))
+
+
+def _part(array: Array, k: int, parts: int) -> Array:
+    size = len(array) // parts
+    return array[k * size : (k + 1) * size]
+
+
+def _started(
+    first: Promise, case: Case, states: Array, began: Slopes | None, decays: bool
+) -> Promise:
+    """Return a promise as it is where agents start in other states (N, n)."""
+    lines, frozen = dict(first.hypotheses), first.frozen
+    if frozen is not None and began is not None:
+        frozen = frozen._replace(starts=began)
+        # The line tells of where they start only if steps grow there.
+        holds = lines[Hypothesis.STEP].verdict is Verdict.HOLDS
+        if case.smooth and not (holds and decays):
+            lines[Hypothesis.STEP] = held(case._replace(frozen=frozen))
+    for line in set_lines(case.parts, states, first.region, first.certified):
+        lines[cast(Hypothesis, line.statement)] = line
+    told = MappingProxyType(lines)
+    return dataclasses.replace(first, hypotheses=told, frozen=frozen)
+
+
+def _asks_where(parts: Parts, loop: Loop) -> bool:
+    """Tell whether laws are looked at away from the trim."""
+    # What does not decay at the trim has nothing to lose elsewhere.
+    return loop.every and parts.drive.metric(parts.model) is not None
+
+
 def _compute(prepared: Prepared, settings: Settings) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
+    run = stopping_of(parts, settings, states)
+    if run is not None:
+        return _anywhere(run, Case(parts, settings, loop, leaders, None, None, None))
     region = region_of(parts, leaders)
-    # What does not decay at the trim has nothing to lose elsewhere.
-    asked = loop.every and parts.drive.metric(parts.model) is not None
     case = Case(
         parts,
         settings,
@@ -233,7 +314,7 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         leaders,
         region.certificate,
         slopes_beside(parts) if at_trim(parts.model).bends.any() else None,
-        frozen_of(parts, settings, loop, leaders, states) if asked else None,
+        frozen_of(parts, settings, loop, leaders, states) if _asks_where(parts, loop) else None,
     )
     lines = list(hypotheses(case))
     region = weaken(parts, region, lines)
@@ -251,4 +332,17 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         without=case.disturbed,
         own=None if leaders.rest else leaders.slowest,
         frozen=case.frozen,
+    )
+
+
+def _anywhere(run: Stopping, case: Case) -> Promise:
+    """Return what is promised under the law `stopping-point`."""
+    found, drifts = tube_of(run), drift_reason(run)
+    lines = [*agent_lines(case), *condition_lines(run), *found.lines]
+    lines += [drifts] if drifts is not None else []
+    kept = MappingProxyType({cast(Hypothesis, x.statement): x for x in lines})
+    tube = None if any(line.reason for line in kept.values() if line.fails) else found.tube
+    own = case.leaders.slowest
+    return Promise(
+        case.loop, None, None, kept, "", "", case.disturbed, own, None, tube, run.longest_step
     )

@@ -6,14 +6,12 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.sweeps.axes import SEED
-from echelon.sweeps.dataset import succeeded
+from echelon.sweeps.dataset import share_bounds, succeeded
 
 if TYPE_CHECKING:
     import xarray as xr
 
 _LINES = 20
-_Z = 1.96
-"""Of a normal distribution, within which 95 % lie."""
 
 
 def sweep_mapping(data: "xr.Dataset") -> dict[str, Any]:
@@ -86,14 +84,6 @@ def _share(count: int, total: int) -> str:
         return "none of 0"
     low, high = share_bounds(count, total)
     return f"{count} of {total} ({100 * low:.3g} to {100 * high:.3g} % at 95 %)"
-
-
-def share_bounds(count: int, total: int) -> tuple[float, float]:
-    """Return the interval of a probability behind `count` of `total` at 95 % (Wilson, 1927)."""
-    share, spread = count / total, _Z**2 / total
-    middle = (share + spread / 2) / (1 + spread)
-    half = _Z * np.sqrt(share * (1 - share) / total + spread / (4 * total)) / (1 + spread)
-    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
 
 
 def _quantiles(values: Array) -> list[float] | None:

@@ -14,6 +14,9 @@ from echelon.engine.result import Result, finite_or_none
 from echelon.engine.sums import SETTLED, output_error
 from echelon.models.model import ControlAffine
 
+_FEW = 8
+"""Agents of which all pairs are looked at sooner than the nearest are found."""
+
 
 class LeaderMetrics(NamedTuple):
     """Root-mean-square deviation of a leader from its reference; None without a reference.
@@ -186,10 +189,11 @@ def _minimum_distance(result: Result) -> float | None:
     axes = result.model.position_indices()
     if not axes or not len(result.times):
         return None
+    places = result.states[:, :, list(axes)]
+    if places.shape[1] <= _FEW:
+        i, j = np.triu_indices(places.shape[1], 1)
+        return finite_or_none(np.linalg.norm(places[:, i] - places[:, j], axis=2).min())
     from scipy.spatial import KDTree
 
-    nearest = [
-        KDTree(points).query(points, k=2)[0][:, 1].min()
-        for points in result.states[:, :, list(axes)]
-    ]
+    nearest = [KDTree(points).query(points, k=2)[0][:, 1].min() for points in places]
     return finite_or_none(min(nearest))

@@ -4,6 +4,7 @@ Names are looked up in the registry alone.
 """
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -40,7 +41,7 @@ from echelon.scenario.checks import section
 from echelon.scenario.own import own_code
 from echelon.scenario.part import Part, accepted, known, law_part, offered, part_of
 from echelon.scenario.scenario import Fault, Scenario, refuse
-from echelon.scenario.sections import GainSpec
+from echelon.scenario.sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.scenario.yaml import joined
 from echelon.world.disturbance import Disturbance
 from echelon.world.plant import check_plant, vary_parameters
@@ -307,6 +308,7 @@ def _follower(
     part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
     _check_keys(scenario, faults, "follower", part)
     offers: dict[str, Any] = {"feedforward": spec.feedforward, "trim": spec.trim}
+    offers |= _stopping(spec)
     if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)
@@ -315,10 +317,21 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
+def _stopping(spec: LeaderSpec | FollowerSpec) -> dict[str, Any]:
+    """Return the keys of the law `stopping-point` that a role gives."""
+    given = {name: getattr(spec, name, None) for name in _STOPPING_KEYS}
+    given = {name: value for name, value in given.items() if value is not None}
+    return given | ({"speed": math.inf} if given.get("speed") == "inf" else {})
+
+
+_STOPPING_KEYS = ("roots", "rate", "coupling", "speed", "observer", "hears")
+_LAW_KEYS = ("gain", "feedforward", "trim", *_STOPPING_KEYS)
+
+
 def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:
     """Note the keys of a role that its law does not take, which of one's own its class knows."""
     for key in section(scenario.data, role):
-        if key in ("gain", "feedforward", "trim") and key not in accepted(part.cls):
+        if key in _LAW_KEYS and key not in accepted(part.cls):
             with faults.at(role, str(key)):
                 raise ScenarioError(
                     f"got a key that the law `{part.what}` does not take, allowed are those that "
@@ -358,7 +371,13 @@ def _leader(
         "start_error": spec.start_error,
         "horizon": scenario.simulation.horizon,
         "limits": scenario.simulation.limits,
+        # One inner loop for all, unless the file says otherwise.
+        **{k: v for k, v in _stopping(scenario.follower).items() if k in ("roots", "rate")},
     }
+    own = _stopping(spec)
+    if {"roots", "rate"} & own.keys():
+        offers = {key: value for key, value in offers.items() if key not in ("roots", "rate")}
+    offers |= own
     if spec.gain is not None:
         with faults.at("leader", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)

@@ -16,8 +16,9 @@ from echelon.scenario.yaml import Document, KeyPath, are, shown
 Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
-_TRACKS = ("tracking", "lqr", "optimal-tracking")
-"""The leader laws that follow a reference."""
+_STOPPING = "stopping-point"
+_TRACKS = ("tracking", "lqr", "optimal-tracking", _STOPPING)
+"""The leader laws that follow a reference; the last one does without, too."""
 
 # Of these two keys a section has one at most; True where it must have one.
 SOURCES: dict[str, tuple[str, str, bool]] = {
@@ -65,6 +66,9 @@ def law_of(data: Part, role: str) -> object:
     default = "consensus"
     if role == "leader":
         default = "passive" if data.get("reference") is None else "tracking"
+        # Its followers are sent what no other law has.
+        if law_of(data, "follower") == _STOPPING:
+            default = _STOPPING
     return section(data, role).get("law", default)
 
 
@@ -259,7 +263,7 @@ def _members(data: Part) -> Iterator[Finding]:
 def _following(data: Part) -> Iterator[Finding]:
     """Yield a leader that tracks nothing, and a reference that nobody tracks."""
     law, given = law_of(data, "leader"), data.get("reference") is not None
-    if law in _TRACKS and not given:
+    if law in _TRACKS and law != _STOPPING and not given:
         yield (
             ("leader", "law"),
             f"got `{law}` without a `reference`, a leader that tracks needs one.",

@@ -114,6 +114,11 @@ FOLLOWER_LAWS = {
         "u = u_ff - c R^-1 g(x)^T P (e + d)",
         takes=("gain", "feedforward", "trim"),
     ),
+    "stopping-point": Entry(
+        "echelon.laws:StoppingPoint",
+        "agree on where each would come to rest; converges from anywhere",
+        takes=("roots", "rate", "coupling", "speed", "observer", "feedforward", "hears"),
+    ),
     "agreement": Entry(
         "echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"
     ),
@@ -131,6 +136,11 @@ LEADER_LAWS = {
         "echelon.optimal.leader:OptimalTracking",
         "a plan of least tracking error, and feedback about it",
         takes=("gain",),
+    ),
+    "stopping-point": Entry(
+        "echelon.laws:StoppingLeader",
+        "the followers' law of that name, led by the reference",
+        takes=("roots", "rate", "coupling", "speed", "observer"),
     ),
     "agreement": FOLLOWER_LAWS["agreement"],
     "passive": FOLLOWER_LAWS["passive"],

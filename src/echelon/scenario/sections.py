@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward
+from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Hears
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -26,6 +26,7 @@ from echelon.scenario.values import (
     Parameters,
     Positive,
     Seed,
+    Speed,
     Unit,
 )
 
@@ -217,6 +218,19 @@ class LeaderSpec(BaseModel, **STRICT):
     start_error: Annotated[dict[str, float], Unit("the states'")] = {}
     """How far the leader starts from its reference, or from its trim without one, by state or group
     of states, in the states' units."""
+    roots: Annotated[tuple[Positive, ...] | None, Field(strict=False), Unit("1/s")] = None
+    """Of the law `stopping-point`: roots of the inner loop, 1/s, one fewer than the longest chain
+    of the model; different from each other."""
+    rate: Annotated[Positive | None, Unit("1/s")] = None
+    """Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."""
+    coupling: Annotated[Positive | None, Unit("1/s")] = None
+    """Of the law `stopping-point`: how fast the leader comes to its reference; default
+    twice the slowest root, or what the step holds."""
+    speed: Annotated[Speed | None, Unit("the outputs' per s")] = None
+    """Of the law `stopping-point`: the speed that agreement may ask for, of each flat output or of
+    all, such as m/s; `inf` for none."""
+    observer: bool | None = None
+    """Of the law `stopping-point`: whether what the model lacks is estimated and opposed."""
     gain: GainSpec | None = None
     """Gain of the leader's own tracking, under `tracking` and `optimal-tracking`; default the
     model's Riccati gain."""
@@ -230,6 +244,22 @@ class FollowerSpec(BaseModel, **STRICT):
     """Name of a law, or one of one's own, `{python: file.py:Class}` with its own keys."""
     gain: GainSpec = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
+    roots: Annotated[tuple[Positive, ...] | None, Field(strict=False), Unit("1/s")] = None
+    """Of the law `stopping-point`: roots of the inner loop, 1/s, one fewer than the longest chain
+    of the model; different from each other."""
+    rate: Annotated[Positive | None, Unit("1/s")] = None
+    """Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."""
+    coupling: Annotated[Positive | None, Unit("1/s")] = None
+    """Of the law `stopping-point`: strength of the agreement, 1/s over the graph's
+    weights; default twice the slowest root over lambda_min, or what the step holds."""
+    speed: Annotated[Speed | None, Unit("the outputs' per s")] = None
+    """Of the law `stopping-point`: the speed that agreement may ask for, of each flat output or of
+    all, such as m/s; `inf` for none."""
+    observer: bool | None = None
+    """Of the law `stopping-point`: whether what the model lacks is estimated and opposed."""
+    hears: Annotated[str, OneOf(map(str, Hears))] | None = None
+    """Of the law `stopping-point`: `all` neighbours are heard, or `leaderward` those alone that are
+    nearer to a leader."""
     feedforward: Annotated[str, OneOf(map(str, Feedforward))] = str(DEFAULT_FEEDFORWARD)
     """What every follower is sent of the same step: `none`, nothing; `relay`, the leader's input;
     `relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer to the

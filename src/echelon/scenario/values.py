@@ -127,6 +127,10 @@ Edge = Annotated[
 ]
 Edges = Annotated[tuple[Edge, ...], Field(strict=False)]
 Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
+Speed = Annotated[
+    Literal["inf"] | Positive | Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)],
+    Allowed("is a positive number, a list of such, or `inf`", ["inf"]),
+]
 Matrix = Annotated[
     Numbers | Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)],
     AfterValidator(_square),

@@ -65,6 +65,9 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     if reference is not None:
         found = asked(parts.model, reference, settings.horizon)
         yield _reference_line(parts.model, found, settings)
+    if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
+        yield from _flat_lines()
+        return
     monotone = _monotone_line(parts, promise)
     yield monotone
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
@@ -136,6 +139,16 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
         remedy += "without"
     verdict, shown = Verdict.of(holds), f"{worst:.3g}"
     return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
+
+
+def _flat_lines() -> Iterator[Statement]:
+    """Assumption 5, Lemma 4 and the conditions on P where stopping points agree (T5)."""
+    text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
+    yield Statement(Line.MONOTONE, Verdict.HOLDS, _PROOF, 0.0, "0", text)
+    text = "for offsets of every flat output: they are symmetries of the chains"
+    yield Statement(Line.ALONG, Verdict.HOLDS, _PROOF, text=text)
+    for name in (Line.PRINTED, Line.FINITE):
+        yield Statement(name, Verdict.NOT_NEEDED, _PROOF, text="T5 asks nothing of a P")
 
 
 def _printed_lmi(parts: Parts, promise: Promise) -> float:

@@ -12,6 +12,7 @@ from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Drive
 from echelon.engine.initial import initial_states
+from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
@@ -22,6 +23,7 @@ from echelon.gains.gain import Gain, Method, synthesize
 from echelon.gains.inner_loop import InnerLoop
 from echelon.gains.riccati import Riccati
 from echelon.laws.consensus import Consensus
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.optimal.drives import Plans, RecedingHorizon
 from echelon.promises.promise import Promise, promise
 from echelon.results.metrics import Metrics, metrics
@@ -29,7 +31,15 @@ from echelon.scenario import registry
 from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
 
-LABELS = ("literal", "riccati-relay", "riccati", "inner-loop", "optimization", "mpc")
+LABELS = (
+    "literal",
+    "riccati-relay",
+    "riccati",
+    "inner-loop",
+    "stopping-point",
+    "optimization",
+    "mpc",
+)
 OWN = "own"
 """Asks for what drives the agents in the scenario itself."""
 
@@ -291,6 +301,9 @@ _DRIVES: Mapping[str, DriveOf] = {
     "riccati-relay": _consensus(_riccati, Feedforward.RELAY),
     "riccati": _consensus(_riccati, Feedforward.NONE),
     "inner-loop": _consensus(_synthesized(InnerLoop()), Feedforward.RELAY),
+    "stopping-point": lambda parts: Laws(
+        StoppingLeader(reference=_reference(parts)), StoppingPoint()
+    ),
     "optimization": lambda parts: Plans(_reference(parts)),
     "mpc": lambda parts: RecedingHorizon(_reference(parts)),
 }

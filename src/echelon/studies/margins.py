@@ -25,6 +25,10 @@ _STIFF = 1e10
 def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
+    if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
+        text = "any coupling; what delay is left depends on c and the graph alone"
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        return
     if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
         verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
         if not promise.linear:

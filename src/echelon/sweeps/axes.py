@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
-from echelon.scenario.yaml import inline_yaml, read_yaml, shown
+from echelon.scenario.yaml import inline_yaml, read_yaml
 
 SEED = "seed"
 """The key that changes what is drawn and nothing else."""
@@ -95,5 +95,5 @@ def _range(item: Any, place: str) -> Sequence[Any]:
         return (item,)
     first, last = map(int, found.groups())
     if last < first:
-        raise ScenarioError(f"{place}: got {shown(item)}, and a range must not fall.")
+        raise ScenarioError(f"{place}: got `{item}`, and a range must not fall.")
     return range(first, last + 1)

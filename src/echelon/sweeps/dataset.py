@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from echelon.sweeps.sweep import Batch
 
+_Z = 1.96
+"""Of a normal distribution, within which 95 % lie."""
 _SECONDS = ("settling_time", "worst_settling_time")
 _WHAT = {
     "outcome": "how the run ended",
@@ -110,3 +112,11 @@ def succeeded(dataset: "xr.Dataset", error: float | None = None) -> "xr.DataArra
     if error is None:
         return reached & dataset["worst_settling_time"].notnull()
     return reached & (dataset["worst_final_error"] < error)
+
+
+def share_bounds(count: Any, total: Any) -> tuple[Any, Any]:
+    """Return the interval of a probability behind `count` of `total` at 95 % (Wilson, 1927)."""
+    share, spread = count / total, _Z**2 / total
+    middle = (share + spread / 2) / (1 + spread)
+    half = _Z * np.sqrt(share * (1 - share) / total + spread / (4 * total)) / (1 + spread)
+    return np.clip(middle - half, 0.0, 1.0), np.clip(middle + half, 0.0, 1.0)

@@ -66,6 +66,11 @@ class Sweep:
         """How many runs there are."""
         return int(np.prod([1, *self.shape], dtype=object))
 
+    @property
+    def seeds(self) -> int:
+        """How many runs each case has."""
+        return int(np.prod([len(axis.values) for axis in self.axes if axis.key == SEED]))
+
     @cached_property
     def order(self) -> list[int]:
         """The axes from the slowest to the fastest, seeds last."""
@@ -75,10 +80,9 @@ class Sweep:
         """Return a run by its number."""
         found = np.unravel_index(number, [self.shape[k] for k in self.order])
         place = dict(zip(self.order, map(int, found), strict=True))
-        seeds = [k for k, axis in enumerate(self.axes) if axis.key == SEED]
-        case = number // int(np.prod([self.shape[k] for k in seeds]))
-        seed = self.axes[seeds[0]].values[place[seeds[0]]] if seeds else None
-        return Run(tuple(place[k] for k in range(len(self.axes))), case, seed)
+        drawn = (int(a.values[place[k]]) for k, a in enumerate(self.axes) if a.key == SEED)
+        here = tuple(place[k] for k in range(len(self.axes)))
+        return Run(here, number // self.seeds, next(drawn, None))
 
     def runs(self, first: int, count: int) -> Iterator[Run]:
         """Yield runs by their numbers."""

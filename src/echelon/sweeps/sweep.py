@@ -1,11 +1,14 @@
 """The verb: all runs of a sweep, batch by batch."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, final
 
 from echelon.core.errors import EchelonError, Outcome
 from echelon.engine.many import Fleet
-from echelon.promises.promise import promise
+from echelon.engine.result import Result
+from echelon.kernels import is_installed
+from echelon.promises.promise import Promise, promises
 from echelon.scenario.build import Built, build
 from echelon.scenario.scenario import Scenario
 from echelon.sweeps.axes import axes_of
@@ -16,8 +19,10 @@ from echelon.sweeps.plan import Run, Sweep
 if TYPE_CHECKING:
     import xarray as xr
 
-_AGENT_STEPS, _MOST = 20_000_000, 2_500
-"""Of a batch: a second or two of native code."""
+_AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
+"""Of a batch: a second or two of native code, and as many runs as a vector has lanes."""
+_SLOWER = 20
+"""How many times slower JAX is."""
 _FRAMES = 20
 """That a run is looked at: for what is not finite, or beyond the range of native code."""
 
@@ -92,25 +97,35 @@ def compute(
             progress(done, plan.count)
 
     told()
-    for first, count in _missing(plan.count, before, cases.size):
+    for first, count in _missing(plan.count, before, cases.size, plan.seeds):
         keep(Batch(first, columns_of(_rows(fleet, cases, first, count, told))))
         done += count
         told()
 
 
-def _missing(runs: int, before: Sequence[Batch], size: int) -> Iterator[tuple[int, int]]:
-    """Yield the batches (first, count) that are to do."""
+def _missing(
+    runs: int, before: Sequence[Batch], size: int, seeds: int = 1
+) -> Iterator[tuple[int, int]]:
+    """Yield the batches (first, count) that are to do, of so many runs.
+
+    Of more seeds than a batch holds none shares a batch with another case's; else all of a case
+    are in one.
+    """
+    whole = seeds if seeds > size else size - size % seeds
     at = 0
     for first, end in [*sorted((b.first, b.first + b.runs) for b in before), (runs, runs)]:
         while at < first:
             # Cut where batches begin, so that the same runs are computed together as without a
             # break, to the same bits.
-            count = min(first, at - at % size + size) - at
+            begun = at - at % whole
+            inner = at - (at - begun) % size + size
+            count = min(first, inner, begun + whole) - at
             yield at, count
             at += count
         at = max(at, end)
 
 
+@final
 class _Cases:
     """The scenarios of a sweep but for their seeds, each built once."""
 
@@ -118,8 +133,9 @@ class _Cases:
         self.plan = plan
         self.last: tuple[int, Built | str] = 0, build(plan.case((0,) * len(plan.axes)))
         settings, graph = self.last[1].settings, self.last[1].parts.graph
-        steps = settings.steps * graph.agents
-        self.size = max(1, min(_MOST, _AGENT_STEPS // steps))
+        fast = settings.engine != "jax" and is_installed()
+        most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
+        self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
 
     def built(self, run: Run) -> Built | str:
         """Return the parts and settings of a run, or why they cannot be made."""
@@ -143,18 +159,26 @@ def _rows(
     """Return what some runs came to."""
     built = [cases.built(run) for run in cases.plan.runs(first, count)]
     flown = [each for each in built if not isinstance(each, str)]
-    results = fleet.fly(flown, told)
+    results, told_of = fleet.fly(flown, told), _promised(flown)
     rows = list[dict[str, Any]]()
     for each in built:
-        if isinstance(each, str):
-            rows.append(refused(each))
-            continue
-        result = next(results)
-        if isinstance(result, EchelonError):
-            rows.append(refused(str(result)))
-            continue
-        if result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
-            raise KeyboardInterrupt
-        rows.append(numbers_of(result, promise(*each)))
+        found = each if isinstance(each, str) else next(results)
+        before = None if isinstance(each, str) else next(told_of)
+        if isinstance(found, Result) and isinstance(before, Promise):
+            if found.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
+                raise KeyboardInterrupt
+            rows.append(numbers_of(found, before))
+        else:
+            rows.append(refused(str(before if isinstance(found, Result) else found)))
         told()
     return rows
+
+
+def _promised(built: Sequence[Built]) -> Iterator[Promise | EchelonError]:
+    """Yield what is promised of runs, of which neighbours often differ in the seed alone."""
+    for _, alike in groupby(built, key=lambda each: id(each.parts)):
+        runs = list(alike)
+        try:
+            yield from promises(runs[0].parts, [each.settings for each in runs])
+        except EchelonError as error:
+            yield from [error] * len(runs)

@@ -19,6 +19,7 @@ from echelon.verifier.findings import Finding, facts, said
 from echelon.verifier.graph import drawn, spanned
 from echelon.verifier.modes import linearized
 from echelon.verifier.region import regional
+from echelon.verifier.tube import read_tube, tube_findings
 
 # Rounding in the last digits of P, in units in which its diagonal is one.
 _SKEW = 1e-12
@@ -45,24 +46,27 @@ class Verified(NamedTuple):
 
 
 def verify(path: PathLike, model: ControlAffine | None = None) -> Verified:
-    """Recompute what a saved gain promises, from its file alone.
+    """Recompute what a saved gain, or a run under the law `stopping-point`, promises.
 
     Args:
-        path: a file that `save_gain` wrote.
+        path: a file that `save_gain` wrote; or the `summary.json` of a run, or what `check --json`
+            printed, of which the tube of T5 is recomputed.
         model: the agents, where they are no bundled model; without them what rests on their
             equations is not checked, and the verdict is `incomplete`.
 
     Raises:
         GainError: the file is no gain, or lacks a part.
     """
-    saved, findings = read(path), list[Finding]()
+    tube = read_tube(path)
+    found = _findings(read(path), model) if tube is None else tube_findings(tube)
+    findings = list[Finding]()
     # Numbers of a false file may overflow: what is not finite fails the comparisons that follow.
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            for finding in _findings(saved, model):
+            for finding in found:
                 findings.append(finding)
-        except (ArithmeticError, TypeError, ValueError) as error:
+        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             # Numbers at which an algorithm gives up are no certificate.
             findings.append(said("all of it can be computed", False, text=str(error)))
     return _verdict(tuple(findings))

@@ -1,0 +1,198 @@
+"""What a chain of integrators under q(D) v = -k0 w does at most, in rationals.
+
+The roots of q are whole multiples of a unit, so that with x = exp(-unit t) every response is a
+polynomial in x on (0, 1], and what it is at most is found by Bernstein's coefficients, which
+enclose a polynomial and are halved until the enclosure is tight. Upper bounds all, and near ones
+(theory page, T5).
+"""
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import NamedTuple, final
+
+from echelon.core.errors import GainError
+
+_FINE = Fraction(1, 2**40)
+"""Of the unit interval; what is not told apart on so short a piece is bounded by its size."""
+_CLOSE = Fraction(1, 10**9)
+_HIGHEST = 300
+"""Degree in x; roots with a smaller common unit are refused."""
+
+Poly = dict[int, Fraction]
+"""Coefficients by power of x, none below 1: responses that end in zero."""
+
+
+@final
+class Chain(NamedTuple):
+    """q by its roots.
+
+    Attributes:
+        powers: each root over the unit, ascending and distinct.
+        unit: 1/s.
+    """
+
+    powers: tuple[int, ...]
+    unit: Fraction
+
+    @classmethod
+    def of(cls, roots: Sequence[float]) -> "Chain":
+        """Return the chain of roots (1/s), each as its shortest decimal says.
+
+        Raises:
+            GainError: they have no common unit that is large enough.
+        """
+        exact = [Fraction(repr(float(root))) for root in sorted(roots)]
+        if not exact:
+            return cls((), Fraction(1))
+        scale = math.lcm(*(root.denominator for root in exact))
+        unit = Fraction(math.gcd(*(int(root * scale) for root in exact)), scale)
+        powers = tuple(int(root / unit) for root in exact)
+        if powers[-1] > _HIGHEST:
+            raise GainError(
+                f"`roots` {list(map(float, exact))} are multiples of {float(unit):.3g} alone, and "
+                f"must be at most {_HIGHEST} times their common unit for a proof."
+            )
+        return cls(powers, unit)
+
+    @property
+    def stiffness(self) -> Fraction:
+        """k0 = q(0)."""
+        return math.prod((n * self.unit for n in self.powers), start=Fraction(1))
+
+    def impulse(self) -> Poly:
+        """Return h, the response of v to an impulse of -w; it is positive with integral 1."""
+        found = Poly()
+        for n in self.powers:
+            apart = ((other - n) * self.unit for other in self.powers if other != n)
+            found[n] = self.stiffness / math.prod(apart, start=Fraction(1))
+        return found
+
+    def free(self, start: Sequence[Fraction]) -> Poly:
+        """Return v from (v, v', ...) at t = 0 without any w; the start is as long as the roots."""
+        rows = [[(-n * self.unit) ** order for n in self.powers] for order in range(len(start))]
+        return dict(zip(self.powers, _solve(rows, list(start)), strict=True))
+
+    def rate(self, p: Poly) -> Poly:
+        """Return the time derivative."""
+        # x' = -unit x.
+        return {n: -n * self.unit * c for n, c in p.items()}
+
+    def derivative(self, p: Poly, order: int) -> Poly:
+        """Return the derivative of an order."""
+        for _ in range(order):
+            p = self.rate(p)
+        return p
+
+    def gain(self, order: int) -> Fraction:
+        """Return a bound of sup |v^(order)| over sup |w|, from rest.
+
+        It is the integral of |h^(order)|, which is how far h^(order - 1) goes up and down; of the
+        highest order w itself adds k0.
+        """
+        if order == 0:
+            return Fraction(1)
+        if not self.powers:
+            return Fraction(0)
+        direct = self.stiffness if order == len(self.powers) else Fraction(0)
+        kernel = self.derivative(self.impulse(), order - 1)
+        return direct + spread_between(kernel, Fraction(0), Fraction(1))
+
+
+def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
+    """Return the solution of linear equations, exactly."""
+    n = len(right)
+    table = [[*row, b] for row, b in zip(rows, right, strict=True)]
+    for k in range(n):
+        best = next(i for i in range(k, n) if table[i][k])
+        table[k], table[best] = table[best], table[k]
+        table[k] = [entry / table[k][k] for entry in table[k]]
+        for i in range(n):
+            if i != k and table[i][k]:
+                table[i] = [a - table[i][k] * b for a, b in zip(table[i], table[k], strict=True)]
+    return [row[n] for row in table]
+
+
+# ---- polynomials on the unit interval ------------------------------------------------------------
+
+
+def value(p: Poly, x: Fraction) -> Fraction:
+    """Return p(x)."""
+    return sum((c * x**n for n, c in p.items()), Fraction(0))
+
+
+def add(*some: Poly) -> Poly:
+    """Return the sum of polynomials."""
+    return {n: sum((p.get(n, Fraction(0)) for p in some), Fraction(0)) for p in some for n in p}
+
+
+def largest_between(p: Poly, low: Fraction, high: Fraction, negative: bool = False) -> Fraction:
+    """Return a bound that p, or -p, is not above on [low, high], too high by 1e-9 of it at most."""
+    sign = -1 if negative else 1
+    start = [sign * c for c in _bernstein(_moved(p, low, high))]
+    best = max(start[0], start[-1])
+    bound, pieces = best, [start]
+    while pieces:
+        piece = pieces.pop()
+        best = max(best, piece[0], piece[-1])
+        if max(piece) <= best + _CLOSE * (1 + abs(best)):
+            bound = max(bound, *piece)
+        else:
+            pieces += _halved(piece)
+    return bound
+
+
+def spread_between(p: Poly, low: Fraction, high: Fraction) -> Fraction:
+    """Return a bound of the total variation of p on [low, high]: how far it goes up and down."""
+    p = _moved(p, low, high)
+    slope = {n - 1: n * c for n, c in p.items() if n}
+    total, pieces = Fraction(0), [(_bernstein(slope), Fraction(0), Fraction(1))]
+    while pieces:
+        piece, a, width = pieces.pop()
+        if min(piece) >= 0 or max(piece) <= 0:
+            # Of one sign, so that the integral of |p'| is the difference of p.
+            total += abs(value(p, a + width) - value(p, a))
+        elif width <= _FINE:
+            total += width * max(map(abs, piece))
+        else:
+            left, right = _halved(piece)
+            half = width / 2
+            pieces += [(left, a, half), (right, a + half, half)]
+    return total
+
+
+def peak(p: Poly) -> Fraction:
+    """Return a bound of |p| on [0, 1]."""
+    return max(largest_between(p, Fraction(0), Fraction(1), sign) for sign in (False, True))
+
+
+def _moved(p: Poly, low: Fraction, high: Fraction) -> Poly:
+    """Return p(low + (high - low) x)."""
+    if (low, high) == (0, 1):
+        return p
+    found, width = dict[int, Fraction](), high - low
+    for n, c in p.items():
+        for k in range(n + 1):
+            more = c * math.comb(n, k) * low ** (n - k) * width**k
+            found[k] = found.get(k, Fraction(0)) + more
+    return found
+
+
+def _bernstein(p: Poly) -> list[Fraction]:
+    """Return Bernstein's coefficients on [0, 1], between whose ends p lies."""
+    degree = max(p, default=0)
+    share = [p.get(n, Fraction(0)) / math.comb(degree, n) for n in range(degree + 1)]
+    return [
+        sum((math.comb(k, i) * share[i] for i in range(k + 1)), Fraction(0))
+        for k in range(degree + 1)
+    ]
+
+
+def _halved(b: list[Fraction]) -> tuple[list[Fraction], list[Fraction]]:
+    """Return the coefficients on both halves (de Casteljau)."""
+    left, right, row = [b[0]], [b[-1]], b
+    while len(row) > 1:
+        row = [(p + q) / 2 for p, q in zip(row, row[1:])]
+        left.append(row[0])
+        right.append(row[-1])
+    return left, right[::-1]

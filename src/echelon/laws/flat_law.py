@@ -1,0 +1,210 @@
+"""What leaders and followers have in common under the law `stopping-point`."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.errors import LawError, ModelError, listing
+from echelon.core.types import Array, Input, State
+from echelon.laws.flat_loop import FlatLoop, Held
+from echelon.laws.law import Law, LocalView
+from echelon.models.chains import Chains, chains_of, flatten, switch_on
+from echelon.models.model import ControlAffine, FlatBound
+
+Speed: TypeAlias = float | tuple[float, ...]
+
+RATE = 4.0
+"""Of the slowest root, 1/s, unless it is given."""
+SPEED, LEAD_SPEED = 2.5, 1.5
+"""Of followers and leaders, m/s and rad/s, unless given: with the default roots both together leave
+a vehicle its thrust, from any place (9.81 / 2.416 m/s; theory page, T5)."""
+_SPREAD = 0.125
+"""Roots of a rate r are r, 1.125 r, 1.25 r, ..: apart, as the certificate wants them."""
+_LEAST = 1e-3
+"""Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
+
+
+def plain_speeds(given: float | Sequence[float]) -> Speed:
+    """Return speeds as plain numbers, which a compiled step takes for constants."""
+    return tuple(map(float, given)) if isinstance(given, Sequence | np.ndarray) else given
+
+
+class FlatLaw(Law):
+    """An agent whose loop is closed in flat coordinates, and which speaks of zeta.
+
+    Args:
+        roots: of q, 1/s, distinct and positive; one fewer than the longest chain of the model.
+        rate: the slowest root, from which the others are made, in place of `roots`.
+        coupling: c > 0.
+        speed: s, of all outputs or one each, in their units per second; infinite is linear.
+        observer: whether what the model lacks is estimated and opposed.
+        loop: of the model; found by `prepared`.
+    """
+
+    roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
+    rate: float | None = eqx.field(default=None, static=True)
+    coupling: float | None = None
+    speed: Speed = eqx.field(default=SPEED, converter=plain_speeds)
+    observer: bool = eqx.field(default=True, static=True)
+    loop: FlatLoop | None = None
+
+    def __check_init__(self) -> None:
+        """Refuse roots that are not distinct and positive, and other numbers that are not."""
+        if self.roots is not None and self.rate is not None:
+            raise LawError("got `roots` and `rate`, allowed is one of them.")
+        for name in ("rate", "coupling"):
+            value = getattr(self, name)
+            if isinstance(value, int | float) and not 0.0 < value < math.inf:
+                raise LawError(f"`{name}` is {value}, and must be a positive finite number.")
+        roots = (1.0,) if self.roots is None else self.roots
+        if not isinstance(roots, Sequence) or not all(map(_positive, roots)):
+            raise LawError(
+                f"`roots` are {self.roots}, and must be a list of positive numbers, 1/s."
+            )
+        if len(set(roots)) < len(roots):
+            raise LawError(f"`roots` are {list(roots)}, and must be different from each other.")
+        speeds = self.speed if isinstance(self.speed, Sequence) else (self.speed,)
+        if not all(isinstance(s, int | float) and s > 0.0 for s in speeds):
+            raise LawError(
+                f"`speed` is {self.speed}, and must be positive, or a list of such numbers."
+            )
+
+    # ---- numbers ----
+
+    def roots_for(self, count: int) -> tuple[float, ...]:
+        """Return the first roots of q, the slowest first."""
+        if self.roots is not None:
+            return tuple(sorted(self.roots))[:count]
+        rate = RATE if self.rate is None else self.rate
+        return tuple(rate * (1.0 + _SPREAD * k) for k in range(count))
+
+    @property
+    def slowest_root(self) -> float:
+        """The slowest root, 1/s."""
+        return self.roots_for(1)[0]
+
+    @property
+    def fastest(self) -> float:
+        """The sum of all roots, 1/s, of the longest chain."""
+        return sum(self.roots_for(max(self.ready.chains.degrees) - 1))
+
+    @property
+    def ready(self) -> FlatLoop:
+        """The loop of a prepared law.
+
+        Raises:
+            LawError: it is not prepared.
+        """
+        if self.loop is None:
+            raise LawError(
+                f"`{type(self).__name__}` has no loop yet; call `prepared(model, graph)` first."
+            )
+        return self.loop
+
+    def speed_of(self, output: int) -> float:
+        """Return s of an output."""
+        return float(self.speed[output] if isinstance(self.speed, Sequence) else self.speed)
+
+    def found_loop(self, model: ControlAffine) -> FlatLoop:
+        """Return the inner loop for a model.
+
+        Raises:
+            LawError: the model has no flat coordinates, or roots or speeds are not as many as it
+                needs.
+        """
+        try:
+            chains = chains_of(model)
+        except ModelError as error:
+            raise LawError(str(error)) from None
+        needed, m = max(chains.degrees) - 1, len(chains.outputs)
+        if self.roots is not None and len(self.roots) != needed:
+            raise LawError(
+                f"`roots` are {list(self.roots)}, and `{type(model).__name__}` needs {needed}: its "
+                f"longest chain is of {needed + 1} integrators."
+            )
+        if isinstance(self.speed, Sequence) and len(self.speed) != m:
+            raise LawError(
+                f"`speed` has {len(self.speed)} numbers, and must be one, or one for each of "
+                f"{listing(chains.outputs)}."
+            )
+        return FlatLoop.of(chains, self.roots_for(needed), self.observer)
+
+    def bounded(self, x: jax.Array) -> jax.Array:
+        """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
+        # By the inverse, which is 0 where s is infinite and sigma is linear.
+        inverse = 1.0 / jnp.asarray(self.speed, x.dtype)
+        return x / jnp.sqrt(1.0 + (x * inverse) ** 2)
+
+    # ---- what any agent does ----
+
+    def begun(self, model: ControlAffine, x: State, ahead: jax.Array) -> Held:
+        """Return the memory of an agent that begins at x and follows what has these derivatives."""
+        return self.ready.begun(model, x, switch_on(model, self.ready.chains, x, ahead))
+
+    def init(self) -> Held:
+        """Return a memory in its form."""
+        return self.ready.nothing()
+
+    def signal(self, model: ControlAffine, x: State, offset: State, memory: Held) -> jax.Array:
+        """Return zeta less the offset, (m,)."""
+        return self.ready.place(model, x, offset, memory)
+
+    def message(self, model: ControlAffine, x: State, v: Input, memory: Held) -> jax.Array:
+        """Return zeta', (m,)."""
+        return memory.rate
+
+    def settle(
+        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Held
+    ) -> Held:
+        """Return the memory with what the actuators made of the input."""
+        return self.ready.settle(model, view.x, wanted, got, memory, view.period)
+
+    def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
+        """Yield the starts outside of the model's flat coordinates."""
+        for bound in model.flat_bounds or ():
+            yield from _outside(self.ready.chains, model, states, bound)
+
+
+def _positive(root: object) -> bool:
+    return isinstance(root, int | float) and 0.0 < root < math.inf
+
+
+def _outside(
+    chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
+) -> Iterator[tuple[int, str]]:
+    """Yield the rows of states (K, n) from which the inputs push a bounded output the wrong way."""
+    output = chains.outputs.index(bound.output)
+    both = np.concatenate([[np.asarray(model.trim[0], float)], states])
+    upright, *ways = np.asarray(_pushes(chains, model, jnp.asarray(both), output)).tolist()
+    for k, (x, way) in enumerate(zip(states.tolist(), ways, strict=True)):
+        off = [name for name, v in zip(model.state_names, x) if not _charted(model, name, v)]
+        # At the border the thrust that is level is infinite, and beyond it is turned downward.
+        if off or not way / upright > _LEAST:
+            i = model.state_names.index(off[0]) if off else None
+            why = f"`{bound.output}` is not pushed upward there"
+            why = why if i is None else f"`{off[0]}` is {x[i]:.4g} {model.state_units[i]}".rstrip()
+            yield k, f"{why}, allowed is {bound.within}"
+
+
+def _charted(model: ControlAffine, name: str, value: float) -> bool:
+    low, high = model.chart.get(name, (-math.inf, math.inf))
+    return low < value < high
+
+
+@eqx.filter_jit
+def _pushes(chains: Chains, model: ControlAffine, states: jax.Array, output: int) -> jax.Array:
+    """Return how the first integrator before an input moves what it reaches of an output, (K,)."""
+    order = chains.degrees[output] - max(chains.integrators)
+
+    def one(x: State) -> jax.Array:
+        def derivative(e: jax.Array) -> jax.Array:
+            return flatten(model, chains, x, e).values[order, output]
+
+        return jax.grad(derivative)(jnp.zeros(chains.size, x.dtype))[0]
+
+    return jax.vmap(one)(states)

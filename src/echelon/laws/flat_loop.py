@@ -1,0 +1,198 @@
+"""What each agent does alone under the law `stopping-point`: an inner loop that feels no position.
+
+In flat coordinates q(D) y' = k0 zeta', where zeta = q(D) y / k0 is where the agent would come to
+rest if nobody spoke (theory page, T5). Integrators before inputs are part of the loop's memory.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.models.chains import Chains, flat_output, flatten
+from echelon.models.model import ControlAffine
+
+_WATCH = (16.0, 64.0)
+"""Of the observer, 1/s and 1/s^2: both its modes at 8 1/s, twice as fast as a quick inner loop."""
+
+
+class Held(NamedTuple):
+    """What an agent remembers.
+
+    Attributes:
+        chain: what the integrators before inputs hold, normalized (k,).
+        rate: zeta' that it commands, (m,), which followers may be sent.
+        got: the normalized input (m,) that the actuators made in the step before.
+        base, push: of the observer (m,): the speed that the model expects but for the half step
+            at whose end it is asked, and the acceleration that the model lacks.
+        half: half of the step before, s; 0 at first.
+    """
+
+    chain: jax.Array
+    rate: jax.Array
+    got: jax.Array
+    base: jax.Array
+    push: jax.Array
+    half: jax.Array
+
+
+@final
+class FlatLoop(eqx.Module):
+    """The inner loop of one agent.
+
+    Attributes:
+        chains: of the model.
+        weights: (r, m) k_l / k0 of each output, zero beyond its q.
+        stiffness: (m,) k0.
+        observer: whether what the model lacks is estimated and opposed.
+    """
+
+    chains: Chains = eqx.field(static=True)
+    weights: Array
+    stiffness: Array
+    observer: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, chains: Chains, roots: tuple[float, ...], observer: bool) -> "FlatLoop":
+        """Return the loop with the poles -roots; a shorter chain takes the first of them."""
+        r, m = max(chains.degrees), len(chains.degrees)
+        weights, stiffness = np.zeros((r, m)), np.ones(m)
+        for k, degree in enumerate(chains.degrees):
+            q = np.poly(-np.array(roots[: degree - 1]))[::-1]
+            weights[:degree, k], stiffness[k] = q / q[0], q[0]
+        return cls(chains, weights, stiffness, observer)
+
+    # ---- memory ----
+
+    def nothing(self) -> Held:
+        """Return a memory in its form."""
+        zero = jnp.zeros(len(self.stiffness))
+        return Held(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()))
+
+    def begun(self, model: ControlAffine, x: State, chain: jax.Array) -> Held:
+        """Return the memory of an agent that begins at x, the model being right."""
+        zero = jnp.zeros(len(self.stiffness), x.dtype)
+        held = Held(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
+        return held._replace(base=self._watched(model, x, held.got)[0])
+
+    # ---- coordinates ----
+
+    def place(self, model: ControlAffine, x: State, offset: State, held: Held) -> jax.Array:
+        """Return zeta less the offset, (m,): where the agent would come to rest."""
+        outputs = self.chains.outputs
+        shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
+        return self.stop(self._seen(model, x, held)) - shift
+
+    def stop(self, values: jax.Array) -> jax.Array:
+        """Return zeta (m,) of flat coordinates (r, m)."""
+        return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
+
+    def _seen(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
+        """Return the flat coordinates (r, m), and what the model lacks in them."""
+        values = flatten(model, self.chains, x, held.chain).values
+        if not self.observer:
+            return values
+        for order, more in zip((2, 3), (held.push, self._learned(model, x, held)), strict=True):
+            inside = np.array(self.chains.degrees) > order
+            if inside.any():
+                values = values.at[order].add(jnp.where(inside, more, 0.0))
+        return values
+
+    # ---- a step ----
+
+    def obey(
+        self, model: ControlAffine, x: State, rate: jax.Array, held: Held, period: Scalar | float
+    ) -> tuple[Input, Held]:
+        """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
+        flat, values = flatten(model, self.chains, x, held.chain), self._seen(model, x, held)
+        degrees = np.array(self.chains.degrees)
+        known = np.arange(len(values))[:, None] < degrees - 1
+        k = jnp.where(known, jnp.asarray(self.weights, x.dtype), 0.0)
+        tops = rate - (k[:-1] * values[1:]).sum(axis=0)
+        tops = jnp.asarray(self.stiffness, x.dtype) * tops
+        if self.observer:
+            tops = tops - jnp.where(degrees <= 2, held.push, 0.0)
+        w = flat.invert(tops)
+        chain, mean = self._integrate(held.chain, w, period)
+        return model.physical(mean), held._replace(chain=chain, rate=rate)
+
+    def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
+        """Return the integrators after a hold, and the mean (m,) of what they give during it."""
+        after, mean = list[jax.Array](), list[jax.Array]()
+        for k, at in enumerate(self.chains.places):
+            tower = [*(e[i] for i in at), w[k]]
+            # Polynomials of time; the actuator holds one value, and their mean moves as far.
+            mean.append(_moved(tower, period, 1))
+            after += [_moved(tower[start:], period, 0) for start in range(len(at))]
+        return (jnp.stack(after) if after else e), jnp.stack(mean)
+
+    def settle(
+        self,
+        model: ControlAffine,
+        x: State,
+        wanted: Input,
+        got: Input,
+        held: Held,
+        period: Scalar | float,
+    ) -> Held:
+        """Return the memory once the actuators have made `got` of what was `wanted`."""
+        v = model.normalized(got)
+        # An integrator that goes on where an actuator stopped would wind up.
+        missed = jnp.where(got == wanted, 0.0, v - model.normalized(wanted))
+        first = [(at[0], k) for k, at in enumerate(self.chains.places) if at]
+        chain = held.chain
+        for place, k in first:
+            chain = chain.at[place].add(missed[k])
+        if not self.observer:
+            return held._replace(chain=chain)
+        speed, pull = self._watched(model, x, v)
+        wrong = self._wrong(model, x, held)
+        half = 0.5 * period
+        base = speed - wrong + half * pull + period * (held.push + _WATCH[0] * wrong)
+        push = held.push + period * _WATCH[1] * wrong
+        return Held(chain, held.rate, v, base, push, half + 0.0 * wrong[0])
+
+    # ---- the observer ----
+
+    def _wrong(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
+        """Return by how much the speed is off what the model and the estimate expect, (m,)."""
+        speed, pull = self._watched(model, x, held.got)
+        # A trapezoid from the start of the hold to its end, in which the input is the same.
+        return speed - (held.base + held.half * pull)
+
+    def _learned(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
+        """Return the rate of the estimated push, (m,)."""
+        return _WATCH[1] * self._wrong(model, x, held)
+
+    def _watched(self, model: ControlAffine, x: State, v: Input) -> tuple[jax.Array, jax.Array]:
+        """Return what is watched of each output, and its rate under a normalized input, (m,).
+
+        It is the speed y', whose rate is y''; and of an output that an input moves at once, y.
+        """
+        u = model.physical(v)
+
+        def velocity(x: State) -> State:
+            return model.velocity(x, u)
+
+        def output(x: State) -> jax.Array:
+            return flat_output(model, self.chains.outputs, x)
+
+        def speed(x: State) -> jax.Array:
+            return jax.jvp(output, (x,), (velocity(x),))[1]
+
+        first, second = jax.jvp(speed, (x,), (velocity(x),))
+        at_once = np.array(self.chains.degrees) == 1
+        return jnp.where(at_once, output(x), first), jnp.where(at_once, first, second)
+
+
+def _moved(tower: Sequence[jax.Array], period: Scalar | float, more: int) -> jax.Array:
+    """Return sum_i y_i T^i / (i + more)!, after a time T; for more = 1 the mean until then."""
+    total = jnp.zeros_like(tower[0])
+    for i, y in enumerate(tower):
+        total = total + y * (period**i / math.factorial(i + more))
+    return total

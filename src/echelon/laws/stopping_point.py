@@ -1,0 +1,233 @@
+"""Stopping-point consensus: agents tell each other where they would come to rest (T5).
+
+Each output of each agent is then one integrator, whatever the agent, so that the formation
+converges from anywhere, over any graph in which the leader reaches everybody, and what an agent
+goes through depends on its own start and on a speed alone.
+"""
+
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.core.errors import LawError, listing
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.words import Feedforward, Hears
+from echelon.laws.flat_law import LEAD_SPEED, FlatLaw, Speed, plain_speeds
+from echelon.laws.flat_loop import Held
+from echelon.laws.law import Law, LocalView
+from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
+from echelon.references.flatness import follow_at
+from echelon.references.guide import Guide
+from echelon.references.reference import Reference, check_reference
+
+_INSTANT = 1e-9
+"""s; a shorter period is none."""
+
+
+@final
+class Reach(eqx.Module):
+    """What the graph asks of the coupling.
+
+    Attributes:
+        slowest: the smallest eigenvalue of the followers' Laplacian.
+        heaviest: d_max, the largest sum of weights that one follower hears.
+    """
+
+    slowest: float
+    heaviest: float
+
+    @classmethod
+    def of(cls, graph: Graph, leaderward: bool) -> "Reach":
+        """Return it of a graph."""
+        heard = graph.exchange(leaderward)
+        sums = np.zeros(graph.agents)
+        np.add.at(sums, heard.receivers, heard.weights)
+        own = sums[list(graph.followers)]
+        # Heard one way the Laplacian is triangular, and its eigenvalues are on its diagonal.
+        slowest = float(own.min()) if leaderward else graph.spectrum().low
+        return cls(slowest, float(own.max()))
+
+
+@final
+class StoppingPoint(FlatLaw):
+    """zeta_i' = zeta_0' - sigma(c z_i), z_i = sum_j A_ij ((zeta_i - xi_i) - (zeta_j - xi_j)).
+
+    zeta = q(D) y / q(0) is where an agent's flat outputs y would come to rest if nobody spoke, and
+    sigma(x) = x / sqrt(1 + (x/s)^2) bounds the speed that agreement asks for. Where `coupling` is
+    left out, c is twice the slowest root over lambda_min, or what the step holds, a little below
+    1 / (d_max dt), where that is less.
+
+    Args:
+        feedforward: `relay`, the leader's zeta' forwarded to all; `parent`, that of the one agent
+            that each hears.
+        hears: `all` neighbours, or `leaderward` those alone that are nearer to the leader; with
+            `parent` it is that one.
+        reach: of the graph; found by `prepared`.
+        ahead: (r, m) how the leader's path begins; taken over by `following`.
+    """
+
+    feedforward: Feedforward = eqx.field(
+        default=Feedforward.RELAY, static=True, converter=Feedforward.named
+    )
+    hears: Hears = eqx.field(default=Hears.ALL, static=True, converter=Hears.named)
+    reach: Reach | None = None
+    ahead: Array | None = None
+
+    def __check_init__(self) -> None:
+        """Refuse a feed-forward that tells no zeta'."""
+        allowed = (Feedforward.RELAY, Feedforward.PARENT)
+        if self.feedforward not in allowed:
+            raise LawError(
+                f"`feedforward` is `{self.feedforward}`, and the law `stopping-point` is sent "
+                f"zeta' by {listing(map(str, allowed))}: without it a leader that moves is lost."
+            )
+
+    @property
+    def leaderward(self) -> bool:
+        """Whether only neighbours nearer to the leader are heard."""
+        return self.hears is Hears.LEADERWARD or self.feedforward is Feedforward.PARENT
+
+    @property
+    def information(self) -> tuple[str, ...]:
+        """Neighbours' stopping points, and whose rate is told."""
+        parent = self.feedforward is Feedforward.PARENT
+        whose = "its parent's" if parent else "the leader's, forwarded to everybody"
+        return ("neighbours' stopping points zeta", f"zeta' of the same step, {whose}")
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingPoint":
+        """Find the model's chains, and what the graph asks of the coupling."""
+        if self.loop is not None:
+            return self
+        if self.feedforward is Feedforward.PARENT:
+            # Raises where the graph is no tree.
+            graph.parents()
+        loop, reach = self.found_loop(model), Reach.of(graph, self.leaderward)
+        return eqx.tree_at(
+            lambda law: (law.loop, law.reach, law.ahead),
+            self,
+            (loop, reach, np.zeros_like(loop.weights)),
+            is_leaf=lambda part: part is None,
+        )
+
+    def following(self, leader: Law, model: ControlAffine) -> "StoppingPoint":
+        """Take over how the leader's path begins, which tells how high a thrust is level."""
+        if not isinstance(leader, StoppingLeader) or self.loop is None:
+            raise LawError(
+                "followers under `stopping-point` are sent the leader's zeta', which the law "
+                f"`{type(leader).__name__}` does not have; give the leader the law "
+                "`stopping-point` too."
+            )
+        if not np.array_equal(leader.ready.weights, self.loop.weights):
+            raise LawError(
+                "the leader and the followers have different `roots`, and would come to rest "
+                "differently; give both the same."
+            )
+        ahead = np.asarray(leader.begins(model))
+        same = np.array_equal(np.asarray(self.ahead), ahead)
+        return self if same else eqx.tree_at(lambda law: law.ahead, self, ahead)
+
+    def begin(self, model: ControlAffine, x: State) -> Held:
+        """Return the memory of an agent that begins at x, with its integrators level."""
+        return self.begun(model, x, jnp.asarray(self.ahead, x.dtype))
+
+    def strength(self, period: Scalar | float) -> Scalar | float:
+        """Return c where inputs are held for a period (s)."""
+        assert self.reach is not None
+        if self.coupling is not None:
+            return self.coupling
+        period = jnp.maximum(period, _INSTANT)
+        # While the highest derivatives are held the inner loop goes on, and zeta moves farther than
+        # Euler's step by half the sum of the roots times the period; twice that is kept free.
+        most = 1.0 / (self.reach.heaviest * period * (1.0 + period * self.fastest))
+        return jnp.minimum(2.0 * self.slowest_root / self.reach.slowest, most)
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Held) -> tuple[Input, Held]:
+        """Return the input of one agent."""
+        pull = self.bounded(self.strength(view.period) * view.disagreement)
+        return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
+
+
+@final
+class StoppingLeader(FlatLaw):
+    """The same law led by the reference: zeta_0' = zeta_r' - sigma(c (zeta_0 - zeta_r)).
+
+    Where `coupling` is left out, c is the slowest root doubled, or what the step holds.
+
+    Args:
+        reference: the path to follow; without one the trim's flat outputs are held.
+    """
+
+    speed: Speed = eqx.field(default=LEAD_SPEED, converter=plain_speeds)
+    reference: Guide | None = None
+
+    @property
+    def information(self) -> tuple[str, ...]:
+        """The reference."""
+        return ("the reference and its derivatives",)
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "StoppingLeader":
+        """Find the model's chains, and check that it can be led along the reference."""
+        if self.loop is not None:
+            return self
+        loop = self.found_loop(model)
+        if self.reference is not None:
+            check_reference(self.reference)
+            if not isinstance(self.reference, Reference):
+                raise LawError(
+                    "the law `stopping-point` follows a path in space, of which it needs "
+                    "derivatives, and the reference `states` gives states; use `lqr` for the "
+                    "leader and `consensus` for the followers."
+                )
+            self.reference.fit(model)
+        none = {"is_leaf": lambda part: part is None}
+        return eqx.tree_at(lambda law: law.loop, self, loop, **none)
+
+    def path(self, model: ControlAffine, t: Scalar) -> jax.Array:
+        """Return the flat outputs to follow with their derivatives, (r + 1, m)."""
+        loop = self.ready
+        if isinstance(self.reference, Reference):
+            return self.reference.derivatives(t, len(loop.weights), loop.chains.outputs)
+        there = model.output(jnp.asarray(np.asarray(model.trim[0], float), t.dtype))
+        place = jnp.stack([there[model.output_names.index(name)] for name in loop.chains.outputs])
+        return jnp.pad(place[None], ((0, len(loop.weights)), (0, 0)))
+
+    def begins(self, model: ControlAffine) -> jax.Array:
+        """Return the flat outputs at t = 0 with their derivatives, (r, m)."""
+        return self.path(model, jnp.zeros(()))[:-1]
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the reference's state at time zero, or the trim."""
+        if self.reference is None:
+            return jnp.asarray(np.asarray(model.trim[0], float))
+        return follow_at(model, self.reference, jnp.zeros(1))[0][0]
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+        """Return x_r at each of `times`, (T, n)."""
+        if self.reference is None:
+            return None
+        return follow_at(model, self.reference, times)[0]
+
+    def own_mode(self, model: ControlAffine) -> float:
+        """Return the slowest mode of the leader about its reference, 1/s."""
+        return -min(self.slowest_root, float(self.strength(0.0)))
+
+    def begin(self, model: ControlAffine, x: State) -> Held:
+        """Return the memory of a leader that begins at x, as level as its path."""
+        return self.begun(model, x, self.begins(model).astype(x.dtype))
+
+    def strength(self, period: Scalar | float) -> Scalar | float:
+        """Return c where inputs are held for a period (s)."""
+        if self.coupling is not None:
+            return self.coupling
+        return jnp.minimum(2.0 * self.slowest_root, 1.0 / jnp.maximum(period, _INSTANT))
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Held) -> tuple[Input, Held]:
+        """Return the leader's input."""
+        loop, path = self.ready, self.path(model, view.t)
+        away = loop.place(model, view.x, view.offset, memory) - loop.stop(path[:-1])
+        rate = loop.stop(path[1:]) - self.bounded(self.strength(view.period) * away)
+        return loop.obey(model, view.x, rate, memory, view.period)

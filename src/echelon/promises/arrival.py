@@ -1,0 +1,123 @@
+"""When the formation is there, by the closed form of T5.3.
+
+With w = L_g^-1 1 the largest |zeta_i| / w_i falls as m' = -sigma(c m) / max w or faster. For
+sigma(x) = x / sqrt(1 + (x/s)^2) that is solved by F(c m / s) = F(c m(0) / s) - c t / max w with
+F(v) = sqrt(1 + v^2) - arsinh(1 / v). Behind it comes the inner loop, delta y = h * zeta and what
+the start leaves, where h is positive.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.signal
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from echelon.core.types import Array
+from echelon.core.words import Feedforward
+from echelon.laws.stopping_point import StoppingPoint
+from echelon.network.graph import Graph
+
+_WITHIN = 0.01  # m
+_CELL, _MOST = 0.01, 20_000
+"""Of time, s; the bound holds all over each cell. So many cells are 200 s."""
+_SLACK = 1e-9
+"""m; more than floats leave of the sums."""
+
+
+class Arrival(NamedTuple):
+    """From which time (s) on all followers are within 1 cm of their goals."""
+
+    time: float
+
+
+def arrival_of(
+    flat: Array, graph: Graph, law: StoppingPoint, coupling: float, position: Sequence[int]
+) -> Arrival | None:
+    """Return when all followers are within 1 cm for good; None where it cannot be told.
+
+    Args:
+        flat: (N, r, m) starts in flat coordinates, less the offsets.
+        graph: who hears whom.
+        law: the followers', prepared.
+        coupling: c.
+        position: which outputs are one.
+    """
+    apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
+    if not position or law.feedforward is Feedforward.PARENT or apart > _SLACK:
+        return None
+    loop, followers = law.ready, list(graph.followers)
+    weights = _weights(graph, law.leaderward)
+    away = flat[followers] - flat[list(graph.nearest_leader())][followers]
+    times = _CELL * np.arange(_MOST + 1)
+    square = np.zeros((len(followers), _MOST))
+    for k in position:
+        own = np.array(law.roots_for(loop.chains.degrees[k] - 1))
+        stops = np.abs(away[:, :, k] @ loop.weights[:, k])
+        m = _falling((stops / weights).max(), coupling, weights.max(), law.speed_of(k), times)
+        driven = _behind(own, m, times)
+        # Agents start in few ways in number; all at once would be (N, cells) anyway.
+        square += (weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
+    outside = np.flatnonzero((np.sqrt(square) + _SLACK >= _WITHIN).any(axis=0))
+    if not len(outside):
+        return Arrival(0.0)
+    last = int(outside[-1]) + 1
+    return None if last >= _MOST else Arrival(float(times[last]))
+
+
+def _weights(graph: Graph, leaderward: bool) -> Array:
+    """Return w = L_g^-1 1 of the followers, all positive."""
+    heard, n = graph.exchange(leaderward), graph.agents
+    adjacency = sp.coo_array((heard.weights, (heard.receivers, heard.senders)), shape=(n, n))
+    rows = list(graph.followers)
+    whole = sp.csr_array(sp.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency)
+    return spla.splu(sp.csc_array(whole[rows][:, rows])).solve(np.ones(len(rows)))
+
+
+def _falling(start: float, c: float, heaviest: float, speed: float, times: Array) -> Array:
+    """Return m at times (T,), from above."""
+    if not start:
+        return np.zeros(len(times))
+    if np.isinf(speed):
+        return start * np.exp(-c * times / heaviest) * (1.0 + _SLACK)
+    goal = _travel(np.log(c * start / speed)) - c * times / heaviest
+    # In the logarithm of v, of which F rises at sqrt(1 + v^2) >= 1.
+    high = np.full(len(times), np.log(c * start / speed))
+    low = high - (goal[0] - goal) - 1.0
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        above = _travel(middle) > goal
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return np.minimum(speed / c * np.exp(high) * (1.0 + _SLACK), start)
+
+
+def _travel(log: Array | float) -> Array:
+    """Return F(v) = sqrt(1 + v^2) - arsinh(1 / v) of v by its logarithm."""
+    v = np.exp(log)
+    # arsinh(1/v) = log(1 + sqrt(1 + v^2)) - log v, which no small v loses digits of.
+    root = np.sqrt(1.0 + v**2)
+    return root - np.log1p(root) + log
+
+
+def _behind(roots: Array, m: Array, times: Array) -> Array:
+    """Return a bound of (h * m)(t) all over each cell of time, (T - 1,)."""
+    if not len(roots):
+        return m[:-1]
+    k0 = roots.prod()
+    apart = np.array([np.prod(np.delete(roots, i) - root) for i, root in enumerate(roots)])
+    # H = 1 - sum of c_i / rho_i exp(-rho_i t), the integral of h.
+    whole = 1.0 - (k0 / apart / roots) @ np.exp(-np.outer(roots, times))
+    steps = np.maximum(np.diff(whole), 0.0)
+    # m falls, so in a cell of both times it is at most what it was at the earlier one.
+    earlier = np.concatenate([m[:1], m[:-2]])
+    return scipy.signal.fftconvolve(steps, earlier)[: len(steps)] * (1.0 + _SLACK)
+
+
+def _left(roots: Array, starts: Array, times: Array) -> Array:
+    """Return a bound of what starts (K, r) leave in y all over each cell of time, (K, T - 1)."""
+    if not len(roots):
+        return np.zeros((len(starts), len(times) - 1))
+    modes = np.linalg.solve(np.vander(-roots, increasing=True).T, starts[:, : len(roots)].T).T
+    falls = np.exp(-np.outer(roots, times[:-1]))
+    return np.abs(modes @ falls) + _CELL * (np.abs(modes) * roots) @ falls

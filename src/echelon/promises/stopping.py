@@ -1,0 +1,246 @@
+"""A run under the law `stopping-point` as its theorem sees it, and what else that rests on (T5)."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.certificates.responses import Chain
+from echelon.core.linear import held_radius
+from echelon.core.types import Array
+from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.engine.laws import Laws
+from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.laws.flat_loop import FlatLoop
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
+from echelon.models.chains import flat_output, flatten
+from echelon.models.model import ControlAffine
+from echelon.promises.statement import Hypothesis, Statement
+
+_PROOF = Kind.PROOF
+
+
+class Stopping(NamedTuple):
+    """A run under the law, as its theorem sees it.
+
+    Attributes:
+        parts: prepared.
+        settings: how it is computed.
+        states: (N, n) at the start.
+        flat: (N, r, m) the same in flat coordinates, less the offsets.
+        ahead: (r, m) of what the leader follows.
+    """
+
+    parts: Parts
+    settings: Settings
+    states: Array
+    flat: Array
+    ahead: Array
+
+    @property
+    def law(self) -> StoppingPoint:
+        """The followers' law."""
+        return self.parts.drive.follower  # pyright: ignore
+
+    @property
+    def leader(self) -> StoppingLeader:
+        """The leader's law."""
+        return self.parts.drive.leader  # pyright: ignore
+
+    @property
+    def coupling(self) -> float:
+        """C."""
+        return float(self.law.strength(self.settings.dt))
+
+    @property
+    def rate(self) -> float:
+        """The slowest mode of the formation, 1/s, as a positive number."""
+        assert self.law.reach is not None
+        agreement = self.coupling * self.law.reach.slowest
+        moves = max(self.law.ready.chains.degrees) > 1
+        return min(self.law.slowest_root, agreement) if moves else agreement
+
+    def chain(self, output: int) -> Chain:
+        """Return the chain of an output.
+
+        Raises:
+            GainError: its roots have no common unit.
+        """
+        degree = self.law.ready.chains.degrees[output]
+        return Chain.of(self.law.roots_for(degree - 1))
+
+    def speed(self, output: int) -> float:
+        """Return s of a follower against the leader: of each link on the way, told by parents."""
+        return self.links * self.law.speed_of(output)
+
+    @property
+    def links(self) -> int:
+        """How many speeds add up on the way from a leader."""
+        told = self.law.feedforward is Feedforward.PARENT
+        return int(self.parts.graph.depths().max()) if told else 1
+
+    @property
+    def longest_step(self) -> float:
+        """The longest step (s) that keeps the largest stopping point from growing."""
+        assert self.law.reach is not None
+        return 1.0 / (self.coupling * self.law.reach.heaviest)
+
+    def own_speed(self, output: int) -> float:
+        """Return the speed against its path that a leader may have: what it starts off, or s_0."""
+        leads = list(self.parts.graph.leaders)
+        weights = self.leader.ready.weights[:, output]
+        away = np.abs(weights @ (self.flat[leads] - self.ahead)[:, :, output].T).max()
+        c = float(self.leader.strength(self.settings.dt))
+        # Its distance never grows, and sigma(c zeta) is below c zeta.
+        return min(self.leader.speed_of(output), c * float(away))
+
+
+def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | None:
+    """Return what T5 speaks of; None under another law."""
+    drive = parts.drive
+    if not isinstance(drive, Laws) or not isinstance(drive.follower, StoppingPoint):
+        return None
+    assert isinstance(drive.leader, StoppingLeader)
+    offsets = jnp.asarray(parts.formation.offsets)
+    flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    return Stopping(parts, settings, states, flat, np.asarray(drive.leader.begins(parts.model)))
+
+
+@eqx.filter_jit
+def _flat(
+    model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
+) -> jax.Array:
+    chains = law.ready.chains
+
+    def one(x: jax.Array, offset: jax.Array) -> jax.Array:
+        values = flatten(model, chains, x, law.begin(model, x).chain).values
+        shift = flat_output(model, chains.outputs, offset)
+        return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
+
+    return jax.vmap(one)(states, offsets)
+
+
+# ---- what else it rests on -----------------------------------------------------------------------
+
+
+def condition_lines(run: Stopping) -> Iterator[Statement]:
+    """Yield the conditions of T5 beside the tube."""
+    n = len(run.parts.model.state_names)
+    text = "of the flat outputs they are; those of other states are none"
+    broken = _moves_others(run)
+    remedy, reason = "", ""
+    if broken:
+        text, remedy = (
+            f"the offset of `{broken}` is none of a flat output",
+            "offset flat outputs only",
+        )
+        reason = "an offset is no symmetry of the law"
+    verdict = Verdict.of(not broken)
+    yield Statement(Hypothesis.SYMMETRY, verdict, _PROOF, None, "", text, remedy, reason)
+    text = "in flat coordinates every agent is linear, with or without a trim"
+    yield Statement(Hypothesis.SMOOTH, Verdict.NOT_NEEDED, _PROOF, text=text)
+    text = f"feedback makes chains of all {n} states and the integrators before inputs"
+    yield Statement(Hypothesis.DETECTABLE, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield Statement(Hypothesis.MATCHED, Verdict.HOLDS, _PROOF, text=f"{run.law.information[1]}")
+    c = run.coupling
+    shown = f"c {c:.4g}, edge 0"
+    yield Statement(Hypothesis.COUPLED, Verdict.HOLDS, _PROOF, c, shown, "any coupling will do")
+    text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
+    shown = f"{-run.rate:.3g} 1/s"
+    yield Statement(Hypothesis.DECAYS, Verdict.HOLDS, _PROOF, -run.rate, shown, text)
+    text = "the law is linear in flat coordinates wherever it goes"
+    yield Statement(Hypothesis.ALONG, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield _step_line(run)
+    yield Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, _PROOF, text="there is no gain")
+
+
+def _moves_others(run: Stopping) -> str:
+    """Return the first state with an offset that is no flat output; empty without one."""
+    outputs, model = run.law.ready.chains.outputs, run.parts.model
+    for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0)):
+        if model.state_names[k] not in outputs:
+            return model.state_names[k]
+    return ""
+
+
+def _step_line(run: Stopping) -> Statement:
+    """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
+    assert run.law.reach is not None
+    name, dt, c = Hypothesis.STEP, run.settings.dt, run.coupling
+    share = c * run.law.reach.heaviest * dt
+    radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
+    if share <= 1.0 + 1e-12 and radius < 1.0:
+        text = f"Euler's step of zeta grows nowhere; spectral radius {radius:.4g} a step"
+        return Statement(name, Verdict.HOLDS, Kind.LINEARIZATION, share, shown, text)
+    text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
+    remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
+    remedy += f"`simulation.dt` to {1.0 / (c * run.law.reach.heaviest):.3g} s"
+    if share <= 1.0:
+        text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
+        text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
+        remedy += "`simulation.dt`"
+    return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, share, shown, text, remedy, text)
+
+
+def _radius(run: Stopping) -> float:
+    """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
+    assert run.law.reach is not None
+    loop, found = run.law.ready, 0.0
+    for k, degree in enumerate(loop.chains.degrees):
+        A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
+        stop = loop.stiffness[k] * loop.weights[:degree, k]
+        inner = np.append(0.0, stop[:-1])
+        # By Gershgorin none is larger than 2 d_max; heard one way none than d_max.
+        most = (1.0 if run.law.leaderward else 2.0) * run.law.reach.heaviest
+        ends = np.array([run.law.reach.slowest, most])
+        gains = inner + run.coupling * ends[:, None] * stop
+        dt, how = run.settings.dt, run.settings.integrator
+        found = max(found, held_radius(A, B, gains[:, None], dt, how))
+    return found
+
+
+def drift_reason(run: Stopping) -> Statement | None:
+    """Return why a lasting push carries the leader away for ever; None where it does not."""
+    world, model = run.parts.world, run.parts.model
+    if run.leader.observer or world.ideal:
+        return None
+    loop = run.leader.ready
+    push = np.zeros(len(model.state_names))
+    if world.disturbance is not None:
+        push = model.per_state(world.disturbance.constant)
+    found = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
+    for k, d in enumerate(np.abs(np.asarray(found)).tolist()):
+        s, degree = run.leader.speed_of(k), loop.chains.degrees[k]
+        asked = d * float(loop.weights[1, k]) if degree > 1 else d
+        if asked >= s:
+            name = loop.chains.outputs[k]
+            text = f"a push of {d:.3g} along `{name}` asks agreement for {asked:.3g} of speed, the "
+            text += f"leader's is {s:.3g}, and it can drift away for ever"
+            remedy = f"set `observer: true`, or `speed` above {asked:.3g}"
+            return Statement(
+                Hypothesis.EXACT, Verdict.FAILS, _PROOF, asked, f"{asked:.3g}", text, remedy, text
+            )
+    return None
+
+
+@eqx.filter_jit
+def _pushed(
+    model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
+) -> jax.Array:
+    """Return what outputs' accelerations differ by at the trim (m,), as an agent is pushed."""
+    chains = loop.chains
+    x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
+
+    def output(x: jax.Array) -> jax.Array:
+        return flat_output(model, chains.outputs, x)
+
+    def speed(x: jax.Array) -> jax.Array:
+        return jax.jvp(output, (x,), (model.velocity(x, u),))[1]
+
+    more = plant.velocity(x, u) + push - model.velocity(x, u)
+    at_once = np.array(chains.degrees) == 1
+    return jnp.where(at_once, jax.jvp(output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1])

@@ -1,0 +1,445 @@
+"""Many runs at once: each is the run that it would be alone, and nothing of a sweep is lost."""
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import echelon as ech
+from echelon.cli.app import app
+from echelon.engine.many import Fleet
+from echelon.plots.sweep import sweep_figures
+from echelon.promises.promise import promise, promises
+from echelon.sweeps.axes import Axis, axes_of, read_axes
+from echelon.sweeps.dataset import dataset_of, share_bounds, succeeded
+from echelon.sweeps.numbers import columns_of
+from echelon.sweeps.plan import Sweep
+from echelon.sweeps.sweep import Batch, _missing
+
+SHORT = ["simulation.horizon=0.5", "simulation.dt=0.01", "report.steady_window=0.1"]
+
+
+def built(name, *changes):
+    return ech.build(ech.load_scenario(name, changes))
+
+
+def seeds(experiment, count, **changes):
+    parts, chosen = experiment
+    return [(parts, chosen._replace(seed=k, **changes)) for k in range(count)]
+
+
+def check_same(one, other, tolerance=0.0):
+    assert (one.outcome, one.message, one.engine) == (other.outcome, other.message, other.engine)
+    assert one.warnings == other.warnings
+    assert (one.reference is None) == (other.reference is None)
+    for name in ("times", "states", "inputs", "reference"):
+        a, b = (np.nan if x is None else x for x in (getattr(one, name), getattr(other, name)))
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance, err_msg=name)
+    for name, a, b in zip(one.sums._fields, one.sums, other.sums, strict=True):
+        size = np.abs(b).max(initial=1e-12)
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * size, err_msg=name)
+
+
+# ---- formations that are stepped together ----
+
+
+@pytest.mark.parametrize("name", ["van-der-pol", "unicycle"])
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
+    experiment = built(name, "simulation.horizon=2", "report.steady_window=1")
+    runs = seeds(experiment, 19, engine="native", precision=precision, store_every=20)
+    for threads in (1, 3):
+        found = list(Fleet(threads).fly(runs))
+        for k in (0, 7, 18):
+            check_same(found[k], ech.simulate(*runs[k]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "planar-quadrotor", "paper-literal", "paper-line"])
+def test_every_run_among_many_has_the_bits_that_it_has_alone(name):
+    runs = seeds(built(name), 20, engine="native", store_every=200)
+    found = list(Fleet().fly(runs))
+    for k in (0, 19):
+        check_same(found[k], ech.simulate(*runs[k]))
+
+
+def parted(graph, model=None, leader=None, world=None, gains=(), **more):
+    """Yield parts of a formation, one for each coupling and weight of its gain."""
+    model = model or ech.models.DoubleIntegrator(dimension=2)
+    formation = ech.Formation.line(model, graph, spacing=1.0)
+    for coupling, weight in gains:
+        n = len(model.state_names)
+        gain = ech.synthesize(
+            model, graph, ech.gains.Riccati(coupling=coupling, Q=(weight * np.ones(n)).tolist())
+        )
+        follower = ech.laws.Consensus(gain, feedforward=more.get("feedforward", "relay"))
+        yield ech.Parts(
+            model,
+            graph,
+            formation,
+            ech.Laws(leader or ech.laws.TrimInput(), follower),
+            initial={"position": 1.0, "velocity": 0.3},
+            world=world or ech.World(),
+        )
+
+
+WIND = ech.World(disturbance=ech.Disturbance(rms={"velocity": 0.2}, hold=0.03))
+WEIGHTED = ech.Graph.from_edges([(0, 1, 0.5), (1, 2, 3.0), (2, 3, 1.0), (0, 4, 2.0)], (0,), 5)
+KINDS = {
+    "gains of their own": (ech.Graph.ring(4), {}),
+    "a parent's input, level by level": (ech.Graph.path(5), {"feedforward": "parent"}),
+    "weights and wind": (WEIGHTED, {"world": WIND}),
+    "several leaders": (ech.Graph.ring(6, leaders=(0, 3)), {}),
+}
+OWN = [(1.0 + 0.1 * k, 1.0 + 0.2 * (k % 3)) for k in range(9)]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_numbers_of_a_formations_own_are_its_own(name):
+    graph, more = KINDS[name]
+    chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
+    runs = [
+        (parts, chosen._replace(seed=k)) for k, parts in enumerate(parted(graph, gains=OWN, **more))
+    ]
+    found = list(Fleet(1).fly(runs))
+    assert len({r.states[-1].tobytes() for r in found}) == len(runs)
+    for k in (0, 5):
+        # Numbers that are rows are rounded where constants would be folded.
+        check_same(found[k], ech.simulate(*runs[k]), 1e-13)
+
+
+def test_runs_that_no_program_shares_are_flown_by_themselves():
+    graph = ech.Graph.path(3)
+    [short] = parted(graph, gains=[(1.0, 1.0)])
+    [longer] = parted(ech.Graph.path(4), gains=[(1.0, 1.0)])
+    chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
+    runs = [(short, chosen), (longer, chosen), (short, chosen._replace(horizon=0.2))]
+    for one, (parts, each) in zip(Fleet(1).fly(runs), runs, strict=True):
+        check_same(one, ech.simulate(parts, each))
+
+
+class Cubic(ech.ControlAffine):
+    """Escapes from beyond its start, at a time that the start decides."""
+
+    state_names, input_names = ("x",), ("push",)
+
+    def drift(self, x):
+        return x**3
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+
+def test_one_that_is_lost_is_told_as_alone_and_loses_no_other():
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    parts = ech.Parts(
+        Cubic(), ech.Graph.path(2), ech.Formation(np.zeros((2, 1))), drive, initial={"x": 0.8}
+    )
+    chosen = ech.Settings(horizon=2.0, dt=0.01, store_every=5, engine="native")
+    runs = [(parts, chosen._replace(seed=k)) for k in range(10)]
+    found = list(Fleet(1).fly(runs))
+    assert {r.outcome.name for r in found} == {"COMPLETED", "DIVERGED"}
+    for one, run in zip(found, runs, strict=True):
+        alone = ech.simulate(*run)
+        assert (one.outcome, one.message) == (alone.outcome, alone.message)
+        np.testing.assert_array_equal(one.states, alone.states)
+        assert one.sums.steps.tolist() == alone.sums.steps.tolist()
+
+
+def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
+    model, graph = ech.models.SingleIntegrator(dimension=1), ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    starts = [np.array([[0.0], [far]]) for far in (1.0, 1e6, 2.0)]
+    runs = [
+        (
+            ech.Parts(model, graph, ech.Formation(np.zeros((2, 1))), drive, initial=start),
+            ech.Settings(horizon=0.1, dt=0.01, engine="native"),
+        )
+        for start in starts
+    ]
+    for one, run in zip(Fleet(1).fly(runs), runs, strict=True):
+        check_same(one, ech.simulate(*run))
+
+
+# ---- what is promised ----
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", [[], ["simulation.dt=0.4"]])
+def test_promises_of_many_seeds_are_those_of_each(changes):
+    experiment = built("van-der-pol", "simulation.horizon=4", "report.steady_window=1", *changes)
+    parts, chosen = experiment
+    asked = [chosen._replace(seed=k) for k in range(3)]
+    for one, each in zip(promises(parts, asked), asked, strict=True):
+        assert one.as_mapping() == promise(parts, each).as_mapping()
+
+
+# ---- the dataset ----
+
+
+def test_a_sweep_is_each_of_its_runs():
+    scenario = ech.load_scenario("van-der-pol", SHORT)
+    found = ech.sweep(scenario, {"seed": range(3), "follower.gain.coupling": [1.0, 2.0]})
+    assert found["formation_rmse"].dims == ("seed", "follower.gain.coupling")
+    for seed in (2,):
+        for coupling in (1.0, 2.0):
+            changes = [*SHORT, f"seed={seed}", f"follower.gain.coupling={coupling}"]
+            run = ech.run(ech.load_scenario("van-der-pol", changes))
+            here = found.sel({"seed": seed, "follower.gain.coupling": coupling})
+            told = ech.metrics(run)
+            followers = list(run.graph.followers)
+            np.testing.assert_allclose(
+                here["rmse"].values[followers], [f.rmse for f in told.followers], rtol=1e-9
+            )
+            assert np.isnan(here["rmse"].values[0])
+            last = np.linalg.norm(run.errors[-1], axis=1)
+            np.testing.assert_allclose(here["final_error"].values[followers], last[followers])
+            assert float(here["worst_final_error"]) == pytest.approx(last.max())
+            assert int(here["outcome"]) == 0 and int(here["promised"]) == int(
+                promise(run.parts, run.settings).promised
+            )
+
+
+def test_what_cannot_be_made_is_refused_and_the_others_run():
+    scenario = ech.load_scenario("van-der-pol", SHORT)
+    found = ech.sweep(scenario, {"follower.gain.coupling": [1.0, 1e300]})
+    assert found["outcome"].values.tolist() == [0, -1]
+    assert "coupling" in str(found["message"].values[1])
+
+
+def test_agents_may_differ_in_number():
+    scenario = ech.load_scenario("van-der-pol", SHORT)
+    found = ech.sweep(scenario, {"graph.agents": [4, 6], "seed": [5]})
+    assert found.sizes["agent"] == 6
+    assert np.isnan(found["rmse"].values[0, 0, 4:]).all()
+    assert np.isfinite(found["rmse"].values[1, 0, 1:]).all()
+
+
+# ---- which runs there are ----
+
+
+@given(st.integers(1, 5), st.integers(1, 4), st.integers(1, 3), st.sampled_from([0, 1, 2]))
+@settings(max_examples=20)
+def test_every_combination_is_a_run_once_with_the_seeds_fastest(seeds, a, b, where):
+    axes = [Axis("x", range(a)), Axis("y", range(b))]
+    axes.insert(where, Axis("seed", range(10, 10 + seeds)))
+    plan = object.__new__(Sweep)
+    plan.axes = tuple(axes)
+    runs = [plan.run(k) for k in range(plan.count)]
+    assert len({run.place for run in runs}) == plan.count == seeds * a * b
+    assert [run.seed for run in runs] == [*range(10, 10 + seeds)] * (a * b)
+    assert [run.case for run in runs] == [k // seeds for k in range(plan.count)]
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 9), st.sets(st.integers(0, 59)))
+def test_what_is_missing_is_computed_once_in_the_batches_of_a_whole_sweep(cases, seeds, size, done):
+    runs = cases * seeds
+    whole = list(_missing(runs, [], size, seeds))
+    assert max(count for _, count in whole) <= size
+    for first, count in whole:
+        # Neighbours share a case, or each case is whole.
+        alike = first // seeds == (first + count - 1) // seeds
+        assert alike or first % seeds == count % seeds == 0
+    before = [
+        Batch(first, {"outcome": np.zeros(count)})
+        for k, (first, count) in enumerate(whole)
+        if k in done
+    ]
+    left = list(_missing(runs, before, size, seeds))
+    assert sorted([*left, *((b.first, b.runs) for b in before)]) == whole
+    assert sum(count for _, count in whole) == runs
+
+
+@pytest.mark.parametrize(
+    "text, values",
+    [
+        ("seed=0..4", [0, 1, 2, 3, 4]),
+        ("a.b=1,2.5,4", [1, 2.5, 4]),
+        ("a.b=[1, 2],[3, 4]", [[1, 2], [3, 4]]),
+        ("graph.name=ring,path", ["ring", "path"]),
+        ("seed=7,10..12", [7, 10, 11, 12]),
+    ],
+)
+def test_values_are_read_and_written_as_on_the_command_line(text, values):
+    [axis] = read_axes([text])
+    assert list(axis.values) == values
+    assert [list(a.values) for a in read_axes([axis.text])] == [values]
+
+
+FAULTS = {
+    "seed": "got no `key=values`, allowed is as in `seed=0..9`.",
+    "seed=": "got no values, allowed are one or more.",
+    "seed=9..0": "got `9..0`, and a range must not fall.",
+    "seed=1,1": "got `1` twice, and once is enough.",
+    "seed=0..999999999999": "1e+12 runs are asked for, and 10000000 fit.",
+    "follower.gain.couplng=1": "got an unknown key",
+    "follower.gain.coupling=1,-2": "got `-2`",
+    "seed=0.5": "got `0.5`",
+}
+
+
+@pytest.mark.parametrize("text", FAULTS)
+def test_bad_axes_are_one_sentence_before_anything_runs(text, here):
+    done = CliRunner().invoke(app, ["sweep", "van-der-pol", "--over", text, "--out", "o"])
+    assert done.exit_code == 2 or done.exception is not None
+    said = str(done.exception)
+    assert said.startswith("--over ") and FAULTS[text] in said, said
+    assert not (here / "o").exists()
+
+
+def test_too_many_runs_of_several_axes_and_of_many_agents_are_refused():
+    scenario = ech.load_scenario("van-der-pol")
+    with pytest.raises(
+        ech.errors.ScenarioError, match="^the sweep is too large: .* runs are asked"
+    ):
+        ech.sweep(
+            scenario, {"seed": range(10**6), "simulation.horizon": [1.0 + k for k in range(99)]}
+        )
+    big = ech.load_scenario("van-der-pol", ["graph.agents=2000"])
+    with pytest.raises(ech.errors.ScenarioError, match="need .* of memory, and .* fit: .* runs"):
+        ech.sweep(big, {"seed": range(10**6)})
+    with pytest.raises(ech.errors.ScenarioError, match="`initial` too, of which it is a part"):
+        axes_of({"initial": [{}], "initial.spread": [{}]})
+
+
+def test_the_interval_of_a_share_is_wilsons():
+    # Computed apart: the roots of (p - s)^2 = z^2 p (1 - p) / n.
+    for count, total in ((0, 10), (3, 10), (10, 10), (700, 1000)):
+        share, z = count / total, 1.96
+        roots = np.roots([1 + z * z / total, -2 * share - z * z / total, share * share])
+        np.testing.assert_allclose(share_bounds(count, total), sorted(roots.real), atol=1e-9)
+
+
+def test_figures_show_the_shares_that_the_batches_hold():
+    scenario = ech.load_scenario("van-der-pol", SHORT)
+    over = {"follower.gain.coupling": [1.0, 2.0, 64.0], "simulation.dt": [0.01, 0.02]}
+    over["seed"] = [1, 2]
+    plan = Sweep(scenario, axes_of(over))
+    rows = [
+        {
+            "outcome": 0,
+            "worst_settling_time": 3.0 if plan.run(k).place[0] else np.nan,
+            "formation_rmse": 0.1 * (k + 1),
+            "saturated": np.zeros(4),
+        }
+        for k in range(12)
+    ]
+    data = dataset_of(plan, [Batch(0, columns_of(rows[:5])), Batch(5, columns_of(rows[5:]))])
+    assert succeeded(data).sum("seed").values.tolist() == [[0, 0], [2, 2], [2, 2]]
+    assert data["formation_rmse"].values.ravel().tolist() == [row["formation_rmse"] for row in rows]
+    found = sweep_figures(data)
+    assert sorted(found) == ["errors", "region", "success"]
+    shown = found["region"].axes[0].collections[0].get_array()
+    assert shown.tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0]]
+    [left, _] = found["success"].axes
+    assert left.get_lines()[0].get_ydata().tolist() == [0.0, 1.0, 1.0]
+
+
+# ---- nothing is lost ----
+
+# Whoever started the tests may have switched Ctrl-C off, and a child inherits that. Batches are
+# small, so that there are some before the end.
+SMALL = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import echelon.sweeps.sweep as sweeps
+sweeps._AGENT_STEPS = 1
+from echelon.cli.app import main
+main()
+"""
+SWEEP = ["sweep", "van-der-pol", "--set", "simulation.horizon=20", "--over", "seed=0..95"]
+SWEEP += ["--over", "follower.gain.coupling=2,3", "--no-figures", "--threads", "1"]
+
+
+@contextlib.contextmanager
+def started(*arguments):
+    process = subprocess.Popen(
+        [sys.executable, "-c", SMALL, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(process, condition):
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+def arrays(folder):
+    with xr.open_dataset(folder / "sweep.nc", engine="h5netcdf") as data:
+        return {name: np.asarray(data[name].values) for name in data}
+
+
+def files(folder):
+    return {f.name: f.stat().st_mtime_ns for f in (folder / "batches").glob("*.npz")}
+
+
+@pytest.mark.slow
+def test_a_sweep_that_is_killed_goes_on_and_computes_nothing_again(here):
+    with started(*SWEEP, "--out", here / "whole") as process:
+        assert process.wait(300) == 0, process.communicate()
+    with started(*SWEEP, "--out", here / "cut") as process:
+        wait_for(process, lambda: len(files(here / "cut")) >= 2)
+        process.send_signal(signal.SIGKILL)
+        process.wait(10)
+    kept = files(here / "cut")
+    assert kept and not (here / "cut" / "sweep.nc").exists()
+    with started("sweep", "--resume", here / "cut", "--no-figures") as process:
+        wait_for(process, lambda: len(files(here / "cut")) > len(kept) or process.poll() == 0)
+        now = files(here / "cut")
+        assert all(now.get(name, stamp) == stamp for name, stamp in kept.items())
+        assert process.wait(300) == 0, process.communicate()
+    whole, cut = arrays(here / "whole"), arrays(here / "cut")
+    assert whole.keys() == cut.keys()
+    for name, values in whole.items():
+        np.testing.assert_array_equal(values, cut[name], err_msg=name)
+    assert not (here / "cut" / "batches").exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_sweep_soon_and_keeps_what_is_done(here):
+    with started(*SWEEP, "--out", here / "cut", "--json") as process:
+        wait_for(process, lambda: len(files(here / "cut")) >= 1)
+        process.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        out, _ = process.communicate(timeout=60)
+        assert process.returncode == 130
+    told = json.loads(out)
+    assert told["outcomes"]["missing"] > 0
+    assert sum(told["outcomes"].values()) == told["runs"] == 192
+    done = 192 - told["outcomes"]["missing"]
+    assert done and int((arrays(here / "cut")["outcome"] >= 0).sum()) == done
+    # The machine may be shared; what is asked for is 2 s.
+    assert time.monotonic() - began < 20.0
+
+
+def test_a_sweep_writes_its_folder_and_is_complete(here):
+    call = ["sweep", "van-der-pol", "--over", "seed=0..2", "--out", "o"]
+    for change in SHORT:
+        call += ["--set", change]
+    done = CliRunner().invoke(app, call)
+    assert done.exit_code == 0, done.output
+    names = {"scenario.yaml", "inputs", "sweep.nc", "sweep.txt", "figures"}
+    assert {path.name for path in (here / "o").iterdir()} == names
+    assert "3 runs: 3 completed." in (here / "o" / "sweep.txt").read_text()
+    again = CliRunner().invoke(app, ["sweep", "--resume", "o"])
+    assert again.exit_code == 0 and "nothing is left to do" in again.output
+    over = CliRunner().invoke(app, call)
+    assert "is not empty" in str(over.exception)
