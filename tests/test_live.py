@@ -74,6 +74,18 @@ def test_a_live_loop_is_the_loop_of_a_run(panel, swarm):
     np.testing.assert_allclose(flown(swarm), ech.run(panel.scenario).states[1:], atol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_law_that_remembers_and_signals_is_live_too():
+    own = ech.load_scenario("paper-global", ["simulation.horizon=0.4", "simulation.engine=jax"])
+    found = Panel(own, build(own))
+    swarm, wanted = Swarm(*found.built, found), ech.run(own).states
+    shown = flown(swarm, 10)
+    # Pictures are 8 steps apart, stored frames 10.
+    np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
+    np.testing.assert_allclose(shown[9], wanted[8], atol=1e-9)
+    assert "coupling" not in found.ranges
+
+
 KNOBS = {
     "coupling": {"coupling": 3.0},
     "feedforward": {"feedforward": 0.0},
