@@ -329,6 +329,7 @@ def test_the_farthest_stopping_point_never_moves_away(hears):
     ].max()
 
 
+@pytest.mark.slow
 def test_the_local_rate_is_the_slower_of_root_and_agreement():
     for c, rate in ((20.0, 2.0), (2.0, 2.0 * PAPER_TREE.spectrum().low)):
         result = fly(flight(roots=(2.0,), coupling=c, spread=0.05, observer=False), 8.0, dt=0.005)

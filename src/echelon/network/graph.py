@@ -300,14 +300,12 @@ class Graph:
 
     def exchange(self, leaderward: bool = False) -> "Exchange":
         """Return the computation of the disagreement; leaderward, of those nearer a leader."""
-        (i, j), weights = self.edges.T, self.weights
-        receivers, senders = np.concatenate([i, j]), np.concatenate([j, i])
-        weights = np.concatenate([weights, weights])
+        (i, j), w = self.edges.T, self.weights
+        heard = np.concatenate([i, j]), np.concatenate([j, i]), np.concatenate([w, w])
         if leaderward:
-            depth = self.depths()
-            nearer = depth[senders] < depth[receivers]
-            receivers, senders, weights = receivers[nearer], senders[nearer], weights[nearer]
-        return Exchange(receivers=receivers, senders=senders, weights=weights)
+            nearer = self.depths()[heard[1]] < self.depths()[heard[0]]
+            heard = tuple(part[nearer] for part in heard)
+        return Exchange(*heard)
 
     def disagreement(self, y: States) -> States:
         """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""
