@@ -242,8 +242,8 @@ def test_every_dependency_is_imported_or_has_its_reason():
         "pyarrow": "what pandas writes Parquet with",
     }
     extras = project()["optional-dependencies"]
-    names = [*project()["dependencies"], *extras["certify"], *extras["fast"], *extras["optimal"]]
-    names += [*extras["video"], *extras["parquet"]]
+    optional = ("certify", "cluster", "fast", "optimal", "video", "parquet")
+    names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
     required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
     found = {
         target.split(".")[0]
@@ -252,7 +252,7 @@ def test_every_dependency_is_imported_or_has_its_reason():
         for target in targets(module, node)
     }
     assert required - found == set(not_imported)
-    assert set(extras) == {"certify", "fast", "optimal", "video", "parquet", "all", "dev"}
+    assert set(extras) == {*optional, "all", "dev"}
 
 
 def test_every_advice_to_install_names_this_distribution():
@@ -264,7 +264,7 @@ def test_every_advice_to_install_names_this_distribution():
     extras = {extra for _, extra in named if extra}
     assert {name for name, _ in named - here} == {project()["name"]}
     assert extras and extras <= set(project()["optional-dependencies"])
-    everything = f"{project()['name']}[certify,fast,optimal,video,parquet]"
+    everything = f"{project()['name']}[certify,cluster,fast,optimal,video,parquet]"
     assert everything in project()["optional-dependencies"]["all"]
 
 

@@ -74,6 +74,18 @@ def test_a_live_loop_is_the_loop_of_a_run(panel, swarm):
     np.testing.assert_allclose(flown(swarm), ech.run(panel.scenario).states[1:], atol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_law_that_remembers_and_signals_is_live_too():
+    own = ech.load_scenario("paper-global", ["simulation.horizon=0.4", "simulation.engine=jax"])
+    found = Panel(own, build(own))
+    swarm, wanted = Swarm(*found.built, found), ech.run(own).states
+    shown = flown(swarm, 10)
+    # Pictures are 8 steps apart, stored frames 10.
+    np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
+    np.testing.assert_allclose(shown[9], wanted[8], atol=1e-9)
+    assert "coupling" not in found.ranges
+
+
 KNOBS = {
     "coupling": {"coupling": 3.0},
     "feedforward": {"feedforward": 0.0},
@@ -81,6 +93,7 @@ KNOBS = {
     "turn": {"turn": 30.0},
     "wind": {"wind": 1.5},
     "cut": {"cut": frozenset({3})},
+    "method": {"method": "inner-loop", "coupling": 1.0},
 }
 
 
@@ -106,6 +119,18 @@ def test_no_knob_compiles_anything_again(panel, swarm, monkeypatch):
     swarm.kick(1, np.ones(4))
     swarm.advance(still=True)
     assert traced == []
+
+
+def test_another_method_brings_its_gain_and_its_coupling(session):
+    session.ask({"name": "method", "value": "inner-loop"})
+    session.settle()
+    found = build(scenario(follower={"gain": {"method": "inner-loop"}})).parts.drive.gain
+    own = session.swarm.loop.follower.law.gain
+    np.testing.assert_array_equal(own.P, found.P)
+    np.testing.assert_array_equal(own.inner, found.inner)
+    assert session.knobs.coupling == pytest.approx(found.coupling, abs=1e-9)
+    with pytest.raises(SimulationError, match="no method `best` here"):
+        session.ask({"name": "method", "value": "best"})
 
 
 def test_the_error_is_the_distance_from_the_goal_of_the_turned_formation(panel, swarm):

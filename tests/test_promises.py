@@ -340,6 +340,20 @@ def test_only_a_law_that_keeps_the_theorem_is_promised_it():
     )
 
 
+def test_a_parent_that_is_the_leader_relays():
+    model, star = ech.models.DoubleIntegrator(1), ech.Graph.star(4)
+    for graph, kept in ((star, True), (PATH, False)):
+        gain = ech.synthesize(model, graph, ech.gains.Contraction({}, rate=0.3))
+        relayed, passed_on = (
+            ech.promise(parts_of(model, graph, gain, feedforward), settings())
+            for feedforward in ("relay", "parent")
+        )
+        assert relayed.region is not None
+        assert (passed_on.region is not None) == kept
+        if kept:
+            assert passed_on.region.rate == relayed.region.rate
+
+
 def test_the_relayed_velocity_has_no_local_theorem_where_g_varies():
     model, bounds = ech.models.PlanarQuadrotor(), {"roll": 0.2, "thrust": 1.0}
     gain = ech.synthesize(model, PATH, ech.gains.RobustLQR(bounds))

@@ -21,6 +21,7 @@ from . import (
 from . import (
     references as references,
 )
+from .archive.open import open_run as open_run
 from .archive.run import (
     load_run as load_run,
 )

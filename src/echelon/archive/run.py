@@ -44,7 +44,7 @@ def save_run(
 def load_run(folder: PathLike) -> Result:
     """Return what is kept of a run that was ended before its horizon: killed, or interrupted.
 
-    A run that is complete is in its `run.nc`, which xarray opens.
+    A run that is complete is in its `run.nc`, which `open_run` reads, and xarray.
 
     Args:
         folder: of the run, as `echelon run` made it.

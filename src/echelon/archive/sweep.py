@@ -9,8 +9,8 @@ from echelon.archive.folder import BATCHES, INPUTS, unwritable
 from echelon.core.files import write_whole
 from echelon.scenario.scenario import KEPT, load_scenario
 from echelon.sweeps.axes import read_axes
+from echelon.sweeps.crew import Batch
 from echelon.sweeps.plan import Sweep
-from echelon.sweeps.sweep import Batch
 
 if TYPE_CHECKING:
     import xarray as xr

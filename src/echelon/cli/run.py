@@ -49,9 +49,16 @@ def run(
         bool, typer.Option("--force", help="Replace an earlier run in --out.")
     ] = False,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show it in the browser when it is done.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a scenario; write its table, figures and dataset."""
+    if view:
+        from echelon.viewer.page import check_page
+
+        check_page()
     if resume is None:
         job = _begin(scenario, set_ or [], out, force, as_json)
     elif scenario or set_ or out or force:
@@ -64,10 +71,21 @@ def run(
         result = _fly(job, as_json)
         _show(result, as_json)
         _write(job.chunks, result, figures, as_json)
+    if view and STOP.number is None and len(result.times):
+        _view(job.chunks.folder)
     if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
         # Then the disk ended it, and its message says so.
         raise OutputError(f"{result.message[:-1]}, and {_again(job.chunks.folder)}.")
     raise typer.Exit(STOP.exit_code or result.outcome.exit_code)
+
+
+def _view(folder: Path) -> None:
+    """Show a run that is done, until Ctrl-C."""
+    from echelon.archive.open import open_run
+    from echelon.cli.view import show_page
+    from echelon.viewer.replay import replay_page
+
+    show_page(replay_page(open_run(folder)).encode(), None, browser=True)
 
 
 def _begin(

@@ -14,8 +14,8 @@ from echelon.core.errors import OutputError
 
 if TYPE_CHECKING:
     from echelon.archive.sweep import Batches
+    from echelon.sweeps.crew import Batch
     from echelon.sweeps.plan import Sweep
-    from echelon.sweeps.sweep import Batch
 
 
 def sweep(
@@ -45,6 +45,9 @@ def sweep(
     threads: Annotated[
         int | None, typer.Option(min=1, help="For native code; one a processor if left out.")
     ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="URL", help="A dask scheduler whose workers compute.")
+    ] = None,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
     as_json: JsonOption = False,
 ) -> None:
@@ -58,7 +61,7 @@ def sweep(
     from echelon.archive.folder import BATCHES, writing
 
     with writing(batches.folder, BATCHES), STOP.hold():
-        done = _compute(plan, batches, threads, as_json)
+        done = _compute(plan, batches, threads, cluster, as_json)
         _finish(plan, batches, done, figures, as_json)
     raise typer.Exit(STOP.exit_code)
 
@@ -96,7 +99,9 @@ def _continue(folder: Path) -> "tuple[Sweep, Batches]":
     return batches.plan(), batches
 
 
-def _compute(plan: "Sweep", batches: "Batches", threads: int | None, quiet: bool) -> "list[Batch]":
+def _compute(
+    plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
+) -> "list[Batch]":
     """Return the batches of a sweep, each written as soon as it is there."""
     from echelon.sweeps.sweep import compute
 
@@ -108,7 +113,7 @@ def _compute(plan: "Sweep", batches: "Batches", threads: int | None, quiet: bool
 
     with _undone(batches), show_progress(quiet, "runs") as show:
         try:
-            compute(plan, keep, _watched(show), tuple(found), threads)
+            compute(plan, keep, _watched(show), tuple(found), threads, cluster)
         except KeyboardInterrupt:
             pass  # what is done is kept, and told below
     return found

@@ -91,3 +91,5 @@ def keep_serving(server: "ThreadingHTTPServer", port: int | None, browser: bool)
         print(f"echelon: {address} shows it{where}. Ctrl-C ends.", flush=True)
         while STOP.number is None:
             time.sleep(0.1)
+        # That is how a page is left, and no interruption.
+        STOP.number = None

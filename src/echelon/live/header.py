@@ -85,6 +85,7 @@ def live_header(swarm: Swarm, panel: Panel, name: str, badge: dict[str, Any]) ->
         "promise": badge,
         "stream": True,
         "knobs": panel.told(),
+        "methods": list(panel.methods),
         "clock": {"start": 0.0, "step": swarm.span, "last": run.times[-1]},
         "axes": len(space.axes),
         "turns": len(space.angles),

@@ -10,11 +10,15 @@ import scipy.sparse as sp
 from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.gains.gain import Gain
 from echelon.models.linearization import linearize
-from echelon.scenario.build import Built
+from echelon.scenario.build import Built, build
 from echelon.scenario.override import named_files
 from echelon.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.scenario.yaml import dump_yaml
+
+_METHODS = ("riccati", "inner-loop")
+"""Those that find a gain in no time, and need nothing more to be said."""
 
 
 class Range(NamedTuple):
@@ -39,6 +43,7 @@ class Knobs(NamedTuple):
         turn: of it, degrees.
         wind: added to the first velocity's rate, or to the first position's.
         cut: places of the edges that are cut.
+        method: of the gain; None for the scenario's own.
     """
 
     coupling: float | None
@@ -47,6 +52,7 @@ class Knobs(NamedTuple):
     turn: float = 0.0
     wind: float = 0.0
     cut: frozenset[int] = frozenset()
+    method: str | None = None
 
 
 @final
@@ -65,6 +71,8 @@ class Panel:
         gain = parts.drive.gain
         self.start = Knobs(None if gain is None else gain.coupling)
         self.ranges: dict[str, Range] = {}
+        self.gains: dict[str | None, Gain | None] = {None: gain}
+        self.methods = _METHODS if gain is not None else ()
         if gain is not None:
             self.ranges["coupling"] = Range(0.02 * gain.coupling, 8.0 * gain.coupling, True)
         if str(parts.drive.feedforward.name) != "NONE":
@@ -124,6 +132,33 @@ class Panel:
             raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
         return knobs._replace(**{name: round(self.ranges[name].clamp(value), 9)})
 
+    def with_method(self, knobs: Knobs, name: object) -> Knobs:
+        """Return the knobs with the gain of another method, and the coupling that it chooses.
+
+        Raises:
+            SimulationError: there is no such method here.
+            ScenarioError: it finds no gain for these agents.
+        """
+        if name not in self.methods:
+            raise SimulationError(
+                f"there is no method `{name}` here; those that need no more are "
+                f"{listing(self.methods)}."
+            )
+        changed = knobs._replace(method=str(name))
+        gain = self.gain(changed)
+        return changed if gain is None else changed._replace(coupling=round(gain.coupling, 9))
+
+    def gain(self, knobs: Knobs) -> Gain | None:
+        """Return the gain of the method of the knobs; its coupling is another matter.
+
+        Raises:
+            ScenarioError: the method finds none.
+        """
+        if knobs.method not in self.gains:
+            plain = self.start._replace(method=knobs.method, coupling=None)
+            self.gains[knobs.method] = build(self.standing(plain)).parts.drive.gain
+        return self.gains[knobs.method]
+
     def offsets(self, knobs: Knobs) -> Array:
         """Return the offsets (N, n) of the formation as it stands, about its first leader."""
         offsets = np.array(self.parts.formation.offsets, np.float64)
@@ -146,7 +181,7 @@ class Panel:
 
     def slowest(self, knobs: Knobs) -> float | None:
         """Return the slowest mode (1/s) near the trim under a gain; None without one."""
-        gain, graph = self.parts.drive.gain, self.parts.graph
+        gain, graph = self.gain(knobs), self.parts.graph
         if gain is None or knobs.coupling is None:
             return None
         kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
@@ -173,6 +208,8 @@ class Panel:
             ScenarioError: it is refused, as where a cut has parted the graph.
         """
         data = self._data()
+        if knobs.method is not None:
+            data.setdefault("follower", {})["gain"] = {"method": knobs.method}
         # With another graph a method would choose another coupling.
         if knobs.coupling is not None and (knobs.cut or knobs.coupling != self.start.coupling):
             data.setdefault("follower", {}).setdefault("gain", {})["coupling"] = knobs.coupling

@@ -165,6 +165,7 @@ class Session:
         graph = self.swarm.parts.graph
         knobs = {name: getattr(self.knobs, name) for name in self.panel.ranges}
         cut = [graph.edges[k].tolist() for k in sorted(self.knobs.cut)]
+        knobs["method"] = self.knobs.method
         return {"knobs": knobs, "cut": cut, "paused": self.paused}
 
     # ---- what is done ---------------------------------------------------------------------------
@@ -197,6 +198,8 @@ class Session:
             if type(value) is not int or not 0 <= value < self.swarm.parts.graph.agents:
                 raise SimulationError(f"`kick` got `{value}`, and must be the number of an agent.")
             return {"kick": {value: self._kick()}}
+        if name == "method":
+            return {name: self.panel.with_method(self.knobs, value).method}
         return {name: getattr(self.panel.turned(self.knobs, name, value), name)}
 
     def _edge(self, pair: Any) -> int:
@@ -228,6 +231,8 @@ class Session:
             elif name in ("cut", "restore"):
                 cut = {self._edge(value)}
                 knobs = knobs._replace(cut=knobs.cut | cut if name == "cut" else knobs.cut - cut)
+            elif name == "method":
+                knobs = self.panel.with_method(knobs, value)
             elif name != "at":
                 knobs = self.panel.turned(knobs, name, value)
         if knobs != self.knobs:
@@ -247,7 +252,7 @@ class Session:
         """Begin again, with the knobs as they stand."""
         self.swarm.restart()
         self.lost, self.events, self.future = False, [], []
-        names = [name for name in self.panel.ranges if _stands(self, name)]
+        names = [name for name in ("method", *self.panel.ranges) if _stands(self, name)]
         told = {name: getattr(self.knobs, name) for name in names}
         self.events += [{"at": 0.0, **told}] if told else []
         graph = self.swarm.parts.graph

@@ -15,9 +15,12 @@ from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
+from echelon.gains.gain import Gain
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.live.knobs import Knobs, Panel
 from echelon.models.model import ControlAffine
+from echelon.network.exchange import Exchange
+from echelon.network.graph import Graph
 from echelon.world.disturbance import Disturbance
 from echelon.world.world import World
 
@@ -48,9 +51,23 @@ class Dimmed(Law):
         )
         return self.law.update(model, dimmed, memory)
 
-    def broadcast(self, model: ControlAffine, x: State, v: Input) -> Any:
+    def begin(self, model: ControlAffine, x: State) -> Memory:
+        """Return what the law begins with at x."""
+        return self.law.begin(model, x)
+
+    def signal(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> Any:
+        """Return what neighbours hear."""
+        return self.law.signal(model, x, offset, memory)
+
+    def settle(
+        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
+    ) -> Memory:
+        """Return the memory once the actuators have acted."""
+        return self.law.settle(model, view, wanted, got, memory)
+
+    def message(self, model: ControlAffine, x: State, v: Input, memory: Memory) -> Any:
         """Return what the law sends."""
-        return self.law.broadcast(model, x, v)
+        return self.law.message(model, x, v, memory)
 
 
 class Picture(NamedTuple):
@@ -90,12 +107,16 @@ class Swarm:
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
         loop = assemble(problem, drive.leader, drive.follower)
-        dimmed = Dimmed(loop.follower, np.asarray(1.0), loop.follower.feedforward)
+        law = loop.follower
+        if panel.start.coupling is not None:
+            law = eqx.tree_at(_inner, law, self._inner(panel.gain(panel.start)), is_leaf=_is_none)
+        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward)
         self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.states, self.measured = problem.states, list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
+        self.edge = _edges_of(loop.exchange, parts.graph)
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
         self.restart()
@@ -119,10 +140,7 @@ class Swarm:
         """Let the loop run with the knobs so."""
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
-        edges = len(weights) // 2
-        for edge in knobs.cut:
-            # Both directions of an edge.
-            weights[[edge, edges + edge]] = 0.0
+        weights[np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
             lambda each: (each.offsets, each.exchange.weights, each.follower.share),
             self.loop,
@@ -131,9 +149,28 @@ class Swarm:
         wind = self.panel.wind(knobs)
         loop = eqx.tree_at(lambda each: each.motion.wind.constant, loop, wind)
         if knobs.coupling is not None:
-            at = lambda each: each.follower.law.gain.coupling  # noqa: E731 - a place in a tree
-            loop = eqx.tree_at(at, loop, np.asarray(knobs.coupling))
+            loop = self._with_gain(loop, knobs)
         self.loop = loop
+
+    def _with_gain(self, loop: Loop, knobs: Knobs) -> Loop:
+        """Return the loop with the gain of the knobs."""
+        gain = self.panel.gain(knobs)
+        assert gain is not None
+
+        def places(each: Any) -> tuple[Any, ...]:
+            own = each.follower.law.gain
+            return own.P, own.R, own.R_inverse, own.inner, own.coupling
+
+        numbers = (gain.P, gain.R, gain.R_inverse, self._inner(gain), np.asarray(knobs.coupling))
+        return eqx.tree_at(places, loop, numbers)
+
+    @staticmethod
+    def _inner(gain: Gain | None) -> Array:
+        """Return the inner loop of a gain, zero without one, so that either compiles to one."""
+        assert gain is not None
+        if gain.inner is not None:
+            return gain.inner
+        return np.zeros((len(gain.R), len(gain.P)))
 
     def kick(self, agent: int, by: Array) -> None:
         """Change the state of an agent by (n,), all at once."""
@@ -153,6 +190,21 @@ class Swarm:
             errors = np.linalg.norm(away, axis=1)
         time = self.steps * self.settings.dt
         return Picture(time, states, np.asarray(inputs, np.float64), errors, self.offsets)
+
+
+def _edges_of(heard: Exchange, graph: Graph) -> Array:
+    """Return which edge each of the ways goes along on which agents hear each other."""
+    places = {tuple(sorted(pair)): k for k, pair in enumerate(graph.edges.tolist())}
+    pairs = zip(np.asarray(heard.receivers).tolist(), np.asarray(heard.senders).tolist())
+    return np.array([places[i, j] if i < j else places[j, i] for i, j in pairs])
+
+
+def _inner(law: Any) -> Any:
+    return law.gain.inner
+
+
+def _is_none(node: object) -> bool:
+    return node is None
 
 
 @eqx.filter_jit

@@ -69,7 +69,6 @@ class Graph:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         self._check_connected()
         self._spectrum: Spectrum | None = None
-        self._nearest: tuple[int, ...] = ()
         # Runs share a graph, and its spectrum is kept: what cannot change cannot go stale.
         for array in (self.edges, self.weights):
             array.setflags(write=False)
@@ -256,11 +255,9 @@ class Graph:
 
     def nearest_leader(self) -> tuple[int, ...]:
         """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
-        if not self._nearest:
-            hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
-            # `argmin` takes the first of equals, and leaders are sorted.
-            self._nearest = tuple(self.leaders[k] for k in np.atleast_2d(hops).argmin(axis=0))
-        return self._nearest
+        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+        # `argmin` takes the first of equals, and leaders are sorted.
+        return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
 
     def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
         """Return the agents by how far they are from the leaders, each with its earlier neighbours.

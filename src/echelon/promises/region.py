@@ -141,7 +141,8 @@ def _withheld(
 def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tuple[str, str]:
     """Return why what is fed forward takes away what the metric could keep, and what would not."""
     feedforward, theorem = parts.drive.feedforward, found.theorem
-    if feedforward is Feedforward.PARENT:
+    # The parent of all is a leader where no agent is farther away, and what it sends is relayed.
+    if feedforward is Feedforward.PARENT and parts.graph.depths().max() > 1:
         text = "parents' inputs are fed forward, and the modes are no longer those of a symmetric "
         return f"{text}matrix, which {theorem} rests on", "set `feedforward: relay`"
     if feedforward is Feedforward.NONE and not leaders.rest:

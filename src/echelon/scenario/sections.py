@@ -339,6 +339,8 @@ class LiveSpec(BaseModel, **STRICT):
     """The coupling from then on."""
     feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
     """1 where followers are sent what `follower.feedforward` says, 0 where nothing."""
+    method: str | None = None
+    """The method of the followers' gain, with the coupling that it chooses."""
     size: Annotated[Positive | None, Unit("1")] = None
     """Size of the formation, times that of `formation`."""
     turn: Annotated[float | None, Unit("deg")] = None

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, combinations
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from echelon.core.errors import ScenarioError
@@ -85,7 +86,11 @@ def _read(text: str) -> Axis:
     if excess is not None:
         raise ScenarioError(f"{place}: {excess}.")
     key = ".".join(part.strip() for part in key.split("."))
-    return Axis(key, parts[0] if len(parts) == 1 else tuple(chain(*parts)))
+    values = parts[0] if len(parts) == 1 else tuple(chain(*parts))
+    if key.endswith(".file"):
+        # A sweep may go on from another working folder.
+        values = tuple(str(Path(str(value)).resolve()) for value in values)
+    return Axis(key, values)
 
 
 def _range(item: Any, place: str) -> Sequence[Any]:

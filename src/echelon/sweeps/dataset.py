@@ -16,7 +16,7 @@ from echelon.sweeps.plan import Sweep
 if TYPE_CHECKING:
     import xarray as xr
 
-    from echelon.sweeps.sweep import Batch
+    from echelon.sweeps.crew import Batch
 
 _Z = 1.96
 """Of a normal distribution, within which 95 % lie."""

@@ -156,6 +156,7 @@ class Live {
       this.knobs[told.name] = knob;
       this.panel.append(knob.element);
     }
+    if (this.run.methods.length) this.panel.append(this.makeMethods());
     const button = (words, title, act) => {
       const made = make("button", { title }, words);
       made.addEventListener("click", act);
@@ -166,6 +167,14 @@ class Live {
       button("reset", "begin again, the knobs as they are", () => this.ask("reset")),
       button("save as scenario", "a file that repeats what was done", () => this.save())));
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, an agent to choose it"));
+  }
+
+  makeMethods() {
+    const select = make("select", { "aria-label": "gain method" }, make("option", { value: "" }, "as in the scenario"));
+    for (const name of this.run.methods) select.append(make("option", { value: name }, name));
+    select.addEventListener("change", () => select.value && this.ask("method", select.value));
+    this.knobs.method = { set: (value) => (select.value = value ?? "") };
+    return make("label", { class: "knob" }, make("span", {}, "gain method"), select);
   }
 
   async save() {

@@ -1,0 +1,46 @@
+"""Draw docs/assets/replay.png and live.png: the pages, as a real browser shows them.
+
+Run it with `.venv/bin/python docs/make_pictures.py`; it needs Chromium, and takes a minute.
+"""
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent / "tests"))
+
+from browser import chromium, opened, until  # noqa: E402 - of the tests
+
+import echelon as ech  # noqa: E402
+from echelon.live.server import live, serve_live  # noqa: E402
+from echelon.results.dataset import dataset  # noqa: E402
+from echelon.results.recording import recording  # noqa: E402
+from echelon.viewer.replay import replay_page  # noqa: E402
+from echelon.viewer.serve import serving  # noqa: E402
+
+SHORT = ("simulation.horizon=20", "simulation.store_every=4")
+
+
+def main() -> None:
+    """Run the paper's scenario, and take both pictures."""
+    run = recording(dataset(ech.run(ech.load_scenario("paper", SHORT))))
+    file = HERE / "assets" / "replay.html"
+    file.write_text(replay_page(run), "utf-8")
+    with chromium() as browser:
+        with opened(browser, file.as_uri()) as page:
+            page.evaluate("echelon.seek(echelon.run.frameOf(1.6))")
+            page.wait_for_timeout(800)
+            page.screenshot(path=HERE / "assets" / "replay.png")
+        file.unlink()
+        session, html = live(ech.load_scenario("paper"))
+        session.start()
+        with serving(serve_live(session, html, 0)) as address, opened(browser, address) as page:
+            until(lambda: page.evaluate("echelon.time") > 8.0)
+            page.evaluate("echelon.ask('kick', 2)")
+            page.wait_for_timeout(900)
+            page.screenshot(path=HERE / "assets" / "live.png")
+        session.end()
+
+
+if __name__ == "__main__":
+    main()
