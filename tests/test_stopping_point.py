@@ -551,7 +551,7 @@ def test_no_graph_and_no_start_leaves_the_tube():
 
 def attack(draw, starts=12):
     """Fly far and steep starts on a random graph; return by how much z'' stays above its bound."""
-    # The bound is of continuous time: held for 2 ms from such tilts, the lowest pass it by 0.1 m/s^2.
+    # The bound is of continuous time: held for 2 ms, the steepest starts pass it by 0.1 m/s^2.
     parts, settings = random_parts(draw), ech.Settings(horizon=1.0, dt=0.0005, limits=False)
     prepared = prepare(parts, settings)
     loop = assemble(prepared.problem, prepared.parts.drive.leader, prepared.parts.drive.follower)
