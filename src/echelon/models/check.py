@@ -133,12 +133,21 @@ def _check_limits(model: ControlAffine, name: str, m: int) -> None:
     if not (low < high).all():
         raise ModelError(f"`input_limits` of `{name}` must have each `low` below its `high`.")
     if type(model).limit is ControlAffine.limit:
-        G = np.asarray(limits.matrix, float)
-        if k != m or np.linalg.matrix_rank(G) < m:
+        if k != m or not _has_inverse(np.asarray(limits.matrix, float)):
             raise ModelError(
                 f"`input_limits` of `{name}` has {k} rows for {m} inputs, which do not say what is "
                 "delivered of an input beyond them; add `limit`."
             )
+
+
+def _has_inverse(G: np.ndarray) -> bool:
+    """Tell whether floats can invert a matrix: of numbers too small they can tell a rank alone."""
+    if np.linalg.matrix_rank(G) < len(G):
+        return False
+    try:
+        return bool(np.isfinite(np.linalg.inv(G)).all())
+    except np.linalg.LinAlgError:
+        return False
 
 
 def _check_limit(model: ControlAffine, name: str, u: np.ndarray) -> None:
