@@ -313,6 +313,16 @@ def test_double_integrators_agree_to_rounding_on_a_moving_leader():
     )
 
 
+def test_without_any_chain_a_step_is_that_of_the_linear_law():
+    # A velocity that is commanded is zeta' itself, so Euler makes e+ = (I - c dt L) e.
+    model, c, dt, steps = ech.models.SingleIntegrator(2), 0.8, 0.05, 40
+    parts = flight(model=model, coupling=c, speed=np.inf, observer=False)
+    result = fly(parts, steps * dt, dt=dt, integrator="euler")
+    step = np.eye(3) - c * dt * PAPER_TREE.grounded_laplacian().toarray()
+    wanted = np.linalg.matrix_power(step, steps) @ result.errors[0, 1:]
+    np.testing.assert_allclose(result.errors[-1, 1:], wanted, atol=1e-12)
+
+
 @pytest.mark.parametrize("hears", ["leaderward", pytest.param("all", marks=pytest.mark.slow)])
 def test_the_farthest_stopping_point_never_moves_away(hears):
     graph = ech.Graph([(0, 1, 0.4), (1, 2, 2.5), (2, 3), (1, 3, 0.7), (3, 4, 1.9)])

@@ -63,7 +63,7 @@ class FlatLoop(eqx.Module):
         r, m = max(chains.degrees), len(chains.degrees)
         weights, stiffness = np.zeros((r, m)), np.ones(m)
         for k, degree in enumerate(chains.degrees):
-            q = np.poly(-np.array(roots[: degree - 1]))[::-1]
+            q = np.atleast_1d(np.poly(-np.array(roots[: degree - 1])))[::-1]
             weights[:degree, k], stiffness[k] = q / q[0], q[0]
         return cls(chains, weights, stiffness, observer)
 
