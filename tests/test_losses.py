@@ -1,13 +1,10 @@
 """Nothing computed is lost, nothing of the user's is overwritten, and runs go on."""
 
-import contextlib
 import json
 import os
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from processes import started, wait_for
 from runs import OWN_PENDULUM
 
 import echelon as ech
@@ -56,28 +54,6 @@ def here(here):
     (here / "models" / "swing.py").write_text(OWN_PENDULUM)
     (here / "mine.yaml").write_text(SCENARIO)
     return here
-
-
-@contextlib.contextmanager
-def started(*arguments, code=EAGER):
-    """Start the command line in a process of its own, with the signals that a terminal gives it."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def wait_for(process, condition):
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
 
 
 def stored(folder):
@@ -178,7 +154,7 @@ def test_the_grid_visits_each_step_once_and_stores_each_frame_once(steps, every,
 
 
 def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelon):
-    with started("run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
+    with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: len(list(here.glob("o/chunks/*.npz"))) > 3)
         process.kill()
     assert process.returncode == -signal.SIGKILL and not (here / "o" / "run.nc").exists()
@@ -199,7 +175,7 @@ def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelo
 
 
 def interrupted(here, number, presses=1):
-    with started("run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
+    with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: list(here.glob("o/chunks/*.npz")))
         process.send_signal(number)
         told = process.stderr.readline()
@@ -239,7 +215,7 @@ def test_a_second_interrupt_ends_at_once_and_keeps_the_chunks(here, echelon):
 
 @pytest.mark.slow
 def test_a_signal_before_anything_is_computed_leaves_no_trace(here):
-    with started("run", "mine.yaml", "--out", "o", code=EAGER) as process:
+    with started(EAGER, "run", "mine.yaml", "--out", "o") as process:
         time.sleep(0.5)
         process.send_signal(signal.SIGTERM)
         process.communicate()
@@ -323,7 +299,7 @@ def test_a_link_and_a_device_are_written_through(here):
 
 
 def test_of_two_runs_into_one_folder_one_is_refused(here, echelon):
-    with started("run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
+    with started(EAGER, "run", "mine.yaml", *LONG, "--no-figures", "--out", "o") as process:
         wait_for(process, lambda: list(here.glob("o/chunks/*.npz")))
         for more in ([], ["--force"]):
             code, _, err = echelon("run", "mine.yaml", *FRAMES, "--out", "o", *more)

@@ -7,7 +7,7 @@ import scipy.optimize
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from echelon.certificates.bounds import exponential, invariant_ellipsoid, peak_gain
+from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
 from echelon.certificates.margins import (
     ClosedLoop,
     decays_between,
@@ -20,6 +20,7 @@ from echelon.certificates.margins import (
     string_gain,
 )
 from echelon.core.errors import GainError
+from echelon.core.linear import exponential
 from echelon.models import Quadrotor
 
 ONE = np.eye(1)

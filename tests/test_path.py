@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon.core.linear import flows
+from echelon.core.linear import exponential
 from echelon.core.words import Kind
 from echelon.promises.statement import Hypothesis
 
@@ -92,6 +92,6 @@ def test_the_inner_loop_does_not_chatter_at_the_papers_own_step(seed):
 def test_flows_are_exponentials(scale):
     draws = np.random.default_rng(1)
     rates = scale * (draws.normal(size=(5, 3, 6, 6)) - 2.0 * np.eye(6))
-    for found, wanted in zip(flows(rates), scipy.linalg.expm(rates), strict=True):
+    for found, wanted in zip(exponential(rates), scipy.linalg.expm(rates), strict=True):
         size = np.abs(wanted).max(axis=(1, 2), keepdims=True)
         np.testing.assert_allclose(found / size, wanted / size, rtol=0, atol=1e-11)

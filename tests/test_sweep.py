@@ -4,17 +4,16 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
 import types
 
+import distributed
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import started, wait_for
 from typer.testing import CliRunner
 
 import echelon as ech
@@ -365,27 +364,6 @@ SWEEP = ["sweep", "van-der-pol", "--set", "simulation.horizon=20", "--over", "se
 SWEEP += ["--over", "follower.gain.coupling=2,3", "--no-figures", "--threads", "1"]
 
 
-@contextlib.contextmanager
-def started(*arguments):
-    process = subprocess.Popen(
-        [sys.executable, "-c", SMALL, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def wait_for(process, condition):
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
-
-
 def arrays(folder):
     with xr.open_dataset(folder / "sweep.nc", engine="h5netcdf") as data:
         return {name: np.asarray(data[name].values) for name in data}
@@ -397,15 +375,15 @@ def files(folder):
 
 @pytest.mark.slow
 def test_a_sweep_that_is_killed_goes_on_and_computes_nothing_again(here):
-    with started(*SWEEP, "--out", here / "whole") as process:
+    with started(SMALL, *SWEEP, "--out", here / "whole") as process:
         assert process.wait(300) == 0, process.communicate()
-    with started(*SWEEP, "--out", here / "cut") as process:
+    with started(SMALL, *SWEEP, "--out", here / "cut") as process:
         wait_for(process, lambda: len(files(here / "cut")) >= 2)
         process.send_signal(signal.SIGKILL)
         process.wait(10)
     kept = files(here / "cut")
     assert kept and not (here / "cut" / "sweep.nc").exists()
-    with started("sweep", "--resume", here / "cut", "--no-figures") as process:
+    with started(SMALL, "sweep", "--resume", here / "cut", "--no-figures") as process:
         wait_for(process, lambda: len(files(here / "cut")) > len(kept) or process.poll() == 0)
         now = files(here / "cut")
         assert all(now.get(name, stamp) == stamp for name, stamp in kept.items())
@@ -419,7 +397,7 @@ def test_a_sweep_that_is_killed_goes_on_and_computes_nothing_again(here):
 
 @pytest.mark.slow
 def test_ctrl_c_ends_a_sweep_soon_and_keeps_what_is_done(here):
-    with started(*SWEEP, "--out", here / "cut", "--json") as process:
+    with started(SMALL, *SWEEP, "--out", here / "cut", "--json") as process:
         wait_for(process, lambda: len(files(here / "cut")) >= 1)
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=60)
@@ -451,7 +429,6 @@ def test_a_sweep_writes_its_folder_and_is_complete(here):
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed():
-    distributed = pytest.importorskip("distributed")
     scenario = ech.load_scenario("van-der-pol", SHORT)
     plan = Sweep(scenario, axes_of({"seed": range(80), "follower.gain.coupling": [1.0, 2.0]}))
     alone, shared = list[Batch](), list[Batch]()
@@ -480,7 +457,6 @@ def smaller_batches():
 
 
 def test_a_cluster_that_does_not_answer_is_one_sentence():
-    pytest.importorskip("distributed")
     plan = Sweep(ech.load_scenario("van-der-pol", SHORT), axes_of({"seed": [1]}))
     with pytest.raises(
         ech.errors.OutputError, match=r"^the cluster at `nowhere:1` does not answer"

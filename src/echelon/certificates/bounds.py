@@ -8,9 +8,8 @@ import numpy as np
 import scipy.linalg
 
 from echelon.certificates.margins import ClosedLoop, lowest, modes
+from echelon.core.linear import exponential
 from echelon.core.types import Array
-
-_DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
 
 
 def invariant_ellipsoid(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array:
@@ -91,20 +90,3 @@ def _impulse_norms(A: Array, E: Array) -> Array:
         if not still.any():
             break
     return d * (closed + wholes.sum(0))
-
-
-def exponential(X: Array) -> Array:
-    """Return exp(X) of matrices (..., n, n), all scaled and squared alike.
-
-    SciPy's waits on other threads for each of a stack of small matrices; products of a stack do
-    not, and are as exact: the error of both is that of the squarings.
-    """
-    size = float(np.linalg.norm(X, 1, axis=(-2, -1)).max())
-    squarings = max(0, int(np.ceil(np.log2(size)))) if size > 0.0 else 0
-    X, one = X * 0.5**squarings, np.eye(X.shape[-1])
-    found = one + X / _DEGREE
-    for k in range(_DEGREE - 1, 0, -1):
-        found = one + X @ found / k
-    for _ in range(squarings):
-        found = found @ found
-    return found

@@ -10,8 +10,7 @@ from echelon.core.errors import GainError
 from echelon.core.numerics import INTEGRATORS
 from echelon.core.types import Array
 
-_TERMS = 16
-"""Of the series of an exponential."""
+_DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
 
 
 def held_step(
@@ -36,21 +35,22 @@ def held_step(
     return moved[..., :n], moved[..., n:]
 
 
-def flows(M: np.ndarray) -> np.ndarray:
-    """Return exp(M) of many matrices (..., n, n) at once, each as its series, scaled and squared.
+def exponential(X: np.ndarray) -> np.ndarray:
+    """Return exp(X) of matrices (..., n, n), all scaled and squared alike.
 
-    One after the other, as SciPy takes them, most of the time goes into calls.
+    SciPy's waits on other threads for each of a stack of small matrices; products of a stack do
+    not, and are as exact: the error of both is that of the squarings.
     """
-    size = float(np.abs(M).sum(axis=-1).max(initial=0.0))
-    # The first term that is left out is below 0.5^17 / 17! < 1e-19 of the scaled flow.
-    halvings = max(0, int(np.ceil(np.log2(size))) + 1) if 0.0 < size < np.inf else 0
-    scaled, one = M * 0.5**halvings, np.eye(M.shape[-1])
-    flow = one + scaled / _TERMS
-    for k in range(_TERMS - 1, 0, -1):
-        flow = one + scaled @ flow / k
-    for _ in range(halvings):
-        flow = flow @ flow
-    return flow
+    size = float(np.linalg.norm(X, 1, axis=(-2, -1)).max(initial=0.0))
+    # A loop that is lost has no flow, and what comes of it is no number either way.
+    squarings = max(0, int(np.ceil(np.log2(size)))) if 0.0 < size < np.inf else 0
+    X, one = X * 0.5**squarings, np.eye(X.shape[-1])
+    found = one + X / _DEGREE
+    for k in range(_DEGREE - 1, 0, -1):
+        found = one + X @ found / k
+    for _ in range(squarings):
+        found = found @ found
+    return found
 
 
 def held_radius(

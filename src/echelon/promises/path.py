@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core import linear
-from echelon.core.linear import flows, held_radius, held_step
+from echelon.core.linear import exponential, held_radius, held_step
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
@@ -92,7 +92,7 @@ class Slopes(NamedTuple):
     def _exponent(self, span: float) -> float:
         """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
         J = self.A[:, None] - self.B[:, None] @ self.gains
-        each = flows(span * J)
+        each = exponential(span * J)
         product, logs = each[0], np.zeros(J.shape[1])
         for flow in each[1:]:
             sizes = np.linalg.norm(product, axis=(1, 2))

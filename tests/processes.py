@@ -1,0 +1,29 @@
+"""The command line in a process of its own, to be ended by signals."""
+
+import contextlib
+import subprocess
+import sys
+import time
+
+
+@contextlib.contextmanager
+def started(code, *arguments):
+    """Start Python code that is the command line, and end it whatever happens."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(process, condition):
+    """Wait until something is so, while a process goes on."""
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
