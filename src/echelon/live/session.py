@@ -88,11 +88,9 @@ class Session:
 
     def show(self, picture: Picture) -> None:
         """Make a picture the latest one."""
-        if not picture.finite:
+        if picture.beyond.any():
             self.lost = True
-            who = int(np.argmax(~np.isfinite(picture.states).all(axis=1)))
-            note = f"The state of agent {who} stopped being finite at {picture.time:.2f} s; reset."
-            self.say({"note": note})
+            self.say({"note": _lost(picture)})
             return
         frame = self._packed(picture)
         with self.changed:
@@ -269,3 +267,12 @@ def _stands(session: Session, name: str) -> bool:
 def _plain(spec: Any) -> dict[str, Any]:
     """Return an event of a scenario as what was noted."""
     return {name: value for name, value in spec.model_dump().items() if value is not None}
+
+
+def _lost(picture: Picture) -> str:
+    """Return who was lost, and when, in words."""
+    who, when = int(np.argmax(picture.beyond)), f"at {picture.time:.2f} s"
+    if np.isfinite(picture.states[who]).all():
+        far = np.abs(picture.states[who]).max()
+        return f"Agent {who} has flown apart, to {far:.1e}, {when}; reset."
+    return f"The state of agent {who} stopped being finite {when}; reset."

@@ -1,9 +1,8 @@
-"""The closed loop as it runs live: one compiled call a picture, and knobs that compile nothing."""
+"""The closed loop as it runs live, and knobs that compile nothing."""
 
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,13 +10,14 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
-from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
+from echelon.engine.loop import Loop, Moment, assemble
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.live.knobs import Knobs, Panel
+from echelon.live.mover import mover_of
 from echelon.models.model import ControlAffine
 from echelon.network.exchange import Exchange
 from echelon.network.graph import Graph
@@ -26,8 +26,6 @@ from echelon.world.world import World
 
 PICTURE = 0.04
 """Seconds of a picture."""
-_MANY = 200
-"""With more agents than this the loop is stepped in float32, which takes half the time."""
 
 
 @final
@@ -71,7 +69,10 @@ class Dimmed(Law):
 
 
 class Picture(NamedTuple):
-    """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n)."""
+    """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
+
+    `beyond` (N,) are those whose numbers are none, or beyond what is computed.
+    """
 
     time: float
     states: Array
@@ -79,10 +80,7 @@ class Picture(NamedTuple):
     errors: Array
     offsets: Array
 
-    @property
-    def finite(self) -> bool:
-        """Whether all numbers are."""
-        return bool(np.isfinite(self.states).all() and np.isfinite(self.inputs).all())
+    beyond: Array
 
 
 @final
@@ -101,12 +99,11 @@ class Swarm:
     def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
         """Prepare what the steps need."""
         world = World(parts.world.plant, parts.world.disturbance or Disturbance())
-        self.many = parts.graph.agents > _MANY
-        self.kind: Any = "float32" if self.many else settings.precision
         prepared = prepare(parts.replace(world=world), settings)
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
-        loop = assemble(problem, drive.leader, drive.follower)
+        with precision("float64"):
+            loop = assemble(problem, drive.leader, drive.follower)
         law = loop.follower
         if panel.start.coupling is not None:
             law = eqx.tree_at(_inner, law, self._inner(panel.gain(panel.start)), is_leaf=_is_none)
@@ -119,17 +116,33 @@ class Swarm:
         self.edge = _edges_of(loop.exchange, parts.graph)
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
+        self.mover = mover_of(self.loop, self._unlike(), self.states, settings)
         self.restart()
+
+    def _unlike(self) -> Loop:
+        """Return a loop that differs from this one in all that a knob turns, but for weights."""
+
+        def places(loop: Loop) -> tuple[Any, ...]:
+            own = () if self.panel.start.coupling is None else _numbers(loop)
+            return loop.follower.share, *own
+
+        other = [np.full(np.shape(leaf), np.nan) for leaf in places(self.loop)]
+        return eqx.tree_at(places, self.loop, tuple(other))
 
     @property
     def span(self) -> float:
         """Seconds from a picture to the next."""
         return self.count * self.settings.dt
 
-    def restart(self) -> None:
-        """Begin again, the knobs as they are."""
-        with precision(self.kind):
-            self.now: Moment = begin(self.loop, jnp.asarray(self.states))
+    def restart(self, states: Array | None = None, step: int = 0) -> None:
+        """Begin again, the knobs as they are; or go on from where others have come, (N, n)."""
+        begin = self.states if states is None else states
+        self.now: Moment = self.mover.begin(self.loop, begin, step)
+
+    @property
+    def engine(self) -> str:
+        """What computes the steps, `native` or `jax`."""
+        return self.mover.engine
 
     @property
     def steps(self) -> int:
@@ -156,13 +169,8 @@ class Swarm:
         """Return the loop with the gain of the knobs."""
         gain = self.panel.gain(knobs)
         assert gain is not None
-
-        def places(each: Any) -> tuple[Any, ...]:
-            own = each.follower.law.gain
-            return own.P, own.R, own.R_inverse, own.inner, own.coupling
-
         numbers = (gain.P, gain.R, gain.R_inverse, self._inner(gain), np.asarray(knobs.coupling))
-        return eqx.tree_at(places, loop, numbers)
+        return eqx.tree_at(_numbers, loop, numbers)
 
     @staticmethod
     def _inner(gain: Gain | None) -> Array:
@@ -174,22 +182,20 @@ class Swarm:
 
     def kick(self, agent: int, by: Array) -> None:
         """Change the state of an agent by (n,), all at once."""
-        with precision(self.kind):
-            moved = self.now.states.at[agent].add(jnp.asarray(by, self.now.states.dtype))
-            self.now = self.now._replace(states=moved)
+        states = np.array(self.now.states)
+        states[agent] += by
+        self.now = self.now._replace(states=states)
 
     def advance(self, still: bool = False) -> Picture:
         """Go on to the next picture, or look at the present one, and return it."""
-        count = np.asarray(0 if still else self.count, np.int32)
-        with precision(self.kind):
-            self.now, inputs = _advance(self.loop, self.now, count)
-            states = np.asarray(self.now.states, np.float64)
+        self.now, states, inputs = self.mover.move(self.loop, self.now, 0 if still else self.count)
         y = states - self.offsets
         with np.errstate(over="ignore", invalid="ignore"):
             away = (y - y[self.nearest])[:, self.measured]
             errors = np.linalg.norm(away, axis=1)
+        lost = self.mover.beyond(states).any(axis=1) | ~np.isfinite(inputs).all(axis=1)
         time = self.steps * self.settings.dt
-        return Picture(time, states, np.asarray(inputs, np.float64), errors, self.offsets)
+        return Picture(time, states, inputs, errors, self.offsets, lost)
 
 
 def _edges_of(heard: Exchange, graph: Graph) -> Array:
@@ -199,20 +205,15 @@ def _edges_of(heard: Exchange, graph: Graph) -> Array:
     return np.array([places[i, j] if i < j else places[j, i] for i, j in pairs])
 
 
+def _numbers(loop: Loop) -> tuple[Any, ...]:
+    """Return the numbers of the followers' gain."""
+    own = loop.follower.law.gain
+    return own.P, own.R, own.R_inverse, own.inner, own.coupling
+
+
 def _inner(law: Any) -> Any:
     return law.gain.inner
 
 
 def _is_none(node: object) -> bool:
     return node is None
-
-
-@eqx.filter_jit
-def _advance(loop: Loop, now: Moment, count: Array) -> tuple[Moment, jax.Array]:
-    """Take steps, and return the moment with the inputs (N, m) there."""
-
-    def one(_: jax.Array, now: Moment) -> Moment:
-        return step(loop, now, control(loop, now))
-
-    now = jax.lax.fori_loop(0, count, one, now)
-    return now, control(loop, now).inputs
