@@ -109,13 +109,15 @@ _ANSWER = """(wind) => new Promise((done) => {
 
 def measure_live(agents: int) -> None:
     """Tell how the loop keeps time, how many pictures are drawn, and how soon a knob is seen."""
+    from browser import until
+
     began = time.perf_counter()
     session, html = live(scenario(agents))
     print(f"ready after {time.perf_counter() - began:.1f} s, {session.swarm.engine}")
     session.start()
     try:
         with serving(serve_live(session, html, 0)) as address, drawn(address) as page:
-            page.wait_for_function("echelon.pictures > 50", timeout=120_000)
+            until(lambda: page.evaluate("echelon.pictures") > 50, 120.0)
             pictures, clock = page.evaluate(_COUNT, _SECONDS)
             waits = []
             for k in range(_TURNS):
