@@ -19,22 +19,21 @@ class Promiser:
     """Finds what is promised in a thread of its own; of many questions only the last is answered.
 
     Args:
-        panel: of the scenario.
         answer: called with what the page is told.
     """
 
-    def __init__(self, panel: Panel, answer: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, answer: Callable[[dict[str, Any]], None]) -> None:
         """Start the thread, which waits for a question."""
-        self.panel, self.answer = panel, answer
-        self.asked: Knobs | None = None
+        self.answer = answer
+        self.asked: tuple[Panel, Knobs] | None = None
         self.woken, self.ended = threading.Condition(), False
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
 
-    def ask(self, knobs: Knobs) -> None:
-        """Ask what is promised of knobs."""
+    def ask(self, panel: Panel, knobs: Knobs) -> None:
+        """Ask what is promised of the knobs of a panel."""
         with self.woken:
-            self.asked = knobs
+            self.asked = panel, knobs
             self.woken.notify()
 
     def end(self) -> None:
@@ -51,11 +50,11 @@ class Promiser:
                 self.woken.wait_for(lambda: self.ended or self.asked is not None)
                 if self.ended:
                     return
-                knobs, self.asked = self.asked, None
-            assert knobs is not None
+                asked, self.asked = self.asked, None
+            assert asked is not None
             # At once what eigenvalues show, since a promise takes seconds to be found.
-            self.answer(first_look(self.panel, knobs))
-            found = badge_of(self.panel, knobs)
+            self.answer(first_look(*asked))
+            found = badge_of(*asked)
             # A knob that was turned meanwhile has made it an answer to no question.
             if self.asked is None and not self.ended:
                 self.answer(found)

@@ -10,8 +10,9 @@ from typing import Any, final
 import numpy as np
 
 from echelon.core.errors import SimulationError
+from echelon.live.choices import under
 from echelon.live.header import drawn
-from echelon.live.knobs import Knobs, Panel
+from echelon.live.knobs import Knobs, Panel, check_choice
 from echelon.live.promiser import Promiser
 from echelon.live.swarm import Picture, Swarm
 from echelon.scenario.scenario import Scenario
@@ -42,7 +43,12 @@ class Session:
         self.future = sorted((_plain(each) for each in scenario.live), key=lambda e: e["at"])
         self.frame, self.number, self.words = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
-        self.promiser = Promiser(panel, self.say_promise)
+        self.promiser = Promiser(self.say_promise)
+        # Laws that were chosen; what is saved is saved of the first.
+        self.first, self.loops = panel, {panel.law: (panel, swarm)}
+        self.origin = swarm.states
+        for law in {str(each["law"]) for each in self.future if "law" in each}:
+            self.prepare(law)
 
     # ---- the loop -------------------------------------------------------------------------------
 
@@ -105,7 +111,8 @@ class Session:
         ends = (loads.max(), loads.min()) if loads.size else (np.nan, np.nan)
         goals = (picture.states[swarm.nearest] - picture.offsets[swarm.nearest]) + picture.offsets
         parts = [
-            np.array([errors.max(), np.median(errors), *ends, self.factor, self.knobs.wind]),
+            np.array([errors.max(), np.median(errors), *ends, picture.lyapunov]),
+            np.array([self.factor, self.knobs.wind]),
             picture.states[:, list(space.axes)],
             goals[:, list(space.axes)],
             space.sign * picture.states[:, list(space.angles)],
@@ -141,7 +148,7 @@ class Session:
             self.watchers += 1
             seen, heard = -1, len(self.words)
         # A page that comes later hears how things stand.
-        self.promiser.ask(self.knobs)
+        self.promiser.ask(self.panel, self.knobs)
         self.say(self.standing())
         try:
             while not self.ended:
@@ -163,8 +170,8 @@ class Session:
         graph = self.swarm.parts.graph
         knobs = {name: getattr(self.knobs, name) for name in self.panel.ranges}
         cut = [graph.edges[k].tolist() for k in sorted(self.knobs.cut)]
-        knobs["method"] = self.knobs.method
-        return {"knobs": knobs, "cut": cut, "paused": self.paused}
+        chosen = {"law": self.panel.law, "method": self.knobs.method, "shape": self.knobs.shape}
+        return {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
 
     # ---- what is done ---------------------------------------------------------------------------
 
@@ -176,7 +183,7 @@ class Session:
         """
         name, value = told.get("name"), told.get("value")
         if name == "save":
-            return {"text": self.panel.saved(self.events)}
+            return {"text": self.first.saved(self.events)}
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
@@ -196,8 +203,11 @@ class Session:
             if type(value) is not int or not 0 <= value < self.swarm.parts.graph.agents:
                 raise SimulationError(f"`kick` got `{value}`, and must be the number of an agent.")
             return {"kick": {value: self._kick()}}
-        if name == "method":
-            return {name: self.panel.with_method(self.knobs, value).method}
+        if name == "law":
+            return {name: self.prepare(str(value))}
+        if name in _CHOSEN:
+            _CHOSEN[name](self.panel, self.knobs, value)
+            return {name: value}
         return {name: getattr(self.panel.turned(self.knobs, name, value), name)}
 
     def _edge(self, pair: Any) -> int:
@@ -229,8 +239,10 @@ class Session:
             elif name in ("cut", "restore"):
                 cut = {self._edge(value)}
                 knobs = knobs._replace(cut=knobs.cut | cut if name == "cut" else knobs.cut - cut)
-            elif name == "method":
-                knobs = self.panel.with_method(knobs, value)
+            elif name == "law":
+                knobs = self._obey(str(value), knobs)
+            elif name in _CHOSEN:
+                knobs = _CHOSEN[name](self.panel, knobs, value)
             elif name != "at":
                 knobs = self.panel.turned(knobs, name, value)
         if knobs != self.knobs:
@@ -239,8 +251,39 @@ class Session:
     def _stand(self, knobs: Knobs) -> None:
         self.knobs = knobs
         self.swarm.turn(knobs)
-        self.promiser.ask(knobs)
+        self.promiser.ask(self.panel, knobs)
         self.say(self.standing())
+
+    def prepare(self, law: str) -> str:
+        """Compile the loop under another law, while this one goes on, and return the law.
+
+        Raises:
+            EchelonError: the law does not fit these agents, or there is none of that name.
+        """
+        if law in self.loops:
+            return law
+        check_choice("law", law, self.panel.laws)
+        self.say({"note": f"The law `{law}` is being compiled; the loop goes on meanwhile."})
+        try:
+            scenario, built = under(self.first.scenario, law)
+            panel = Panel(scenario, built)
+            self.loops[law] = panel, Swarm(*built, panel)
+            # Whatever is compiled only when it is first used.
+            self.loops[law][1].advance()
+        finally:
+            self.say({"note": ""})
+        return law
+
+    def _obey(self, law: str, knobs: Knobs) -> Knobs:
+        """Go on from here under another law, whose agents remember nothing of the one before."""
+        self.prepare(law)
+        before, self.swarm = self.swarm, self.loops[law][1]
+        self.panel = self.loops[law][0]
+        self.swarm.restart(np.asarray(before.now.states, float), before.steps)
+        self.say({"panel": self.panel.told(), "choices": self.panel.choices()})
+        kept = {name for name in self.panel.ranges if name not in ("coupling",)}
+        told = {name: getattr(knobs, name) for name in {"shape", "cut", *kept}}
+        return self.panel.start._replace(**told)
 
     def _pause(self, paused: bool) -> None:
         self.paused = paused
@@ -248,16 +291,24 @@ class Session:
 
     def _reset(self) -> None:
         """Begin again, with the knobs as they stand."""
-        self.swarm.restart()
+        self.swarm.restart(self.origin)
         self.lost, self.events, self.future = False, [], []
-        names = [name for name in ("method", *self.panel.ranges) if _stands(self, name)]
-        told = {name: getattr(self.knobs, name) for name in names}
+        names = [name for name in (*_CHOSEN, *self.panel.ranges) if _stands(self, name)]
+        told: dict[str, Any] = {} if self.panel is self.first else {"law": self.panel.law}
+        told |= {name: getattr(self.knobs, name) for name in names}
         self.events += [{"at": 0.0, **told}] if told else []
         graph = self.swarm.parts.graph
         for edge in sorted(self.knobs.cut):
             self.events.append({"at": 0.0, "cut": graph.edges[edge].tolist()})
         self.say({"reset": True, "note": ""})
         self.show(self.swarm.advance(still=True))
+
+
+_CHOSEN: dict[str, Callable[[Panel, Knobs, object], Knobs]] = {
+    "method": Panel.with_method,
+    "shape": Panel.with_shape,
+}
+"""What is chosen from a list, and how."""
 
 
 def _stands(session: Session, name: str) -> bool:

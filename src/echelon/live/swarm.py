@@ -1,11 +1,13 @@
 """The closed loop as it runs live, and knobs that compile nothing."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import GraphError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 from echelon.core.words import Feedforward
@@ -21,6 +23,7 @@ from echelon.live.mover import mover_of
 from echelon.models.model import ControlAffine
 from echelon.network.exchange import Exchange
 from echelon.network.graph import Graph
+from echelon.results.lyapunov import potential
 from echelon.world.disturbance import Disturbance
 from echelon.world.world import World
 
@@ -71,7 +74,8 @@ class Dimmed(Law):
 class Picture(NamedTuple):
     """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
 
-    `beyond` (N,) are those whose numbers are none, or beyond what is computed.
+    `lyapunov` is V, NaN where there is none; `beyond` (N,) are those whose numbers are none, or
+    beyond what is computed.
     """
 
     time: float
@@ -79,7 +83,7 @@ class Picture(NamedTuple):
     inputs: Array
     errors: Array
     offsets: Array
-
+    lyapunov: float
     beyond: Array
 
 
@@ -105,29 +109,40 @@ class Swarm:
         with precision("float64"):
             loop = assemble(problem, drive.leader, drive.follower)
         law = loop.follower
-        if panel.start.coupling is not None:
-            law = eqx.tree_at(_inner, law, self._inner(panel.gain(panel.start)), is_leaf=_is_none)
+        gain = panel.gain(panel.start)
+        if gain is not None:
+            law = eqx.tree_at(lambda each: each.gain.inner, law, _inner(gain), is_leaf=_is_none)
+        elif panel.start.coupling is not None:
+            c = np.asarray(panel.start.coupling)
+            law = eqx.tree_at(lambda each: each.coupling, law, c, is_leaf=_is_none)
         dimmed = Dimmed(law, np.asarray(1.0), law.feedforward)
         self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
+        self.potentials: dict[Any, Callable[[Array], Array]] = {}
         self.states, self.measured = problem.states, list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
         self.edge = _edges_of(loop.exchange, parts.graph)
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
+        self.potential = self._potential(panel.start)
         self.mover = mover_of(self.loop, self._unlike(), self.states, settings)
         self.restart()
 
     def _unlike(self) -> Loop:
         """Return a loop that differs from this one in all that a knob turns, but for weights."""
+        other = [np.full(np.shape(leaf), np.nan) for leaf in self._turned(self.loop)]
+        return eqx.tree_at(self._turned, self.loop, tuple(other))
 
-        def places(loop: Loop) -> tuple[Any, ...]:
-            own = () if self.panel.start.coupling is None else _numbers(loop)
-            return loop.follower.share, *own
-
-        other = [np.full(np.shape(leaf), np.nan) for leaf in places(self.loop)]
-        return eqx.tree_at(places, self.loop, tuple(other))
+    def _turned(self, loop: Loop) -> tuple[Any, ...]:
+        """Return the numbers of the followers' law that knobs turn."""
+        follower: Any = loop.follower
+        if self.panel.start.coupling is None:
+            return (follower.share,)
+        if self.panel.parts.drive.gain is None:
+            return follower.share, follower.law.coupling
+        own = follower.law.gain
+        return follower.share, own.coupling, own.P, own.R, own.R_inverse, own.inner
 
     @property
     def span(self) -> float:
@@ -151,34 +166,40 @@ class Swarm:
 
     def turn(self, knobs: Knobs) -> None:
         """Let the loop run with the knobs so."""
+        self.potential = self._potential(knobs)
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
         weights[np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
-            lambda each: (each.offsets, each.exchange.weights, each.follower.share),
+            lambda each: (each.offsets, each.exchange.weights, each.motion.wind.constant),
             self.loop,
-            (self.offsets, weights, np.asarray(float(knobs.feedforward))),
+            (self.offsets, weights, self.panel.wind(knobs)),
         )
-        wind = self.panel.wind(knobs)
-        loop = eqx.tree_at(lambda each: each.motion.wind.constant, loop, wind)
-        if knobs.coupling is not None:
-            loop = self._with_gain(loop, knobs)
-        self.loop = loop
+        self.loop = eqx.tree_at(self._turned, loop, self._numbers(knobs))
 
-    def _with_gain(self, loop: Loop, knobs: Knobs) -> Loop:
-        """Return the loop with the gain of the knobs."""
+    def _numbers(self, knobs: Knobs) -> tuple[Any, ...]:
+        """Return what these are at the knobs."""
+        share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
+        if knobs.coupling is None:
+            return (share,)
+        c = np.asarray(knobs.coupling)
+        if gain is None:
+            return share, c
+        return share, c, gain.P, gain.R, gain.R_inverse, _inner(gain)
+
+    def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
+        """Return what tells V; None of a law without a P, or where a cut has parted the graph."""
         gain = self.panel.gain(knobs)
-        assert gain is not None
-        numbers = (gain.P, gain.R, gain.R_inverse, self._inner(gain), np.asarray(knobs.coupling))
-        return eqx.tree_at(_numbers, loop, numbers)
-
-    @staticmethod
-    def _inner(gain: Gain | None) -> Array:
-        """Return the inner loop of a gain, zero without one, so that either compiles to one."""
-        assert gain is not None
-        if gain.inner is not None:
-            return gain.inner
-        return np.zeros((len(gain.R), len(gain.P)))
+        P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
+        if P is None:
+            return None
+        if (knobs.cut, knobs.method) not in self.potentials:
+            try:
+                graph = self.panel.graph(knobs)
+                self.potentials[knobs.cut, knobs.method] = potential(self.parts.model, graph, P)
+            except GraphError:
+                return None
+        return self.potentials[knobs.cut, knobs.method]
 
     def kick(self, agent: int, by: Array) -> None:
         """Change the state of an agent by (n,), all at once."""
@@ -193,9 +214,10 @@ class Swarm:
         with np.errstate(over="ignore", invalid="ignore"):
             away = (y - y[self.nearest])[:, self.measured]
             errors = np.linalg.norm(away, axis=1)
-        lost = self.mover.beyond(states).any(axis=1) | ~np.isfinite(inputs).all(axis=1)
+        known = np.isfinite(inputs).all(axis=1) & ~self.mover.beyond(states).any(axis=1)
         time = self.steps * self.settings.dt
-        return Picture(time, states, inputs, errors, self.offsets, lost)
+        V = float(self.potential(y[None])[0]) if known.all() and self.potential else np.nan
+        return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(known))
 
 
 def _edges_of(heard: Exchange, graph: Graph) -> Array:
@@ -205,14 +227,11 @@ def _edges_of(heard: Exchange, graph: Graph) -> Array:
     return np.array([places[i, j] if i < j else places[j, i] for i, j in pairs])
 
 
-def _numbers(loop: Loop) -> tuple[Any, ...]:
-    """Return the numbers of the followers' gain."""
-    own = loop.follower.law.gain
-    return own.P, own.R, own.R_inverse, own.inner, own.coupling
-
-
-def _inner(law: Any) -> Any:
-    return law.gain.inner
+def _inner(gain: Gain) -> Array:
+    """Return the inner loop of a gain, zero without one, so that either compiles to one."""
+    if gain.inner is not None:
+        return gain.inner
+    return np.zeros((len(gain.R), len(gain.P)))
 
 
 def _is_none(node: object) -> bool:
