@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from echelon.core.errors import SimulationError
+from echelon.core.errors import EchelonError, SimulationError
 from echelon.live.choices import under
 from echelon.live.header import drawn
 from echelon.live.knobs import Knobs, Panel, check_choice
@@ -187,7 +187,12 @@ class Session:
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
-        event = self._event(str(name), value)
+        try:
+            event = {name: self.prepare(str(value))} if name == "law" else None
+        except EchelonError as error:
+            # Asked well, and nothing that these agents can do.
+            return {"fault": _without_place(error)}
+        event = event or self._event(str(name), value)
         self._later(lambda: self.apply(event))
         return event
 
@@ -203,12 +208,15 @@ class Session:
             if type(value) is not int or not 0 <= value < self.swarm.parts.graph.agents:
                 raise SimulationError(f"`kick` got `{value}`, and must be the number of an agent.")
             return {"kick": {value: self._kick()}}
-        if name == "law":
-            return {name: self.prepare(str(value))}
         if name in _CHOSEN:
             _CHOSEN[name](self.panel, self.knobs, value)
             return {name: value}
-        return {name: getattr(self.panel.turned(self.knobs, name, value), name)}
+        stands = getattr(self.panel.turned(self.knobs, name, value), name)
+        span = self.panel.ranges[name]
+        if not span.low <= value <= span.high:
+            text = f"`{name}` got {value:g}, and stands at {stands:g}, the end of its range."
+            self.say({"note": text})
+        return {name: stands}
 
     def _edge(self, pair: Any) -> int:
         edges = self.swarm.parts.graph.edges.tolist()
@@ -318,6 +326,11 @@ def _stands(session: Session, name: str) -> bool:
 def _plain(spec: Any) -> dict[str, Any]:
     """Return an event of a scenario as what was noted."""
     return {name: value for name, value in spec.model_dump().items() if value is not None}
+
+
+def _without_place(error: EchelonError) -> str:
+    """Return what was refused without the file's name, of which there is none here."""
+    return str(error).removeprefix("mapping: ")
 
 
 def _lost(picture: Picture) -> str:

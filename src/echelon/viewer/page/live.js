@@ -73,8 +73,9 @@ class Live {
     moment.time = time;
     this.numbers = { worst, median, lyapunov, factor, wind };
     // A logarithm has no 0, and below rounding there is nothing to see.
-    const log = (value) => (value > 1e-17 ? Math.log10(value) : NaN);
-    this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov)]] : []), [100 * most, 100 * least]]);
+    const log = (value, floor = 1e-17) => (value > floor ? Math.log10(value) : NaN);
+    // V is of the second order in errors.
+    this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov, 1e-34)]] : []), [100 * most, 100 * least]]);
     this.clock.innerHTML = `<b>${time.toFixed(1)}</b> s${factor < 0.95 ? ` \u00b7 ${factor.toFixed(2)} \u00d7 real time` : ""}`;
     this.show();
   }
@@ -112,7 +113,7 @@ class Live {
   hear(told) {
     if (told.promise) this.tellPromise(told.promise);
     if (told.note !== undefined) this.note = told.note;
-    if (told.reset) this.view.trail.forget();
+    if (told.reset) (this.view.trail.forget(), (this.causes = []));
     if (told.panel) this.makeKnobs(told.panel, told.choices);
     if (told.knobs) this.stand(told);
     this.tellNotes();
@@ -186,7 +187,7 @@ class Live {
   // A list to choose from, of which one stands for what the scenario says.
   makeChoice(name, words, names) {
     const select = make("select", { "aria-label": words });
-    for (const each of names) select.append(make("option", { value: each }, each === "scenario" ? "as in the scenario" : each));
+    for (const each of names) select.append(make("option", { value: each }, each === "scenario" ? "the scenario's" : each));
     const set = (value) => (select.value = value ?? "scenario");
     // What is refused leaves the choice as it was.
     select.addEventListener("change", async () => {
