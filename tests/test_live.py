@@ -315,7 +315,9 @@ def test_a_growing_mode_is_told_at_once(panel):
 @pytest.fixture(scope="module")
 def page():
     """A session that runs, and where its page is."""
-    session, html = live(scenario())
+    # A quick loop, since it is watched in real time.
+    follower = {"law": "consensus", "gain": {"method": "riccati", "R": [0.02, 0.02]}}
+    session, html = live(scenario(follower=follower))
     session.start()
     with serving(serve_live(session, html, 0)) as address:
         yield session, address
@@ -417,6 +419,22 @@ def test_a_page_that_is_closed_ends_nothing_and_nobody_watching_stops_the_clock(
     assert session.swarm.steps <= steps + 2 * session.swarm.count
     with opened(browser, address) as shown:
         until(lambda: shown.evaluate("echelon.pictures") > 3)
+
+
+@pytest.mark.parametrize(
+    ("event", "sentence"),
+    [
+        ({"cut": [0, 2]}, "`live` at 1 s: `[0, 2]` is no link of the graph."),
+        ({"law": "best"}, "`live` at 1 s: there is no law `best` here; there are `consensus`"),
+        ({"shape": "star"}, "`live` at 1 s: there is no shape `star` here; there are"),
+        ({"kick": {4: [1.0, 0, 0, 0]}}, "`live` at 1 s: `kick` got agent 4 with 4 numbers"),
+    ],
+)
+def test_what_a_scenario_cannot_do_live_is_told_before_it_begins(panel, swarm, event, sentence):
+    own = scenario(live=[{"at": 1.0, **event}])
+    with pytest.raises(SimulationError) as fault:
+        Session(own, panel, swarm)
+    assert str(fault.value).startswith(sentence)
 
 
 def test_what_is_too_large_to_be_live_is_refused_with_what_would_be(monkeypatch):

@@ -7,6 +7,7 @@ from typing import Any, final
 from echelon.core.errors import EchelonError
 from echelon.live.knobs import Knobs, Panel
 from echelon.promises.promise import Promise, promise
+from echelon.reports.causes import beyond
 from echelon.scenario.build import build
 from echelon.viewer.replay import promise_badge
 
@@ -26,6 +27,7 @@ class Promiser:
         """Start the thread, which waits for a question."""
         self.answer = answer
         self.asked: tuple[Panel, Knobs] | None = None
+        self.beyond = list[str]()
         self.woken, self.ended = threading.Condition(), False
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
@@ -57,6 +59,7 @@ class Promiser:
             found = badge_of(*asked)
             # A knob that was turned meanwhile has made it an answer to no question.
             if self.asked is None and not self.ended:
+                self.beyond = found.get("beyond", [])
                 self.answer(found)
 
 
@@ -72,6 +75,8 @@ def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
     badge: dict[str, Any] = promise_badge(found.as_mapping())
     badge["causes"] = [each.sentence() for each in found.causes]
     badge["edge"] = found.edge
+    # Told where the formation flies apart all the same.
+    badge["beyond"] = [each.sentence() for each in beyond(0.0, found)]
     if found.promised and _near(found, knobs):
         badge |= {"state": "edge", "short": f"{badge['short']}, at its edge"}
     elif not found.promised and found.slowest is not None and found.slowest >= 0.0:

@@ -43,12 +43,40 @@ class Session:
         self.future = sorted((_plain(each) for each in scenario.live), key=lambda e: e["at"])
         self.frame, self.number, self.words = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
-        self.promiser = Promiser(self.say_promise)
         # Laws that were chosen; what is saved is saved of the first.
         self.first, self.loops = panel, {panel.law: (panel, swarm)}
         self.origin = swarm.states
-        for law in {str(each["law"]) for each in self.future if "law" in each}:
-            self.prepare(law)
+        self._check()
+        self.promiser = Promiser(self.say_promise)
+
+    def _check(self) -> None:
+        """Check what the scenario does live, and compile the laws that it takes.
+
+        Raises:
+            SimulationError: something cannot be done, and when.
+        """
+        for event in self.future:
+            try:
+                self._check_event(event)
+            except EchelonError as error:
+                said = _without_place(error)
+                raise SimulationError(f"`live` at {event['at']:g} s: {said}") from error
+
+    def _check_event(self, event: Mapping[str, Any]) -> None:
+        panel = self.loops[self.prepare(str(event["law"]))][0] if "law" in event else self.panel
+        agents, n = self.swarm.states.shape
+        for name, value in event.items():
+            if name in ("cut", "restore"):
+                self._edge(value)
+            elif name in _CHOSEN:
+                _CHOSEN[name](panel, panel.start, value)
+            elif name == "kick":
+                for agent, by in value.items():
+                    if not 0 <= agent < agents or len(by) != n:
+                        raise SimulationError(
+                            f"`kick` got agent {agent} with {len(by)} numbers, and must be of "
+                            f"agents 0 to {agents - 1} with {n}."
+                        )
 
     # ---- the loop -------------------------------------------------------------------------------
 
@@ -87,7 +115,11 @@ class Session:
         with self.changed:
             todo, self.todo = self.todo, []
         for act in todo:
-            act()
+            try:
+                act()
+            except EchelonError as error:
+                # What could be done when it was asked, and no more, as under another law.
+                self.say({"note": _without_place(error)})
         now = self.swarm.steps * self.swarm.settings.dt
         while self.future and self.future[0]["at"] <= now + 1e-9:
             self.apply(self.future.pop(0))
@@ -96,7 +128,7 @@ class Session:
         """Make a picture the latest one."""
         if picture.beyond.any():
             self.lost = True
-            self.say({"note": _lost(picture)})
+            self.say({"note": _lost(picture), "causes": self.promiser.beyond})
             return
         frame = self._packed(picture)
         with self.changed:
