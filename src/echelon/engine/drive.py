@@ -15,7 +15,7 @@ import numpy as np
 
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, State
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, Frame
 from echelon.engine.motion import Motion
 from echelon.engine.settings import Settings
 from echelon.engine.sums import Meter, Sums
@@ -175,6 +175,11 @@ class Drive(eqx.Module):
     def feedforward(self) -> Feedforward:
         """What the followers are sent of others' inputs."""
         return Feedforward.NONE
+
+    @property
+    def frame(self) -> Frame:
+        """The axes of the followers' gain, as they are asked for."""
+        return Frame.WORLD
 
     @property
     def reacts(self) -> bool:

@@ -12,7 +12,7 @@ from echelon.core.errors import (
     check_kind,
 )
 from echelon.core.types import Array, State
-from echelon.core.words import Feedforward
+from echelon.core.words import Feedforward, Frame
 from echelon.engine.by_jax import JaxStepper
 from echelon.engine.drive import Drive, Information, Problem, Stepper
 from echelon.engine.loop import assemble
@@ -59,6 +59,12 @@ class Laws(Drive):
     def feedforward(self) -> Feedforward:
         """What the followers' law needs of others' inputs."""
         return self.follower.feedforward
+
+    @property
+    def frame(self) -> Frame:
+        """The axes of the followers' gain, as they are asked for."""
+        # Of another law one for the gain alone is made, which turns where it can.
+        return getattr(self.follower, "frame", Frame.HEADING)
 
     @property
     def reacts(self) -> bool:
