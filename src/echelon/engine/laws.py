@@ -11,7 +11,7 @@ from echelon.core.errors import (
     SimulationError,
     check_kind,
 )
-from echelon.core.types import Array, State
+from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame
 from echelon.engine.by_jax import JaxStepper
 from echelon.engine.drive import Drive, Information, Problem, Stepper
@@ -123,9 +123,14 @@ class Laws(Drive):
         """Return the metric of the followers' law."""
         return self.follower.metric(model)
 
-    def drift(self, model: ControlAffine, x: State) -> State:
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
+        """Return the heading that a leader at x tells."""
+        return self.leader.heading(model, t, x) if self.follower.turning else None
+
+    def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
         """Return the drift under the followers' law."""
-        return self.follower.drift(model, x)
+        law = self.follower if heading is None else self.follower.facing(heading)
+        return law.drift(model, x)
 
     def stepper(self, problem: Problem) -> Stepper:
         """Return what steps the closed loop, by JAX or by native code.

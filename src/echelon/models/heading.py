@@ -6,6 +6,7 @@ E turns the inputs. So what a law does about one heading it can do about all, in
 
 from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,11 +113,13 @@ def heading_gap(model: "ControlAffine") -> float:
     x = trim + draw.uniform(-0.5, 0.5, (_SAMPLES, len(trim)))
     angles = draw.uniform(-np.pi, np.pi, _SAMPLES)
     with precision("float64"):
-        gaps, sizes = (np.asarray(each) for each in _gaps(model, x, angles))
+        found = _gaps(model, jnp.asarray(x), jnp.asarray(angles))
+    gaps, sizes = map(np.asarray, found)
     return float((gaps / np.maximum(1.0, sizes)).max())
 
 
-def _gaps(model: "ControlAffine", x: Array, angles: Array) -> tuple[jax.Array, jax.Array]:
+@eqx.filter_jit
+def _gaps(model: "ControlAffine", x: jax.Array, angles: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the gap (S, n, 1 + m) at each sample, and the size of what it is of (n, 1 + m)."""
     D, E = state_turn(model), input_turn(model)
 
@@ -131,5 +134,5 @@ def _gaps(model: "ControlAffine", x: Array, angles: Array) -> tuple[jax.Array, j
         m = len(model.input_names)
         return jax.vmap(at, out_axes=1)(jnp.concatenate([jnp.zeros((1, m)), jnp.eye(m)]))
 
-    gaps, sizes = jax.vmap(one)(jnp.asarray(x), jnp.asarray(angles))
+    gaps, sizes = jax.vmap(one)(x, angles)
     return jnp.abs(gaps), jnp.abs(sizes).max(axis=0)

@@ -203,7 +203,7 @@ def frozen_of(
     rows = Rows._make(map(np.concatenate, both))
     count, all_ = len(path.times), _followers(parts, loop, rows)
     along, begun = (Slopes(*(x[part] for x in all_)) for part in (slice(count), slice(count, None)))
-    turns = (float(path.rates.min()), float(path.rates.max())) if path.rates.any() else ()
+    turns = path.extreme_rates()
     own = _leader(parts, path.own_headings(parts), along)
     found = Frozen(path.times, along, own, begun, "", turns)
     if not count or not found.growth().lost:

@@ -48,6 +48,14 @@ class Route(NamedTuple):
         """What followers at the leader's own states are asked with."""
         return Rows(self.times, self.states, self.inputs, self.states, self.rates)
 
+    def extreme_rates(self) -> tuple[float, ...]:
+        """Return the least and the largest rate, rad/s, once where they are one; no zero."""
+        if not len(self.rates):
+            return ()
+        # Flatness maps round: a heading that stays seems to turn at 1e-17.
+        known = np.round([self.rates.min(), self.rates.max()], 9)
+        return tuple(rate for rate in dict.fromkeys(known.tolist()) if rate)
+
     def own_headings(self, parts: Parts) -> Array:
         """Return how far a leader's own gain is turned in these axes, (K,)."""
         turns = getattr(getattr(parts.drive, "leader", None), "turns", False)
@@ -63,12 +71,9 @@ class Route(NamedTuple):
             return Rows(still, np.tile(self.trim, (count, 1)), sent, states, still)
         first = Rows(*(np.repeat(part[:1], count, axis=0) for part in self.rows))
         away = np.repeat(self.headings[:1], count)
-        seen = (
-            np.asarray(_turned_back(model, *map(jnp.asarray, (states, away))))
-            if away.any()
-            else states
-        )
-        return first._replace(times=np.zeros(count), states=seen)
+        seen = jnp.asarray(states)
+        seen = _turned_back(model, seen, jnp.asarray(away)) if away.any() else seen
+        return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
 def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> Route:
@@ -99,9 +104,8 @@ def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> Route:
     if not (parts.drive.follower.turning and len(times)):
         return path
     away = states[:, heading_index(model)] - rest_heading(model)
-    back, sent, rates = map(
-        np.asarray, _in_heading(model, *map(jnp.asarray, (states, inputs, away)))
-    )
+    found = _in_heading(model, *map(jnp.asarray, (states, inputs, away)))
+    back, sent, rates = map(np.asarray, found)
     return path._replace(states=back, inputs=sent, headings=away, rates=rates)
 
 
