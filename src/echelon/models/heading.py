@@ -4,6 +4,7 @@ With T the turn of a state by an angle and D its slope, f(T x) = D f(x) and g(T 
 E turns the inputs. So what a law does about one heading it can do about all, in axes that turn.
 """
 
+import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Scalar, State
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from echelon.models.model import ControlAffine
 
 _SAMPLES = 16
+_GAP = 1e-9
+"""Relative, of f and g; an inertia makes some entries tens of thousands."""
 
 
 class Heading(NamedTuple):
@@ -100,6 +104,35 @@ def rest_heading(model: "ControlAffine") -> float:
 def turned(model: "ControlAffine", x: State, angle: Scalar) -> State:
     """Return T x, the state (n,) of an agent turned about the origin by an angle (rad)."""
     return state_turn(model)(x, angle).at[heading_index(model)].add(angle)
+
+
+def check_heading(model: "ControlAffine") -> None:
+    """Check that what a model says of its heading is so.
+
+    Raises:
+        ModelError: it names what is no state or input, or f and g do not turn so.
+    """
+    told, name = model.heading, type(model).__name__
+    if told is None:
+        return
+    if not isinstance(told, Heading):
+        raise ModelError(f"`heading` of `{name}` is {told!r}, and must be a `Heading` or None.")
+    for what, pairs, known in (
+        ("state", ((told.state,), *told.vectors), model.state_names),
+        ("input", told.inputs, model.input_names),
+    ):
+        for member in itertools.chain.from_iterable(pairs):
+            if member not in known:
+                raise ModelError(
+                    f"`heading` of `{name}` names `{member}`, which is no {what}; allowed are "
+                    f"{listing(known)}{did_you_mean(member, known)}."
+                )
+    if not (gap := heading_gap(model)) <= _GAP:
+        raise ModelError(
+            f"`heading` of `{name}` says that its motion turns with `{told.state}`, and turned by "
+            f"some angle f or g differs by {gap:.3g} from what turns; name all that turns in "
+            "`vectors` and `inputs`, or leave `heading` out."
+        )
 
 
 @kept
