@@ -74,9 +74,7 @@ def flown(reference, initial, horizon, engine="jax"):
     formation = ech.Formation.from_offsets(model, graph, {1: (-1.0, 0.3), 2: (-2.0, -0.4)})
     gain = ech.synthesize(model, graph, ech.gains.Riccati())
     drive = ech.Laws(ech.laws.Tracking(reference), ech.laws.Consensus(gain))
-    parts = ech.Parts(
-        model, graph, formation, drive, initial=initial, start_error=start_error or {}
-    )
+    parts = ech.Parts(model, graph, formation, drive, initial=initial)
     return ech.simulate(parts, ech.Settings(horizon=horizon, dt=0.02, engine=engine))
 
 
