@@ -18,9 +18,10 @@ import echelon.models
 from echelon.core import numerics
 from echelon.core.errors import ModelError
 from echelon.core.numerics import precision
-from echelon.models import Heading, (
+from echelon.models import (
     ControlAffine,
     DoubleIntegrator,
+    Heading,
     Limits,
     Linear,
     Pendulum,
