@@ -191,7 +191,7 @@ def test_v_is_measured_in_the_axes_that_turn(run):
 def test_what_is_promised_of_a_turn_is_the_rate_at_which_errors_shrink():
     spin = ech.references.Hover(position=(0.0, 0.0, 0.0), yaw_rate=1.0)
     # Along the eigenvector of the line's larger eigenvalue, whose slowest mode is the slowest.
-    apart = np.array([1e-3, 1e-3, 0.0, 0.0, 0.0, 0.0])
+    apart = np.array([1e-3, 1e-3, 0.0, 0.0, 1e-3, 0.0])
     rest = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     offsets, shares = ([-1.0, 0.3], [-2.0, -0.4]), (1.0, 0.5 - 0.5 * np.sqrt(5.0))
     starts = {
