@@ -36,7 +36,10 @@ class Watched:
         told = promise(parts, settings).as_mapping()
         self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, told)
         P = parts.drive.metric(parts.model)
-        self.potential = None if P is None else potential(parts.model, parts.graph, P)
+        # Of a law that turns, P stands in axes that turn too, and V is told at the end.
+        turns = getattr(getattr(parts.drive, "follower", None), "turning", False)
+        known = P is not None and not turns
+        self.potential = potential(parts.model, parts.graph, P) if known else None
         self.page = Growing(self.run)
 
     def add(self, stretch: "Stretch") -> None:

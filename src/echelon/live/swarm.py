@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.core.errors import GraphError
 from echelon.core.numerics import precision
-from echelon.core.types import Array, Input, State
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
 from echelon.engine.loop import Loop, Moment, assemble
@@ -38,6 +38,11 @@ class Dimmed(Law):
     law: Law
     share: Any
     feedforward: Feedforward = eqx.field(static=True)
+    turning: bool = eqx.field(static=True)
+
+    def facing(self, heading: Scalar) -> Law:
+        """Return the law in the axes of a heading."""
+        return eqx.tree_at(lambda each: each.law, self, self.law.facing(heading))
 
     def init(self) -> Memory:
         """Return what the law begins with."""
@@ -115,7 +120,7 @@ class Swarm:
         elif panel.start.coupling is not None:
             c = np.asarray(panel.start.coupling)
             law = eqx.tree_at(lambda each: each.coupling, law, c, is_leaf=_is_none)
-        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward)
+        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward, law.turning)
         self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.potentials: dict[Any, Callable[[Array], Array]] = {}
@@ -191,7 +196,8 @@ class Swarm:
         """Return what tells V; None of a law without a P, or where a cut has parted the graph."""
         gain = self.panel.gain(knobs)
         P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
-        if P is None:
+        # Of a law that turns, P stands in axes that turn too.
+        if P is None or self.loop.follower.turning:
             return None
         if (knobs.cut, knobs.method) not in self.potentials:
             try:
