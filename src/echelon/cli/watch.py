@@ -38,8 +38,8 @@ class Watched:
         P = parts.drive.metric(parts.model)
         # Of a law that turns, P stands in axes that turn too, and V is told at the end.
         turns = getattr(getattr(parts.drive, "follower", None), "turning", False)
-        known = P is not None and not turns
-        self.potential = potential(parts.model, parts.graph, P) if known else None
+        shown = None if turns else P
+        self.potential = shown if shown is None else potential(parts.model, parts.graph, shown)
         self.page = Growing(self.run)
 
     def add(self, stretch: "Stretch") -> None:
