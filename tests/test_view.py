@@ -235,8 +235,10 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
         seek(page, 120)
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
         assert f"V {run.lyapunov[120]:.3g}" in chart and "slope promised, −1 1/s" in chart
-        growing.finish(run)
-        until(lambda: page.evaluate("!echelon.run.growing && echelon.frame === 120"))
+        with page.expect_navigation():
+            growing.finish(run)
+        shown = "window.echelon !== undefined && !echelon.run.growing && echelon.frame === 120"
+        until(lambda: page.evaluate(shown))
 
 
 # ---- other models -----------------------------------------------------------------------------

@@ -255,7 +255,9 @@ class Session:
         for place, edge in enumerate(edges):
             if isinstance(pair, list | tuple) and sorted(edge) == sorted(pair):
                 return place
-        raise SimulationError(f"`{pair}` is no link of the graph.")
+        # As a file writes it, which a checked scenario holds as a tuple.
+        told = list(pair) if isinstance(pair, tuple) else pair
+        raise SimulationError(f"`{told}` is no link of the graph.")
 
     def _kick(self) -> list[float]:
         """Return what a kick adds to a state: another way each time."""
