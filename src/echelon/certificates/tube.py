@@ -45,7 +45,7 @@ def room_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction)
     """
     left = [chain.derivative(chain.free(push.start), order) for push in pushes if push.start]
     free = add(*left) if left else Poly()
-    kernel = chain.derivative(chain.impulse(), order - 1)
+    kernel = chain.kernel(order)
     unit = chain.derivative(
         chain.free([Fraction(1), *[Fraction(0)] * (len(chain.powers) - 1)]), order
     )
