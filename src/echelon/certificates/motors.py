@@ -92,16 +92,24 @@ def motors_of(
     return Motors(least, largest, slope)
 
 
+def motors_suffice(
+    frame: Airframe, slices: Sequence[Slice], path: Sequence[Asked], push: Pushed
+) -> bool:
+    """Tell whether the motors give all that is asked of an agent on a path, pushed off it."""
+    most, pairs = Fraction(frame.motor_thrust), zip(slices, path, strict=True)
+    return all(motors_for(frame, add_pushes(*pair, (push,))).within(most) for pair in pairs)
+
+
 def add_pushes(piece: Slice, asked: Asked, pushes: Sequence[Pushed]) -> Asked:
     """Return what is asked on a slice of agents that are pushed off the path."""
-    long, short = piece.reaches[-1], piece.reaches[0]
     aside, up, turn = list(asked.sideways), [Fraction(0)] * 3, list(asked.turn)
     for push in pushes:
+        along, upward, around = push.speeds
         for k in range(3):
-            aside[k] += long.of(k + 1, push.sideways, push.speeds[0])
-            up[k] += long.of(k + 1, push.upward, push.speeds[1])
-            if k < 2:
-                turn[k] += short.of(k, push.turn, push.speeds[2])
+            aside[k] += piece.whole.of(k + 1, push.sideways, along)
+            up[k] += piece.whole.of(k + 1, push.upward, upward)
+        for k in range(2):
+            turn[k] += piece.first.of(k, push.turn, around)
     return Asked(
         (aside[0], aside[1], aside[2]),
         asked.low - up[0],

@@ -169,10 +169,29 @@ def spread_between(p: Poly, low: Fraction, high: Fraction) -> Fraction:
 
 def bounds_on_pieces(p: Poly, halvings: int) -> list[Fraction]:
     """Return a bound of |p| on each of 2^halvings equal pieces of [0, 1], ascending."""
+    return [max(map(abs, piece)) for piece in _pieces(p, halvings)]
+
+
+def spreads_on_pieces(p: Poly, halvings: int) -> list[Fraction]:
+    """Return a bound of the total variation of p on each of 2^halvings equal pieces of [0, 1]."""
+    count, slope = 1 << halvings, {n - 1: n * c for n, c in p.items() if n}
+    ends = [Fraction(k, count) for k in range(count + 1)]
+    values = [value(p, x) for x in ends]
+    return [
+        # Of one sign, so that the integral of |p'| is the difference of p.
+        abs(values[k + 1] - values[k])
+        if min(piece) >= 0 or max(piece) <= 0
+        else spread_between(p, ends[k], ends[k + 1])
+        for k, piece in enumerate(_pieces(slope, halvings))
+    ]
+
+
+def _pieces(p: Poly, halvings: int) -> list[list[Fraction]]:
+    """Return the coefficients of Bernstein on equal pieces of [0, 1]."""
     pieces = [_bernstein(p)]
     for _ in range(halvings):
         pieces = [half for piece in pieces for half in _halved(piece)]
-    return [max(map(abs, piece)) for piece in pieces]
+    return pieces
 
 
 def _moved(p: Poly, low: Fraction, high: Fraction) -> Poly:

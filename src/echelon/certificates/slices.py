@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
-from echelon.certificates.responses import Chain, bounds_on_pieces, spread_between
+from echelon.certificates.responses import Chain, bounds_on_pieces, spreads_on_pieces
 from echelon.enclosure.interval import ELEMENTARY, point
 
 _HALVINGS = 7
@@ -45,24 +45,25 @@ class Slice(NamedTuple):
     """A slice of time from `begin` to `end` (s; None is for ever) and what chains do in it.
 
     Attributes:
-        reaches: of the chain with the first root alone, the first two, and so on.
+        whole: of the chain.
+        first: of the one with its first root alone.
     """
 
     begin: Fraction
     end: Fraction | None
-    reaches: tuple[Reach, ...]
+    whole: Reach
+    first: Reach
 
 
 @functools.lru_cache(32)
 def slices_of(chain: Chain) -> tuple[Slice, ...]:
-    """Return the slices of all time, for a chain and those of its first roots."""
-    shorter = [Chain(chain.powers[: k + 1], chain.unit) for k in range(len(chain.powers))]
-    reaches = list(zip(*map(_reaches, shorter), strict=True))
+    """Return the slices of all time, for a chain of one root or more."""
+    first = Chain(chain.powers[:1], chain.unit)
     count = 1 << _HALVINGS
     times = [_time(chain, Fraction(k, count)) for k in range(count, 0, -1)]
     ends = [high for _, high in times[1:]]
     begins = [low for low, _ in times]
-    return tuple(map(Slice, begins, [*ends, None], reaches))
+    return tuple(map(Slice, begins, [*ends, None], _reaches(chain), _reaches(first)))
 
 
 def _time(chain: Chain, x: Fraction) -> tuple[Fraction, Fraction]:
@@ -94,10 +95,9 @@ def _reaches(chain: Chain) -> list[Reach]:
 
 def _grown(chain: Chain, order: int) -> list[Fraction]:
     """Return the integral of |h^(order)| until the end of each slice of x, the last one first."""
-    kernel, count = chain.kernel(order), 1 << _HALVINGS
     total = chain.stiffness if order == len(chain.powers) else Fraction(0)
     found = list[Fraction]()
-    for k in range(count, 0, -1):
-        total += spread_between(kernel, Fraction(k - 1, count), Fraction(k, count))
+    for spread in reversed(spreads_on_pieces(chain.kernel(order), _HALVINGS)):
+        total += spread
         found.append(rounded_up(total))
     return found[::-1]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from echelon.certificates.motors import Asked, Motors, Pushed, add_pushes, motors_of
+from echelon.certificates.motors import Asked, Motors, Pushed, add_pushes, motors_of, motors_suffice
 from echelon.certificates.responses import Chain
 from echelon.certificates.slices import rounded_up, slices_of
 from echelon.core.kept import kept
@@ -27,8 +27,8 @@ _ROUNDED = Fraction(1, 10**6)
 """Of a start in flat coordinates: a thousand times what floats leave of it."""
 _STARTS = 64
 """Starts that are looked at one by one where all together are too many for the motors."""
-_STEPS = 9
-"""Of a bisection for how far a start may be off: a 500th of where it begins."""
+_STEPS = 8
+"""Of a bisection for how far a start may be off: a 250th of where it begins."""
 _ZERO = Fraction(0)
 _STILL = Pushed((), (), (), (_ZERO, _ZERO, _ZERO))
 
@@ -110,14 +110,14 @@ def strain_of(run: Stopping) -> Strained:
         return Strained(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
     chain = run.chain(0)
     speeds = _speeds(run.speed(k) for k in range(4))
-    ahead = run.flat[list(run.parts.graph.leaders)] - run.ahead
-    led = _largest([_start(each) for each in ahead])
+    off = run.flat[list(run.parts.graph.leaders)] - run.ahead
+    led = _largest([_start(each) for each in off])
     led = led._replace(speeds=_speeds(run.own_speed(k) for k in range(4)))
     path = _path(run.leader, run.parts.model, run.settings.horizon, chain)
     base = _pushed(chain, path.asked, led, speeds)
     away = run.flat - run.flat[list(run.parts.graph.nearest_leader())]
     starts = [_start(each) for each in np.unique(away[list(run.parts.graph.followers)], axis=0)]
-    found = _from(frame, chain, base, starts)
+    found, starts = _from(frame, chain, base, starts)
     shown, most = _shown(found), Fraction(frame.motor_thrust)
     if not found.within(most):
         text = "from these starts the motors are not shown to give what is asked: "
@@ -125,8 +125,9 @@ def strain_of(run: Stopping) -> Strained:
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
         return Strained(None, _line(Verdict.FAILS, path.kind, found, shown, text, remedy))
-    alone = _alone(frame, chain, base, run.ahead)
+    ahead = _ahead(frame, run.ahead)
     told = _told(run, frame, path.asked, led, speeds, starts)
+    told["ahead"] = {name: float(x) for name, x in ahead._asdict().items()}
     least = _floor(found.least)
     strain = Strain(
         path.kind,
@@ -134,7 +135,7 @@ def strain_of(run: Stopping) -> Strained:
         -_floor(-found.largest),
         float(most),
         -_floor(-found.tilt),
-        alone,
+        _alone(frame, chain, base, ahead),
         told,
     )
     text = "the motors give what is asked from these starts, all the way"
@@ -249,49 +250,74 @@ def _pushed(
 
 def _from(
     frame: Airframe, chain: Chain, base: Sequence[Asked], starts: Sequence[Pushed]
-) -> Motors:
-    """Return what motors give from any of these starts, behind what all agents do."""
+) -> tuple[Motors, Sequence[Pushed]]:
+    """Return what motors give from any of these starts, and which are looked at for that."""
 
     def found(start: Pushed) -> Motors:
         return motors_of(frame, slices_of(chain), base, (start,))
 
-    whole = found(_largest(starts))
+    largest = _largest(starts)
+    whole = found(largest)
     if whole.within(Fraction(frame.motor_thrust)) or len(starts) > _STARTS:
-        return whole
+        return whole, [largest]
     each = [found(start) for start in starts]
     if any(one.slope is None for one in each):
-        return whole
+        return whole, [largest]
     least = min(one.least for one in each)
     slopes = [one.slope for one in each if one.slope is not None]
-    return Motors(least, max(one.largest for one in each), max(slopes))
+    return Motors(least, max(one.largest for one in each), max(slopes)), starts
+
+
+class _Ahead(NamedTuple):
+    """Sizes of how a leader's path begins, m and s.
+
+    Attributes:
+        speed, push, jerk: its horizontal velocity, and the derivatives of that.
+        rise: its vertical velocity.
+        lift: g and its vertical acceleration together.
+        climb: the rate of that.
+        turn: of its yaw.
+    """
+
+    speed: Fraction
+    push: Fraction
+    jerk: Fraction
+    rise: Fraction
+    lift: Fraction
+    climb: Fraction
+    turn: Fraction
+
+
+def _ahead(frame: Airframe, path: Array) -> _Ahead:
+    start = _start(path)
+    rise, push, climb = start.upward
+    return _Ahead(*start.sideways, rise, Fraction(frame.gravity) + push, climb, start.turn[0])
 
 
 @kept
 def _alone(
-    frame: Airframe, chain: Chain, base: tuple[Asked, ...], ahead: Array
+    frame: Airframe, chain: Chain, base: tuple[Asked, ...], path: _Ahead
 ) -> Alone | None:
     """Return how far one thing may be off at a start that is else the leader's."""
-    most, slices = Fraction(frame.motor_thrust), slices_of(chain)
-    speed, first, second = (_start(np.roll(ahead, -k, axis=0)) for k in range(3))
-    v, a, j = (part.sideways[0] for part in (speed, first, second))
-    lift = Fraction(frame.gravity) + abs(Fraction(float(ahead[2, 2]))) + _ROUNDED
-    climb = second.upward[0]
+    slices = slices_of(chain)
 
     def fits(sideways: tuple[Fraction, ...], upward: Fraction = _ZERO) -> bool:
-        start = Pushed(sideways, (upward,), (), _STILL.speeds)
-        return motors_of(frame, slices, base, (start,)).within(most)
+        start = Pushed(sideways, (upward,), (path.turn,), _STILL.speeds)
+        return motors_suffice(frame, slices, base, start)
 
-    # The thrust is set level, so that z'' and z''' are the path's: a tilt of tangent t accelerates
-    # by (g + z'') t, and its jerk is z''' t; a body rate w of a level agent adds (g + z'') w.
+    # The thrust is set level, so that z'' and its rate are the path's: a tilt of tangent t
+    # accelerates by (g + z'') t, at a rate of t times the path's; a body rate w of a level agent
+    # adds (g + z'') w to that.
     if not fits((_ZERO,)):
         return None
+    _, a, j, rise, lift, climb, _ = path
     tilt = _farthest(lambda t: fits((_ZERO, lift * t + a, climb * t + j)), Fraction(4))
     return Alone(
         math.atan(tilt),
         _farthest(lambda x: fits((x,)), Fraction(40)),
         _farthest(lambda x: fits((_ZERO,), x), Fraction(20)),
         _farthest(lambda w: fits((_ZERO, a, j + lift * w)), Fraction(40)),
-        fits((v, a, j), speed.upward[0]),
+        fits((path.speed, a, j), rise),
     )
 
 
@@ -321,7 +347,7 @@ def _told(
         "leader": _numbers(led),
         "starts": [_numbers(start) for start in starts],
         "path": [
-            [_above(piece.begin), *(_above(x) for part in asked for x in _flat(part))]
+            [float(piece.begin), *(float(x) for part in asked for x in _flat(part))]
             for piece, asked in zip(spans, path, strict=True)
         ],
     }
@@ -329,10 +355,6 @@ def _told(
 
 def _flat(part: Fraction | tuple[Fraction, ...]) -> tuple[Fraction, ...]:
     return part if isinstance(part, tuple) else (part,)
-
-
-def _above(x: Fraction) -> float:
-    return float(x)
 
 
 def _numbers(push: Pushed) -> dict[str, list[float]]:

@@ -1,6 +1,6 @@
 """What a leader's path asks at most of its derivatives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -20,6 +20,8 @@ from echelon.references.reference import COORDINATES, Reference
 
 _PIECE, _MOST = Fraction(1, 20), 800
 """Of time, s, and how many there are at most."""
+_EXACT = Fraction(1, 10**9)
+"""Of the highest derivative; one that is known so well in one piece is constant, but for rounding."""
 _SAMPLES = 10
 """In each piece, where the path has no enclosure."""
 
@@ -69,8 +71,7 @@ def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: i
     # Derivatives of another making than that of the path would be no part of the enclosure.
     if type(reference).derivatives is Reference.derivatives:
         try:
-            found = enclose_derivatives(lambda t: reference(t)[picked], times, order)
-            return Pieces(Kind.PROOF, times, tuple(tuple(map(tuple, rows)) for rows in found))
+            return _enclosed(lambda t: reference(t)[picked], times, order)
         except GainError:
             pass
     fine = np.linspace(0.0, horizon, count * _SAMPLES + 1)
@@ -78,6 +79,22 @@ def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: i
     seen = np.asarray(every(jnp.asarray(fine)))
     cut = [seen[k * _SAMPLES : (k + 1) * _SAMPLES + 1] for k in range(count)]
     return Pieces(Kind.SAMPLES, times, tuple(map(_seen, cut)))
+
+
+def _enclosed(
+    path: Callable[[jax.Array], jax.Array], times: tuple[Fraction, ...], order: int
+) -> Pieces:
+    """Return what a path is in pieces of time, or in one where that tells all.
+
+    Raises:
+        GainError: the path has no enclosure.
+    """
+    for cut in ((times[0], times[-1]), times):
+        found = tuple(tuple(map(tuple, rows)) for rows in enclose_derivatives(path, cut, order))
+        # What does not move is known at once.
+        if all(x.hi - x.lo < _EXACT for rows in found for x in rows[-1]):
+            break
+    return Pieces(Kind.PROOF, cut, found)
 
 
 def _seen(values: np.ndarray) -> tuple[tuple[Interval, ...], ...]:
