@@ -341,5 +341,3 @@ def _convert(params: Any, x: np.ndarray) -> np.ndarray:
     if np.dtype(params["new_dtype"]).kind in "biu":
         raise GainError("a path turns time into a whole number, of which there is no enclosure.")
     return x
-
-

@@ -295,9 +295,7 @@ def _ahead(frame: Airframe, path: Array) -> _Ahead:
 
 
 @kept
-def _alone(
-    frame: Airframe, chain: Chain, base: tuple[Asked, ...], path: _Ahead
-) -> Alone | None:
+def _alone(frame: Airframe, chain: Chain, base: tuple[Asked, ...], path: _Ahead) -> Alone | None:
     """Return how far one thing may be off at a start that is else the leader's."""
     slices = slices_of(chain)
 

@@ -39,7 +39,9 @@ class Pieces(NamedTuple):
     times: tuple[Fraction, ...]
     values: tuple[tuple[tuple[Interval, ...], ...], ...]
 
-    def between(self, begin: Fraction, end: Fraction | None) -> Sequence[Sequence[Sequence[Interval]]]:
+    def between(
+        self, begin: Fraction, end: Fraction | None
+    ) -> Sequence[Sequence[Sequence[Interval]]]:
         """Return the pieces that meet a stretch of time; the last one at least."""
         spans = zip(self.times, self.times[1:], self.values, strict=False)
         found = [v for a, b, v in spans if b >= begin and (end is None or a <= end)]
@@ -119,4 +121,6 @@ def least_on_path(
     low = min(rows[order][0].lo for rows in found.values)
     value = float(low)
     # `float` rounds to nearest, and a bound must not be rounded up.
-    return Least(value if Fraction(value) <= low else float(np.nextafter(value, -np.inf)), found.kind)
+    return Least(
+        value if Fraction(value) <= low else float(np.nextafter(value, -np.inf)), found.kind
+    )
