@@ -1,8 +1,8 @@
 """What four motors must give at most on a path whose derivatives are bounded, in rationals (T5).
 
-With F = p'' + g e3 the thrust is m |F| along F, and the derivatives of F turn it: R'F' = (f q, -f p, f')
-and R'F'' give the body rates and, with the yaw, all three torques (theory page). Only sizes are
-used, so that any heading will do.
+With F = p'' + g e3 the thrust is m |F| along F, and the derivatives of F turn it: R'F' and R'F''
+give the body rates and, with the yaw, all three torques (theory page). Only sizes are used, so that
+any heading will do.
 """
 
 from collections.abc import Sequence

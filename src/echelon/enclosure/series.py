@@ -1,8 +1,9 @@
-"""What a function of time and its derivatives may be on an interval, by Taylor's series of intervals.
+"""What a function of time and its derivatives may be on an interval, by series of intervals.
 
-Each entry of a trace is a truncated series whose coefficients hold those at every time of the interval
-(Moore, Interval Analysis, 1966). So no derivative is taken from JAX, and the cost grows with the
-square of the order. Ends are whole numbers of units of 2^-90, moved outward by every product.
+Each entry of a trace is a truncated Taylor series whose coefficients hold those at every time of
+the interval (Moore, Interval Analysis, 1966). So no derivative is taken from JAX, and the cost
+grows with the square of the order. Ends are whole numbers of units of 2^-90, moved outward by every
+product.
 """
 
 import functools

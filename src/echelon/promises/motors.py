@@ -30,6 +30,7 @@ _STARTS = 64
 _STEPS = 8
 """Of a bisection for how far a start may be off: a 250th of where it begins."""
 _ZERO = Fraction(0)
+_UNKNOWN = "no certificate is known of these limits; a run says whether one acted"
 _STILL = Pushed((), (), (), (_ZERO, _ZERO, _ZERO))
 
 
@@ -102,44 +103,78 @@ class Strained(NamedTuple):
     line: Statement
 
 
+class _Case(NamedTuple):
+    """What the motors of a run are asked for.
+
+    Attributes:
+        frame: of the agents.
+        chain: of their position.
+        path: what the leader's path asks.
+        led: the leader's start off its path, and its speeds.
+        speeds: of the agents.
+        base: what agents are asked for that start as their leader.
+        starts: of the agents.
+    """
+
+    frame: Airframe
+    chain: Chain
+    path: "_Path"
+    led: Pushed
+    speeds: tuple[Fraction, Fraction, Fraction]
+    base: tuple[Asked, ...]
+    starts: Sequence[Pushed]
+
+    @classmethod
+    def of(cls, run: Stopping, frame: Airframe) -> "_Case":
+        """Return it of a run."""
+        chain, graph = run.chain(0), run.parts.graph
+        speeds = _speeds([run.speed(k) for k in range(4)])
+        off = run.flat[list(graph.leaders)] - run.ahead
+        led = _largest([_start(each) for each in off])
+        led = led._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
+        path = _path(run.leader, run.parts.model, run.settings.horizon, chain)
+        base = _pushed(chain, path.asked, led, speeds)
+        away = (run.flat - run.flat[list(graph.nearest_leader())])[list(graph.followers)]
+        starts = [_start(each) for each in np.unique(away, axis=0)]
+        return cls(frame, chain, path, led, speeds, base, starts)
+
+
+def motors_bear(run: Stopping) -> bool:
+    """Tell whether the motors are certified from the starts of a run."""
+    frame = run.parts.model.airframe
+    if frame is None or _beyond(run):
+        return False
+    case = _Case.of(run, frame)
+    return _from(case)[0].within(Fraction(frame.motor_thrust))
+
+
 def strain_of(run: Stopping) -> Strained:
     """Return whether the motors of a run's agents suffice, by T5 with limits."""
     frame, reason = run.parts.model.airframe, _beyond(run)
     if frame is None or reason:
-        text = reason or "no certificate is known of these limits; a run says whether one acted"
+        text = reason or _UNKNOWN
         return Strained(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
-    chain = run.chain(0)
-    speeds = _speeds(run.speed(k) for k in range(4))
-    off = run.flat[list(run.parts.graph.leaders)] - run.ahead
-    led = _largest([_start(each) for each in off])
-    led = led._replace(speeds=_speeds(run.own_speed(k) for k in range(4)))
-    path = _path(run.leader, run.parts.model, run.settings.horizon, chain)
-    base = _pushed(chain, path.asked, led, speeds)
-    away = run.flat - run.flat[list(run.parts.graph.nearest_leader())]
-    starts = [_start(each) for each in np.unique(away[list(run.parts.graph.followers)], axis=0)]
-    found, starts = _from(frame, chain, base, starts)
-    shown, most = _shown(found), Fraction(frame.motor_thrust)
+    case = _Case.of(run, frame)
+    found, starts = _from(case)
+    kind, shown, most = case.path.kind, _shown(found), Fraction(frame.motor_thrust)
     if not found.within(most):
-        text = "from these starts the motors are not shown to give what is asked: "
-        text += shown or "the thrust may vanish"
+        text = "from these starts the motors are not shown to give what is asked"
+        text += f": {shown}" if shown else ", and the thrust not to vanish"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
-        return Strained(None, _line(Verdict.FAILS, path.kind, found, shown, text, remedy))
+        return Strained(None, _line(Verdict.FAILS, kind, found, shown, text, remedy))
     ahead = _ahead(frame, run.ahead)
-    told = _told(run, frame, path.asked, led, speeds, starts)
-    told["ahead"] = {name: float(x) for name, x in ahead._asdict().items()}
-    least = _floor(found.least)
     strain = Strain(
-        path.kind,
-        least,
+        kind,
+        _floor(found.least),
         -_floor(-found.largest),
         float(most),
         -_floor(-found.tilt),
-        _alone(frame, chain, base, ahead),
-        told,
+        _alone(frame, case.chain, case.base, ahead),
+        _told(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors give what is asked from these starts, all the way"
-    return Strained(strain, _line(Verdict.HOLDS, path.kind, found, shown, text))
+    return Strained(strain, _line(Verdict.HOLDS, kind, found, shown, text))
 
 
 def _beyond(run: Stopping) -> str:
@@ -148,7 +183,7 @@ def _beyond(run: Stopping) -> str:
     if not run.settings.limits or run.parts.model.input_limits is None:
         return "the inputs have no limits"
     if (chains.outputs, chains.degrees) != (_OUTPUTS, _DEGREES):
-        return "no certificate is known of these limits; a run says whether one acted"
+        return _UNKNOWN
     speeds = [*map(run.speed, range(4)), *map(run.own_speed, range(4))]
     return "a `speed` is infinite" if any(map(math.isinf, speeds)) else ""
 
@@ -219,7 +254,7 @@ def _norm(sizes: Sequence[Fraction]) -> Fraction:
 # ---- agents --------------------------------------------------------------------------------------
 
 
-def _speeds(values: "Sequence[float] | Any") -> tuple[Fraction, Fraction, Fraction]:
+def _speeds(values: Sequence[float]) -> tuple[Fraction, Fraction, Fraction]:
     x, y, z, yaw = map(Fraction, values)
     return _norm([x, y]), z, yaw
 
@@ -248,24 +283,19 @@ def _pushed(
     return tuple(add_pushes(piece, asked, (led, own)) for piece, asked in pairs)
 
 
-def _from(
-    frame: Airframe, chain: Chain, base: Sequence[Asked], starts: Sequence[Pushed]
-) -> tuple[Motors, Sequence[Pushed]]:
-    """Return what motors give from any of these starts, and which are looked at for that."""
-
-    def found(start: Pushed) -> Motors:
-        return motors_of(frame, slices_of(chain), base, (start,))
-
+def _from(case: _Case) -> tuple[Motors, Sequence[Pushed]]:
+    """Return what motors give from any of the starts, and which are looked at for that."""
+    frame, slices, starts = case.frame, slices_of(case.chain), case.starts
     largest = _largest(starts)
-    whole = found(largest)
+    whole = motors_of(frame, slices, case.base, (largest,))
     if whole.within(Fraction(frame.motor_thrust)) or len(starts) > _STARTS:
         return whole, [largest]
-    each = [found(start) for start in starts]
-    if any(one.slope is None for one in each):
-        return whole, [largest]
-    least = min(one.least for one in each)
+    each = [motors_of(frame, slices, case.base, (start,)) for start in starts]
     slopes = [one.slope for one in each if one.slope is not None]
-    return Motors(least, max(one.largest for one in each), max(slopes)), starts
+    if len(slopes) < len(each):
+        return whole, [largest]
+    least, most = min(one.least for one in each), max(one.largest for one in each)
+    return Motors(least, most, max(slopes)), starts
 
 
 class _Ahead(NamedTuple):
@@ -329,24 +359,19 @@ def _farthest(fits: Callable[[Fraction], bool], most: Fraction) -> float:
 
 
 def _told(
-    run: Stopping,
-    frame: Airframe,
-    path: Sequence[Asked],
-    led: Pushed,
-    speeds: tuple[Fraction, ...],
-    starts: Sequence[Pushed],
+    case: _Case, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
 ) -> dict[str, Any]:
     """Return what the strain was computed of, ready for JSON."""
-    spans = slices_of(run.chain(0))
     return {
-        "airframe": frame._asdict(),
-        "roots": list(run.law.roots_for(3)),
-        "speeds": [float(s) for s in speeds],
-        "leader": _numbers(led),
+        "airframe": case.frame._asdict(),
+        "roots": list(roots),
+        "speeds": [float(s) for s in case.speeds],
+        "leader": _numbers(case.led),
         "starts": [_numbers(start) for start in starts],
+        "ahead": {name: float(x) for name, x in ahead._asdict().items()},
         "path": [
             [float(piece.begin), *(float(x) for part in asked for x in _flat(part))]
-            for piece, asked in zip(spans, path, strict=True)
+            for piece, asked in zip(slices_of(case.chain), case.path.asked, strict=True)
         ],
     }
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,12 @@ from echelon.references.reference import COORDINATES, Reference
 _PIECE, _MOST = Fraction(1, 20), 800
 """Of time, s, and how many there are at most."""
 _EXACT = Fraction(1, 10**9)
-"""Of the highest derivative; one that is known so well in one piece is constant, but for rounding."""
+"""Of the highest derivative; one that is known so well in one piece is constant."""
 _SAMPLES = 10
 """In each piece, where the path has no enclosure."""
+
+
+_Rows: TypeAlias = tuple[tuple[Interval, ...], ...]
 
 
 class Pieces(NamedTuple):
@@ -37,7 +40,7 @@ class Pieces(NamedTuple):
 
     kind: Kind
     times: tuple[Fraction, ...]
-    values: tuple[tuple[tuple[Interval, ...], ...], ...]
+    values: tuple[_Rows, ...]
 
     def between(
         self, begin: Fraction, end: Fraction | None

@@ -85,7 +85,7 @@ class _Motion(NamedTuple):
 
 
 def _responses(rho: Array, times: Array) -> tuple[Array, Array]:
-    """Return |v^(l)| of unit starts (p + 1, p, T), and the integrals of |h^(l)| so far (p + 1, T)."""
+    """Return |v^(l)| of unit starts (p + 1, p, T), and integrals of |h^(l)| so far (p + 1, T)."""
     p = len(rho)
     orders = np.arange(p + 1)
     modes = np.linalg.inv(np.vander(-rho, increasing=True).T)
