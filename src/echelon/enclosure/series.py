@@ -22,7 +22,6 @@ from echelon.core.jaxpr import Algebra, Rule, dot, each, entrywise, reduction, w
 from echelon.core.numerics import precision
 from echelon.enclosure import rules
 from echelon.enclosure.interval import ELEMENTARY, Interval, wave
-from echelon.enclosure.polynomial import Polynomial
 
 _BITS = 90
 _UNIT = 1 << _BITS
@@ -285,6 +284,11 @@ def _hyperbolic(x: Series, sign: int) -> Series:
     return number(Fraction(1, 2), x.order) * (up + number(sign, x.order) * down)
 
 
+def _tangent(x: Series) -> Series:
+    c, s = _circle(x)
+    return s * _reciprocal(c)
+
+
 def _tanh(x: Series) -> Series:
     """Return 1 - 2 / (exp 2x + 1), within -1 and 1."""
     one, two = number(1, x.order), number(2, x.order)
@@ -301,7 +305,7 @@ _FUNCTIONS: dict[str, Callable[[Series], Series]] = {
     "rsqrt": lambda x: _reciprocal(_sqrt(x)),
     "sin": lambda x: _circle(x)[1],
     "cos": lambda x: _circle(x)[0],
-    "tan": lambda x: (lambda c, s: s * _reciprocal(c))(*_circle(x)),
+    "tan": _tangent,
     "sinh": lambda x: _hyperbolic(x, -1),
     "cosh": lambda x: _hyperbolic(x, 1),
     "tanh": _tanh,
@@ -317,7 +321,9 @@ def _algebra(order: int) -> Algebra:
         lifted = rules.lift(array)
         if lifted.dtype != object:
             return lifted
-        return each(lambda p: number(p.value(), order) if isinstance(p, Polynomial) else p, lifted)
+        return each(
+            lambda p: number(p.value() or 0.0, order) if isinstance(p, Polynomial) else p, lifted
+        )
 
     def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
         raise GainError(

@@ -269,8 +269,8 @@ def _start(flat: Array) -> Pushed:
 def _largest(starts: Sequence[Pushed]) -> Pushed:
     """Return one that is as large as each in everything."""
     parts = zip(*(start[:3] for start in starts), strict=True)
-    rows = [tuple(map(max, zip(*part, strict=True))) for part in parts]
-    return Pushed(*rows, _STILL.speeds)
+    sideways, upward, turn = (tuple(map(max, zip(*part, strict=True))) for part in parts)
+    return Pushed(sideways, upward, turn, _STILL.speeds)
 
 
 @kept
@@ -320,8 +320,9 @@ class _Ahead(NamedTuple):
 
 def _ahead(frame: Airframe, path: Array) -> _Ahead:
     start = _start(path)
-    rise, push, climb = start.upward
-    return _Ahead(*start.sideways, rise, Fraction(frame.gravity) + push, climb, start.turn[0])
+    (speed, push, jerk), (rise, up, climb) = start.sideways, start.upward
+    lift = Fraction(frame.gravity) + up
+    return _Ahead(speed, push, jerk, rise, lift, climb, start.turn[0])
 
 
 @kept
