@@ -49,10 +49,13 @@ def inside(count: int, *changes: str) -> int:
 def table_of_starts(count: int) -> None:
     """Print how many starts are inside, of the paper's, at rest and level, and at any phase."""
     began = time.process_time()
-    print(f"paper's starts inside: {inside(count)} of {count}")
+    print(f"paper's starts inside: {inside(count)} of {count}", flush=True)
     print(f"  ({time.process_time() - began:.3g} s of a processor)")
     level = [f"{k}: [{x}, {y}, 1.0, {', '.join(['0'] * 9)}]" for k, x, y in _PLACES]
-    print(f"at rest and level: {inside(1, 'initial.states={' + ', '.join(level) + '}')} of 1")
+    print(
+        f"at rest and level: {inside(1, 'initial.states={' + ', '.join(level) + '}')} of 1",
+        flush=True,
+    )
     few, phases = max(1, count // 50), np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     for spread in (0.25, 0.3):
         change = f"initial.spread={{position: 1.0, attitude: {spread}}}"

@@ -321,9 +321,8 @@ def _algebra(order: int) -> Algebra:
         lifted = rules.lift(array)
         if lifted.dtype != object:
             return lifted
-        return each(
-            lambda p: number(p.value() or 0.0, order) if isinstance(p, Polynomial) else p, lifted
-        )
+        # Constants are polynomials of no variable.
+        return each(lambda p: number(p.value() or 0.0, order), lifted)
 
     def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
         raise GainError(
