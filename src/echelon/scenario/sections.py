@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Hears
+from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Frame, Hears
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -264,6 +264,9 @@ class FollowerSpec(BaseModel, **STRICT):
     """What every follower is sent of the same step: `none`, nothing; `relay`, the leader's input;
     `relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer to the
     leader, on a tree."""
+    frame: Annotated[str, OneOf(map(str, Frame))] = str(Frame.HEADING)
+    """Axes of the gain, under `consensus`: `heading`, they turn with the heading that the leader
+    follows, where the model states one; `world`, they stand still, as the paper has it."""
     trim: bool = True
     """Whether the law starts from the trim input, such as a quadrotor's weight, or from zero, as
     the paper prints it."""
@@ -338,12 +341,17 @@ class LiveSpec(BaseModel, **STRICT):
 
     at: Annotated[NotNegative, Unit("s")]
     """When, s."""
+    law: str | None = None
+    """The followers' law from then on; its agents remember nothing of the one before."""
     coupling: Annotated[Positive | None, Unit("1")] = None
     """The coupling from then on."""
     feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
     """1 where followers are sent what `follower.feedforward` says, 0 where nothing."""
     method: str | None = None
-    """The method of the followers' gain, with the coupling that it chooses."""
+    """The method of the followers' gain, with the coupling that it chooses; `scenario` for the
+    scenario's own."""
+    shape: str | None = None
+    """Shape of the formation, by a name of `formation`; `scenario` for the scenario's own."""
     size: Annotated[Positive | None, Unit("1")] = None
     """Size of the formation, times that of `formation`."""
     turn: Annotated[float | None, Unit("deg")] = None
