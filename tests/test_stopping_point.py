@@ -408,8 +408,12 @@ def promised(parts, **settings):
     return promise(parts, ech.Settings(**{"horizon": 10.0, "dt": 0.01, **settings}))
 
 
-def test_integrators_are_promised_from_everywhere_and_arrive_in_time():
-    parts = flight(rate=3.0)
+@pytest.mark.parametrize(
+    ("graph", "told"),
+    [(PAPER_TREE, "relay"), pytest.param(ech.Graph.path(5), "parent", marks=pytest.mark.slow)],
+)
+def test_integrators_are_promised_from_everywhere_and_arrive_in_time(graph, told):
+    parts = flight(graph, rate=3.0, feedforward=told)
     found = promised(parts)
     assert found.theorem is Theorem.T5 and found.kind is Kind.PROOF
     assert "any state of any agent" in found.sentence()
@@ -494,6 +498,17 @@ def test_parents_add_their_speeds():
     assert shown[0.8][0] and not shown[2.5][0]
     # 9.81 / 2.4159 / 3 links.
     assert "below 1.35" in shown[2.5][1]
+
+
+@pytest.mark.parametrize("roots", [SLOW_ROOTS, FAST_ROOTS])
+def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
+    lead = StoppingLeader(roots=roots).prepared(QUADROTOR, PAPER_TREE)
+    most = QUADROTOR.gravity / float(Chain.of(roots).gain(1))
+    z = chains_of(QUADROTOR).outputs.index("z")
+    law = StoppingPoint(roots=roots).prepared(QUADROTOR, PAPER_TREE)
+    assert 0.5 * most < law.speed_of(z) + lead.speed_of(z) < most or law.speed_of(z) == 2.5
+    long = StoppingPoint(roots=roots, feedforward="parent")
+    assert 0.9 * most < 29 * long.prepared(QUADROTOR, ech.Graph.path(30)).speed_of(z) < most
 
 
 def test_a_model_that_does_not_say_where_it_ends_is_promised_nothing():

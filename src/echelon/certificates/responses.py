@@ -84,6 +84,13 @@ class Chain(NamedTuple):
             p = self.rate(p)
         return p
 
+    def kernel(self, order: int) -> Poly:
+        """Return what h^(order) is the derivative of."""
+        p = self.impulse()
+        # Of order 0 its integral: x' = -unit x.
+        first = {n: c / (-n * self.unit) for n, c in p.items()}
+        return self.derivative(p, order - 1) if order else first
+
     def gain(self, order: int) -> Fraction:
         """Return a bound of sup |v^(order)| over sup |w|, from rest.
 
@@ -95,8 +102,7 @@ class Chain(NamedTuple):
         if not self.powers:
             return Fraction(0)
         direct = self.stiffness if order == len(self.powers) else Fraction(0)
-        kernel = self.derivative(self.impulse(), order - 1)
-        return direct + spread_between(kernel, Fraction(0), Fraction(1))
+        return direct + spread_between(self.kernel(order), Fraction(0), Fraction(1))
 
 
 def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:
@@ -161,9 +167,31 @@ def spread_between(p: Poly, low: Fraction, high: Fraction) -> Fraction:
     return total
 
 
-def peak(p: Poly) -> Fraction:
-    """Return a bound of |p| on [0, 1]."""
-    return max(largest_between(p, Fraction(0), Fraction(1), sign) for sign in (False, True))
+def bounds_on_pieces(p: Poly, halvings: int) -> list[Fraction]:
+    """Return a bound of |p| on each of 2^halvings equal pieces of [0, 1], ascending."""
+    return [max(map(abs, piece)) for piece in _pieces(p, halvings)]
+
+
+def spreads_on_pieces(p: Poly, halvings: int) -> list[Fraction]:
+    """Return a bound of the total variation of p on each of 2^halvings equal pieces of [0, 1]."""
+    count, slope = 1 << halvings, {n - 1: n * c for n, c in p.items() if n}
+    ends = [Fraction(k, count) for k in range(count + 1)]
+    values = [value(p, x) for x in ends]
+    return [
+        # Of one sign, so that the integral of |p'| is the difference of p.
+        abs(values[k + 1] - values[k])
+        if min(piece) >= 0 or max(piece) <= 0
+        else spread_between(p, ends[k], ends[k + 1])
+        for k, piece in enumerate(_pieces(slope, halvings))
+    ]
+
+
+def _pieces(p: Poly, halvings: int) -> list[list[Fraction]]:
+    """Return the coefficients of Bernstein on equal pieces of [0, 1]."""
+    pieces = [_bernstein(p)]
+    for _ in range(halvings):
+        pieces = [half for piece in pieces for half in _halved(piece)]
+    return pieces
 
 
 def _moved(p: Poly, low: Fraction, high: Fraction) -> Poly:

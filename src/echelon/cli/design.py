@@ -56,12 +56,16 @@ def design(
             radii = _draw(best.parts, found.settings, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             told["radii"] = radii
+    stopping = found.stopping
+    if stopping is not None:
+        sentence += f"\n{stopping.sentence()}"
+        told["stopping_point"] = stopping.as_mapping()
     told["methods"] = [tables.design_row(each) for each in found.designs]
     if as_json:
         print(json.dumps(told, indent=2))
     else:
         tables.print_designs(told["methods"], sentence)
-    raise typer.Exit(0 if best is not None else 1)
+    raise typer.Exit(0 if best is not None or stopping is not None else 1)
 
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, asked: str | None) -> str | None:

@@ -21,15 +21,22 @@ Speed: TypeAlias = float | tuple[float, ...]
 RATE = 4.0
 """Of the slowest root, 1/s, unless it is given."""
 SPEED, LEAD_SPEED = 2.5, 1.5
-"""Of followers and leaders, m/s and rad/s, unless given: with the default roots both together leave
-a vehicle its thrust, from any place (9.81 / 2.416 m/s; theory page, T5)."""
+"""Of followers and leaders, m/s and rad/s, unless given, and of a bounded output no more than these
+parts of what its bound leaves: with the default roots both together leave a vehicle its thrust,
+from any place (9.81 / 2.416 m/s; theory page, T5)."""
+SHARE, LEAD_SHARE = 0.6, 0.36
+_CHAINED = 1.0
+"""Of each link where speeds add up along parents, of what has no bound: as long as links are short
+this is hardly ever reached."""
+CHAIN_SHARE = 0.96
+"""Of all links together, of a bounded output: a leader is then to start on its path there."""
 _SPREAD = 0.125
 """Roots of a rate r are r, 1.125 r, 1.25 r, ..: apart, as the certificate wants them."""
 _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
 
 
-def plain_speeds(given: float | Sequence[float]) -> Speed:
+def plain_speeds(given: float | Sequence[float] | None) -> Speed | None:
     """Return speeds as plain numbers, which a compiled step takes for constants."""
     return tuple(map(float, given)) if isinstance(given, Sequence | np.ndarray) else given
 
@@ -41,7 +48,8 @@ class FlatLaw(Law):
         roots: of q, 1/s, distinct and positive; one fewer than the longest chain of the model.
         rate: the slowest root, from which the others are made, in place of `roots`.
         coupling: c > 0.
-        speed: s, of all outputs or one each, in their units per second; infinite is linear.
+        speed: s, of all outputs or one each, in their units per second; infinite is linear. Left
+            out, what the model's bounds allow, found by `prepared`.
         observer: whether what the model lacks is estimated and opposed.
         loop: of the model; found by `prepared`.
     """
@@ -49,7 +57,7 @@ class FlatLaw(Law):
     roots: tuple[float, ...] | None = eqx.field(default=None, static=True)
     rate: float | None = eqx.field(default=None, static=True)
     coupling: float | None = None
-    speed: Speed = eqx.field(default=SPEED, converter=plain_speeds)
+    speed: Speed | None = eqx.field(default=None, converter=plain_speeds)
     observer: bool = eqx.field(default=True, static=True)
     loop: FlatLoop | None = None
 
@@ -69,7 +77,7 @@ class FlatLaw(Law):
         if len(set(roots)) < len(roots):
             raise LawError(f"`roots` are {list(roots)}, and must be different from each other.")
         speeds = self.speed if isinstance(self.speed, Sequence) else (self.speed,)
-        if not all(isinstance(s, int | float) and s > 0.0 for s in speeds):
+        if self.speed is not None and not all(map(_moves, speeds)):
             raise LawError(
                 f"`speed` is {self.speed}, and must be positive, or a list of such numbers."
             )
@@ -108,6 +116,7 @@ class FlatLaw(Law):
 
     def speed_of(self, output: int) -> float:
         """Return s of an output."""
+        assert self.speed is not None, "`prepared` finds the speeds"
         return float(self.speed[output] if isinstance(self.speed, Sequence) else self.speed)
 
     def found_loop(self, model: ControlAffine) -> FlatLoop:
@@ -133,6 +142,29 @@ class FlatLaw(Law):
                 f"{listing(chains.outputs)}."
             )
         return FlatLoop.of(chains, self.roots_for(needed), self.observer)
+
+    def speeds_within(
+        self, model: ControlAffine, chains: Chains, most: float, share: float, links: int = 1
+    ) -> Speed:
+        """Return s as it is given, or what bounds allow of each link on the way from a leader.
+
+        Args:
+            model: the agent.
+            chains: of it.
+            most: of an output.
+            share: of what leads to the bound of an output.
+            links: whose speeds add up.
+        """
+        if self.speed is not None:
+            return self.speed
+        each = most if links == 1 else min(most, max(most / links, _CHAINED))
+        found = dict.fromkeys(chains.outputs, each)
+        for bound in model.flat_bounds or ():
+            degree = chains.degrees[chains.outputs.index(bound.output)]
+            left = _left(self.roots_for(degree - 1), bound)
+            cap = most if links == 1 else math.inf
+            found[bound.output] = min(cap, share * left) / links if left > 0.0 else each
+        return tuple(found.values())
 
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
@@ -168,6 +200,22 @@ class FlatLaw(Law):
         """Yield the starts outside of the model's flat coordinates."""
         for bound in model.flat_bounds or ():
             yield from _outside(self.ready.chains, model, states, bound)
+
+
+def _moves(speed: object) -> bool:
+    return isinstance(speed, int | float) and speed > 0.0
+
+
+def _left(roots: tuple[float, ...], bound: FlatBound) -> float:
+    """Return the speed at which agreement alone leads from rest to a bound; 0 where none does."""
+    if bound.derivative != 2 or len(roots) < 2 or bound.above >= 0.0:
+        return 0.0
+    # v' is at most the variation of h over that speed, and h rises once to its largest value.
+    apart = [np.prod([b - a for b in roots if b != a]) for a in roots]
+    times = np.linspace(0.0, 20.0 / min(roots), 20_000)
+    falls = np.exp(-np.outer(roots, times))
+    h = (np.prod(roots) / np.array(apart)) @ falls
+    return -bound.above / (2.0 * float(h.max()))
 
 
 def _positive(root: object) -> bool:

@@ -15,7 +15,14 @@ import numpy as np
 from echelon.core.errors import LawError, listing
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, Hears
-from echelon.laws.flat_law import LEAD_SPEED, FlatLaw, Speed, plain_speeds
+from echelon.laws.flat_law import (
+    CHAIN_SHARE,
+    LEAD_SHARE,
+    LEAD_SPEED,
+    SHARE,
+    SPEED,
+    FlatLaw,
+)
 from echelon.laws.flat_loop import Held
 from echelon.laws.law import Law, LocalView
 from echelon.models.model import ControlAffine
@@ -102,14 +109,18 @@ class StoppingPoint(FlatLaw):
         """Find the model's chains, and what the graph asks of the coupling."""
         if self.loop is not None:
             return self
+        links, share = 1, SHARE
         if self.feedforward is Feedforward.PARENT:
             # Raises where the graph is no tree.
             graph.parents()
+            links = int(graph.depths().max())
+            share = CHAIN_SHARE if links > 1 else SHARE
         loop, reach = self.found_loop(model), Reach.of(graph, self.leaderward)
+        speed = self.speeds_within(model, loop.chains, SPEED, share, links)
         return eqx.tree_at(
-            lambda law: (law.loop, law.reach, law.ahead),
+            lambda law: (law.loop, law.reach, law.ahead, law.speed),
             self,
-            (loop, reach, np.zeros_like(loop.weights)),
+            (loop, reach, np.zeros_like(loop.weights), speed),
             is_leaf=lambda part: part is None,
         )
 
@@ -161,7 +172,6 @@ class StoppingLeader(FlatLaw):
         reference: the path to follow; without one the trim's flat outputs are held.
     """
 
-    speed: Speed = eqx.field(default=LEAD_SPEED, converter=plain_speeds)
     reference: Guide | None = None
 
     @property
@@ -183,8 +193,9 @@ class StoppingLeader(FlatLaw):
                     "leader and `consensus` for the followers."
                 )
             self.reference.fit(model)
+        speed = self.speeds_within(model, loop.chains, LEAD_SPEED, LEAD_SHARE)
         none = {"is_leaf": lambda part: part is None}
-        return eqx.tree_at(lambda law: law.loop, self, loop, **none)
+        return eqx.tree_at(lambda law: (law.loop, law.speed), self, (loop, speed), **none)
 
     def path(self, model: ControlAffine, t: Scalar) -> jax.Array:
         """Return the flat outputs to follow with their derivatives, (r + 1, m)."""

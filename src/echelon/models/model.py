@@ -17,6 +17,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
+from echelon.models.airframe import Airframe
 from echelon.models.heading import Heading
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
@@ -180,6 +181,9 @@ class ControlAffine(eqx.Module):
     flat_bounds: ClassVar[tuple[FlatBound, ...] | None] = None
     """Where the flat coordinates of `flat_chains` end: nowhere where there are none, by the model's
     own word; None where it does not say."""
+
+    airframe: ClassVar[Airframe | None] = None
+    """The body that `thrust` and three torques move by four motors; None where it is none."""
 
     @abc.abstractmethod
     def drift(self, x: State) -> State:

@@ -14,6 +14,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
+from echelon.models.airframe import Airframe
 from echelon.models.heading import Heading
 from echelon.models.model import (
     ControlAffine,
@@ -194,6 +195,12 @@ class Quadrotor(ControlAffine):
             for left, front, spin in zip(_LEFT, _FRONT, _SPIN, strict=True)
         )
         return Limits(rows, (0.0,) * 4, (self.motor_thrust,) * 4)
+
+    @property
+    def airframe(self) -> Airframe:
+        """What its motors move."""
+        numbers = self.gravity, self.arm, self.torque_per_thrust, self.motor_thrust
+        return Airframe(self.mass, self.inertia, *numbers)
 
     def drift(self, x: State) -> State:
         """Return f(x): free fall, attitude kinematics and gyroscopic coupling."""

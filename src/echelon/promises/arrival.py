@@ -3,7 +3,8 @@
 With w = L_g^-1 1 the largest |zeta_i| / w_i falls as m' = -sigma(c m) / max w or faster. For
 sigma(x) = x / sqrt(1 + (x/s)^2) that is solved by F(c m / s) = F(c m(0) / s) - c t / max w with
 F(v) = sqrt(1 + v^2) - arsinh(1 / v). Behind it comes the inner loop, delta y = h * zeta and what
-the start leaves, where h is positive.
+the start leaves, where h is positive. Told by parents each link is e' = -sigma(c a e) by itself, so
+that m is its |e| with w = 1, and what is off the leader is at most the sum along the way.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,8 @@ from echelon.network.graph import Graph
 _WITHIN = 0.01  # m
 _CELL, _MOST = 0.01, 20_000
 """Of time, s; the bound holds all over each cell. So many cells are 200 s."""
+_FEW = 100
+"""Followers that are told by parents: each link is followed by itself."""
 _SLACK = 1e-9
 """m; more than floats leave of the sums."""
 
@@ -44,26 +47,61 @@ def arrival_of(
         coupling: c.
         position: which outputs are one.
     """
+    told = law.feedforward is Feedforward.PARENT
     apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
-    if not position or law.feedforward is Feedforward.PARENT or apart > _SLACK:
+    if not position or apart > _SLACK or told and len(graph.followers) > _FEW:
         return None
     loop, followers = law.ready, list(graph.followers)
-    weights = _weights(graph, law.leaderward)
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]
     times = _CELL * np.arange(_MOST + 1)
     square = np.zeros((len(followers), _MOST))
+    moved = _along_links if told else _all_together
     for k in position:
         own = np.array(law.roots_for(loop.chains.degrees[k] - 1))
-        stops = np.abs(away[:, :, k] @ loop.weights[:, k])
-        m = _falling((stops / weights).max(), coupling, weights.max(), law.speed_of(k), times)
-        driven = _behind(own, m, times)
+        stops = flat[:, :, k] @ loop.weights[:, k]
+        reach = moved(stops, graph, law, coupling, law.speed_of(k), times)
+        driven = np.stack([_behind(own, m, times) for m in reach.bounds])[reach.whose]
         # Agents start in few ways in number; all at once would be (N, cells) anyway.
-        square += (weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
+        square += (reach.weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
     outside = np.flatnonzero((np.sqrt(square) + _SLACK >= _WITHIN).any(axis=0))
     if not len(outside):
         return Arrival(0.0)
     last = int(outside[-1]) + 1
     return None if last >= _MOST else Arrival(float(times[last]))
+
+
+class _Reach(NamedTuple):
+    """Bounds (K, T) of |zeta_i|, falling; of follower i the weight w_i times bounds[whose[i]]."""
+
+    bounds: Array
+    whose: Array
+    weights: Array
+
+
+def _all_together(
+    stops: Array, graph: Graph, law: StoppingPoint, c: float, speed: float, times: Array
+) -> _Reach:
+    """Return how far stopping points (N,) are off by the largest |zeta_i| / w_i."""
+    followers, weights = list(graph.followers), _weights(graph, law.leaderward)
+    away = np.abs(stops[followers] - stops[list(graph.nearest_leader())][followers])
+    m = _falling((away / weights).max(), c, weights.max(), speed, times)
+    return _Reach(m[None], np.zeros(len(followers), int), weights)
+
+
+def _along_links(
+    stops: Array, graph: Graph, law: StoppingPoint, c: float, speed: float, times: Array
+) -> _Reach:
+    """Return the same told by parents: each link e' = -sigma(c a e) is alone, and they add up."""
+    heard, parent = graph.exchange(leaderward=True), graph.parents()
+    strength = dict(zip(heard.receivers.tolist(), heard.weights.tolist(), strict=True))
+    followers, depths = list(graph.followers), graph.depths()
+    found = {lead: np.zeros(len(times)) for lead in graph.leaders}
+    for i in sorted(followers, key=lambda i: depths[i]):
+        off = float(abs(stops[i] - stops[parent[i]]))
+        link = _falling(off, c * strength[i], 1.0, speed, times)
+        found[i] = found[parent[i]] + link
+    count = len(followers)
+    return _Reach(np.stack([found[i] for i in followers]), np.arange(count), np.ones(count))
 
 
 def _weights(graph: Graph, leaderward: bool) -> Array:

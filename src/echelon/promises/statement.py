@@ -25,6 +25,7 @@ class Hypothesis(Word):
     REGION = "region of the gain"
     SET = "certified set"
     STARTS = "starts in the certified set"
+    LIMITS = "motors, from these starts"
     CLAIMS = "claims of the gain"
 
 

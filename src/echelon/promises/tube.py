@@ -13,6 +13,7 @@ from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.models.model import FlatBound
 from echelon.promises.arrival import Arrival, arrival_of
+from echelon.promises.motors import Strain, strain_of
 from echelon.promises.paths import least_on_path
 from echelon.promises.statement import Hypothesis, Statement
 from echelon.promises.stopping import Stopping
@@ -37,6 +38,7 @@ class Tube(NamedTuple):
         arrival: when all are within 1 cm, if it can be told.
         who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
+        strain: what the motors give; None where they have no limits, or may not suffice.
     """
 
     kind: Kind
@@ -47,6 +49,7 @@ class Tube(NamedTuple):
     arrival: Arrival | None
     who: str
     borders: tuple[dict[str, Any], ...]
+    strain: Strain | None
 
     @property
     def theorem(self) -> Theorem:
@@ -65,6 +68,7 @@ class Tube(NamedTuple):
             "any graph in which the leader reaches everybody, where the model is exact and zeta' "
             "is told at all times (T5); on this graph in the end at "
             f"{self.rate:.3g} 1/s or faster{when}."
+            + ("" if self.strain is None else f" {self.strain.sentence()}")
         )
 
     def as_mapping(self) -> dict[str, object]:
@@ -79,6 +83,7 @@ class Tube(NamedTuple):
             **finite,
             "within_1_cm_from": when,
             "borders": list(self.borders),
+            "motors": None if self.strain is None else self.strain.as_mapping(),
         }
 
 
@@ -116,7 +121,9 @@ def tube_of(run: Stopping) -> _Found:
     arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
     far = math.inf if not borders else float(left)
     told = tuple(border.told for border in borders)
-    return _Found(Tube(kind, run.rate, gains, far, steepest, arrival, who, told), tuple(lines))
+    strain, line = strain_of(run)
+    tube = Tube(kind, run.rate, gains, far, steepest, arrival, who, told, strain)
+    return _Found(tube, (*lines, line))
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> _Found:

@@ -31,6 +31,7 @@ from echelon.scenario.scenario import Scenario
 from echelon.scenario.sections import GainSpec
 from echelon.scenario.yaml import Fault
 from echelon.studies.speedup import speedup
+from echelon.studies.stopping_design import Stopping, design_stopping
 
 _ADVISED = 100
 """Followers of the largest swarm that is advised on its graph; of more it would take minutes."""
@@ -92,13 +93,15 @@ _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
 class Designs(NamedTuple):
     """The methods that were tried, the one that is recommended if any, and why.
 
-    `settings` are those that all were tried under.
+    `settings` are those that all were tried under. Of followers under the law `stopping-point`,
+    `stopping` is what motors are certified with, if anything is.
     """
 
     designs: tuple[Design, ...]
     recommended: Design | None
     because: str
     settings: Settings
+    stopping: Stopping | None = None
 
 
 def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
@@ -129,7 +132,8 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     )
     best, dt = recommended(tried, built.settings.dt), built.settings.dt
     why = "No method gives a stable loop here." if best is None else because(best, tried, dt)
-    return Designs(tried, best, why, built.settings)
+    stopping = design_stopping(*built) if method is None else None
+    return Designs(tried, best, why, built.settings, stopping)
 
 
 _ALWAYS = GainSpec(method="given", P="identity")

@@ -16,6 +16,7 @@ import numpy as np
 
 from echelon.core.types import Array, PathLike
 from echelon.verifier.findings import Finding, said, same
+from echelon.verifier.motors import motor_findings
 
 FORMAT = "echelon tube 1"
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
@@ -45,6 +46,8 @@ def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
             found = _gain(roots, order)
             yield same(f"gain {order} of {name}", stored, found, 1e-8, "quadrature between roots")
         yield from _room(border, roots, name)
+    if tube.get("motors") is not None:
+        yield from motor_findings(tube["motors"])
 
 
 def _room(border: Mapping[str, Any], roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
