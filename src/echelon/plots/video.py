@@ -28,6 +28,7 @@ _RATE: Final = 25.0
 _TRAIL: Final = 4.0  # s
 _FEW: Final = 60
 _PAPER, _GRID, _LINK, _GOAL = "#f7f8fa", "#dde2e8", "#4f5b68", "#d99000"
+_SHADOW: Final = "#d3d9e0"
 KINDS: Final = (".mp4", ".gif")
 
 
@@ -172,7 +173,7 @@ def draw_floor(ax: Any, camera: Camera, space: Space) -> None:
     low, high, stretch = space.low, space.high, (*space.stretch, 1.0)
     lines, said = [], []
     for k in (0, 1):
-        step = _nice((high[k] - low[k]) / stretch[k] / 7.0)
+        step = _nice((high[k] - low[k]) / stretch[k] / 10.0)
         said.append(f"{step:g}{f' {space.units[k]}' if space.units[k] else ''}")
         ends = np.array([low, high])
         ends[:, 2] = low[2]
@@ -244,13 +245,16 @@ class _Moving:
         self.size = body_width(run, space)
         ring = np.linspace(0.0, 2.0 * np.pi, 33)
         self.ring = np.column_stack([np.cos(ring), np.sin(ring), 0.0 * ring])
+        self.shadows = PolyCollection([], facecolors=_SHADOW, edgecolors="none")
+        self.falls = LineCollection([], colors=_GRID, linewidths=0.8)
         self.trails = LineCollection([], linewidths=1.3 if few else 0.6, alpha=0.75)
         self.links = LineCollection([], colors=_LINK, linewidths=1.1 if few else 0.4, alpha=0.8)
         self.goals = PolyCollection([], facecolors="none", edgecolors=_GOAL, linewidths=1.2)
         self.arms = LineCollection([], linewidths=2.2)
         self.rotors = PolyCollection([], linewidths=0.4, edgecolors="white")
         self.clock = ax.text(14, _SIZE[1] - 26, "", size=13)
-        self.artists = [self.trails, self.links, self.goals, self.arms, self.rotors]
+        ground = [self.shadows, self.falls] if space.kind == "space" and few else []
+        self.artists = [*ground, self.trails, self.links, self.goals, self.arms, self.rotors]
         for part in self.artists:
             ax.add_collection(part)
         self.artists.append(self.clock)
@@ -269,7 +273,15 @@ class _Moving:
             goals[:, 0] = now[:, 0]
         rings = goals[list(self.run.followers)][:, None] + 0.55 * self.size * self.ring
         self.goals.set_verts(list(project(rings)[0]))
+        self._ground(now)
         self._bodies(now, angles)
+
+    def _ground(self, now: Array) -> None:
+        """Put shadows under the agents: without them a height cannot be told from a distance."""
+        below = now * (1.0, 1.0, 0.0) + (0.0, 0.0, self.space.low[2])
+        discs = below[:, None] + 0.35 * self.size * self.ring
+        self.shadows.set_verts(list(self.camera.project(discs)[0]))
+        self.falls.set_segments(list(self.camera.project(np.stack([now, below], axis=1))[0]))
 
     def _bodies(self, now: Array, angles: Array | None) -> None:
         project, size = self.camera.project, self.size
