@@ -157,7 +157,7 @@ WORKERS: dict[str, tuple[tuple[str, ...], Callable[[], Turn]]] = {
     "echelon, float64, RK4": ((), lambda: echelon(64, "rk4")),
     "crazyflow, bare plant": (("crazyflow",), lambda: crazyflow("rotor_vel")),
     "crazyflow, its controller": (("crazyflow",), lambda: crazyflow("state")),
-    "rotorpy, batched": (("rotorpy",), rotorpy),
+    "rotorpy, batched": (("rotorpy", "torch", "torchdiffeq"), rotorpy),
     "VMAS, drone": (("vmas",), vmas),
     "numpy and scipy": ((), numpy_and_scipy),
 }
