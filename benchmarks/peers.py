@@ -111,7 +111,7 @@ def vmas() -> Turn:
 
 
 def numpy_and_scipy() -> Turn:
-    """10,000 quadrotors on a ring as users write it: vectorized RK4, a sparse Laplacian, float64."""
+    """10,000 quadrotors on a ring as users write it: vectorized RK4, sparse Laplacian, float64."""
     import numpy as np
     import scipy.sparse as sp
 

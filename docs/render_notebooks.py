@@ -59,7 +59,7 @@ def render(book: Path) -> tuple[str, dict[str, Figure]]:
 
 
 def run(source: str, names: dict[str, Any]) -> tuple[str, Any]:
-    """Run a cell; return what it prints and the value of its last line, if that is an expression."""
+    """Run a cell; return what it prints, and the value of its last line where that has one."""
     tree, value = ast.parse(source), None
     last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
     with contextlib.redirect_stdout(io.StringIO()) as out:
