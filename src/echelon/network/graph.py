@@ -23,7 +23,7 @@ from echelon.network.edges import (
     split_weights,
 )
 from echelon.network.exchange import Exchange
-from echelon.network.reach import advise_radius
+from echelon.network.reach import advising
 from echelon.network.spectrum import Spectrum
 
 if TYPE_CHECKING:
@@ -170,10 +170,8 @@ class Graph:
         # The tree returns pairs in no promised order; sorted, a seed is one graph everywhere. One
         # number a pair sorts ten times faster than two.
         number = np.sort(pairs[:, 0] * agents + pairs[:, 1])
-        try:
+        with advising(points, radius):
             return cls(np.stack(np.divmod(number, agents), axis=1), leaders, agents)
-        except GraphError as error:
-            raise GraphError(f"{str(error)[:-1]}{advise_radius(points, radius)}.") from error
 
     def adjacency(self) -> sp.csr_array:
         """Return the symmetric adjacency matrix (N, N), sparse."""
