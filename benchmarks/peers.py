@@ -68,13 +68,13 @@ def crazyflow(control: str) -> Turn:
 
 
 def rotorpy() -> Turn:
-    """1,000 drones in a batch, RK4, motor speeds given, no aerodynamics, float64."""
+    """10,000 drones in a batch, RK4, motor speeds given, no aerodynamics, float64."""
     import torch
     from rotorpy.vehicles.crazyflie_params import quad_params
     from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
 
     torch.set_num_threads(1)
-    count, device = 1_000, torch.device("cpu")
+    count, device = AGENTS, torch.device("cpu")
     zeros = torch.zeros(count, 3, dtype=torch.float64)
     upright = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64).repeat(count, 1)
     speeds = torch.full((count, 4), 1788.53, dtype=torch.float64)
@@ -86,9 +86,9 @@ def rotorpy() -> Turn:
 
     def turn() -> int:
         now = state
-        for _ in range(20):
+        for _ in range(3):
             now = fleet.step(now, control, 0.005)
-        return count * 20
+        return count * 3
 
     return turn
 
@@ -157,7 +157,7 @@ WORKERS: dict[str, tuple[tuple[str, ...], Callable[[], Turn]]] = {
     "echelon, float64, RK4": ((), lambda: echelon(64, "rk4")),
     "crazyflow, bare plant": (("crazyflow",), lambda: crazyflow("rotor_vel")),
     "crazyflow, its controller": (("crazyflow",), lambda: crazyflow("state")),
-    "rotorpy, batched": (("rotorpy", "torch", "torchdiffeq"), rotorpy),
+    "rotorpy, batched": (("rotorpy", "torch", "torchdiffeq", "roma"), rotorpy),
     "VMAS, drone": (("vmas",), vmas),
     "numpy and scipy": ((), numpy_and_scipy),
 }
@@ -221,13 +221,15 @@ def main() -> None:
     """Ask each worker in turn, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worker", choices=[*WORKERS], help=argparse.SUPPRESS)
+    parser.add_argument("--only", nargs="*", choices=[*WORKERS], help="beside echelon's first line")
     parser.add_argument("--envs", type=Path, default=ROOT / "build" / "peers")
     asked = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     if asked.worker is not None:
         return work(asked.worker)
-    started = {name: start(name, asked.envs) for name in WORKERS}
+    names = WORKERS if asked.only is None else dict.fromkeys([next(iter(WORKERS)), *asked.only])
+    started = {name: start(name, asked.envs) for name in names}
     workers = {name: worker for name, worker in started.items() if worker is not None}
     rates: dict[str, list[float]] = {name: [] for name in workers}
     for _ in range(TURNS):
