@@ -97,12 +97,15 @@ def measure(agents: int, bits: int, yardstick: Path | None) -> dict[str, Any]:
 _FORMATIONS, _STEPS = 2_560, 300
 
 
-def formations(bits: int, own: bool, threads: int = 1) -> tuple[NativeStepper, np.ndarray]:
+def formations(
+    bits: int, own: bool, threads: int = 1, integrator: Any = "rk4"
+) -> tuple[NativeStepper, np.ndarray]:
     """Return what steps 2,560 formations of 4 that all hear each other, and the reference.
 
     Each has a gain of its own where `own` is true: other numbers in P, R and c.
     """
-    chosen = ech.Settings(horizon=50.0, dt=_DT, precision=f"float{bits}")  # type: ignore[arg-type]
+    kind: Any = f"float{bits}"
+    chosen = ech.Settings(horizon=50.0, dt=_DT, precision=kind, integrator=integrator)
     prepared = prepare(flock(ech.Graph.complete(4)), chosen)
     drive, draws = prepared.parts.drive, np.random.default_rng(0)
     with precision("float64"):

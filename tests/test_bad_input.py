@@ -197,7 +197,8 @@ GRAPHS = {
     ),
     "points too far apart": (
         lambda: Graph.geometric(3, 1e-6),
-        "the graph is disconnected: agents 1, 2 have no path to a leader (leader 0).",
+        "the graph is disconnected: agents 1, 2 have no path to a leader (leader 0); a `radius` of "
+        "0.667 connects these places, and another `seed` draws others.",
     ),
     "a leader that is no list": (
         lambda: Graph.ring(4, leaders=0),

@@ -41,10 +41,15 @@ def test_run_writes_what_it_says(here, echelon):
     assert (code, err) == (0, "")
     assert "paper, 0.5 s, seed 0" in out and "9.289e-17" in out
     assert "rounding" in out and "Written to o" in out
-    names = {"summary.json", "run.nc", "scenario.yaml", "report.txt"}
+    names = {"summary.json", "run.nc", "scenario.yaml", "report.txt", "gain.json"}
     assert {path.name for path in (here / "o").iterdir()} == names
     again = ech.load_scenario(here / "o" / "scenario.yaml")
     assert again.simulation.horizon == 0.5
+    code, out, _ = echelon("verify", "o")
+    assert code == 0 and "Verified: " in out
+    (here / "o" / "gain.json").unlink()
+    code, _, err = echelon("verify", "o")
+    assert code == 2 and "left neither a gain nor a tube to verify" in err
 
 
 def test_summary_has_the_promised_keys_and_no_nan(here, echelon):

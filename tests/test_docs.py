@@ -23,9 +23,22 @@ from echelon.reports.printed import PRINTED
 from echelon.scenario.registry import METHODS
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = pytest.param("tutorial.md", marks=pytest.mark.slow, id="tutorial.md")
-RUN = ["README.md", SLOW, "extending.md"]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+
+
+def slow(*pages):
+    return pytest.param(pages, marks=pytest.mark.slow, id=pages[0])
+
+
+FIRST = ("start", "agents", "graphs", "formations", "promises", "laws", "runs", "datasets")
+# What is read one after the other, in one folder.
+JOURNEYS = [
+    pytest.param(("README",), id="README"),
+    pytest.param(("extending",), id="extending"),
+    slow(*FIRST, "troubleshooting"),
+    slow("recipes", "sweeps", "comparing"),
+]
 
 FENCE = re.compile(
     r"^(?P<mark><!-- not executed -->\s+)?^```(?P<language>\w+)(?: title=\"(?P<title>[^\"]+)\")?\n"
@@ -89,11 +102,11 @@ def folder(tmp_path, monkeypatch):
 
 
 class Reader:
-    """Someone who types a page's blocks one after the other."""
+    """Someone who types the blocks of pages one after the other."""
 
     def __init__(self, name, monkeypatch):
         self.name, self.monkeypatch = name, monkeypatch
-        self.module = types.ModuleType(f"page_{name.removesuffix('.md')}")
+        self.module = types.ModuleType(f"page_{name}")
         monkeypatch.setitem(sys.modules, self.module.__name__, self.module)
         self.printed, self.code = "", 0
 
@@ -138,14 +151,16 @@ class Reader:
         return out.getvalue()
 
 
-@pytest.mark.parametrize("name", RUN)
-def test_every_block_runs_and_prints_what_stands_below_it(name, folder, monkeypatch):
-    reader, done = Reader(name, monkeypatch), 0
-    for block in blocks(page(name)):
-        if block.executed:
-            reader.types(block)
-            done += block.language == "python"
-    assert done
+@pytest.mark.parametrize("names", JOURNEYS)
+def test_every_block_runs_and_prints_what_stands_below_it(names, folder, monkeypatch):
+    reader = Reader(names[0], monkeypatch)
+    for name in names:
+        reader.name, done = f"{name}.md", 0
+        for block in blocks(page(reader.name)):
+            if block.executed:
+                reader.types(block)
+                done += block.language in ("python", "console")
+        assert done, name
 
 
 PENDULUM = """name: pushed
@@ -201,7 +216,7 @@ def test_few_blocks_are_left_out():
 
 
 def test_every_scenario_on_the_pages_is_one(folder):
-    """All but the tutorial's `bad.yaml`, whose faults its page shows."""
+    """All but `bad.yaml`, whose faults its page shows."""
     seen = 0
     for path in PAGES:
         for block in blocks(path):
@@ -226,10 +241,10 @@ def test_relative_links_and_images_lead_somewhere(path):
     assert dead == []
 
 
-def test_the_readme_quotes_the_measured_numbers():
-    """Rows that both pages have say the same, and no number stands in the README alone."""
-    text = page("README.md").read_text("utf-8")
-    part = text.partition("[start:numbers]")[2].partition("[end:numbers]")[0]
+def test_the_first_page_quotes_the_measured_numbers():
+    """Rows that both pages have say the same, and no number stands on the first page alone."""
+    text = page("index.md").read_text("utf-8")
+    part = text.partition("<!-- numbers -->")[2].partition("<!-- /numbers -->")[0]
     measured = {row[0]: row[1] for row in rows(page("results.md").read_text("utf-8"))}
     quoted = {row[0]: row[1] for row in rows(part) if len(row) == 2 and row[0] != "what"}
     assert len(quoted) >= 5
@@ -272,8 +287,8 @@ def is_module(value):
 def test_every_page_is_in_the_navigation_and_is_there():
     """The build overlooks a page of the navigation that does not exist."""
     text = (ROOT / "mkdocs.yml").read_text("utf-8")
-    entries = re.findall(r"^  - [\w ]+: (\S+\.md)$", text, re.MULTILINE)
-    assert sorted(entries) == [path.name for path in PAGES[1:]]
+    entries = re.findall(r"^ +- [^:]+: (\S+\.md)$", text, re.MULTILINE)
+    assert sorted(entries) == sorted(str(path.relative_to(DOCS)) for path in PAGES[1:])
 
 
 def test_what_pages_quote_of_the_readme_has_no_relative_link():

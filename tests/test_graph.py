@@ -245,6 +245,13 @@ def test_a_geometric_graph_links_exactly_the_points_that_are_near():
     assert same_edges(graph, other)
     assert graph == Graph.geometric(40, 0.3, seed=3)
     assert graph != Graph.geometric(40, 0.3, seed=4)
+    for seed in range(4):
+        with pytest.raises(errors.GraphError, match="another `seed`") as told:
+            Graph.geometric(7, 0.2, seed)
+        advised = float(str(told.value).split("`radius` of ")[1].split()[0])
+        assert Graph.geometric(7, advised, seed).agents == 7
+        with pytest.raises(errors.GraphError, match="disconnected"):
+            Graph.geometric(7, advised - 0.002, seed)
 
 
 def test_edges_are_kept_as_given_with_the_smaller_agent_first():

@@ -12,11 +12,12 @@ from pathlib import Path
 
 from echelon.core.errors import OutputError
 
-CHUNKS, INPUTS, RUNS, BATCHES, DATA = "chunks", "inputs", "runs", "batches", "run.nc"
-_RUN = ("summary.json", DATA, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
+CHUNKS, INPUTS, RUNS, BATCHES = "chunks", "inputs", "runs", "batches"
+DATA, GAIN, SUMMARY = "run.nc", "gain.json", "summary.json"
+_RUN = (SUMMARY, DATA, GAIN, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
 _SWEEP = ("sweep.nc", "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
-_OURS = {"summary.json": _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
+_OURS = {SUMMARY: _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
 _OURS |= {"sweep.nc": _SWEEP, BATCHES: _SWEEP}
 """What shows that a command wrote a folder, and all that `--force` then removes."""
 _WANTED = {CHUNKS: _RUN, RUNS: _COMPARISON, BATCHES: _SWEEP}

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from echelon.archive.chunks import Chunks
-from echelon.archive.folder import DATA
+from echelon.archive.folder import DATA, GAIN, SUMMARY
 from echelon.core.errors import OutputError
 from echelon.core.types import PathLike
 from echelon.results.recording import Recording, read_recording
+from echelon.verifier.tube import read_tube
 
 
 def open_run(place: PathLike) -> Recording:
@@ -35,3 +36,23 @@ def open_run(place: PathLike) -> Recording:
     if (path / "comparison.json").is_file():
         raise OutputError(f"`{path}` is a comparison; give one of its runs, `{path}/runs/NAME.nc`.")
     raise OutputError(f"the folder `{path}` holds no `{DATA}`, and so no run.")
+
+
+def promise_file(place: PathLike) -> Path:
+    """Return the file that holds what a run's gain, or its law, promises: what `verify` takes.
+
+    Args:
+        place: the folder of a run; or such a file itself, which is returned as it is.
+
+    Raises:
+        OutputError: nothing that its law promises is kept there.
+    """
+    path = Path(place)
+    if not path.is_dir():
+        return path
+    # A law without a gain leaves its tube, where it has one, in the summary.
+    if (path / GAIN).is_file() or not (path / SUMMARY).is_file():
+        return path / GAIN
+    if read_tube(path / SUMMARY) is None:
+        raise OutputError(f"the law of `{path}` left neither a gain nor a tube to verify.")
+    return path / SUMMARY

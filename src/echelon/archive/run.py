@@ -4,12 +4,13 @@ import json
 from pathlib import Path
 
 from echelon.archive.chunks import Chunks
-from echelon.archive.folder import DATA, claim_folder, unwritable
+from echelon.archive.folder import DATA, GAIN, SUMMARY, claim_folder, unwritable
 from echelon.core.errors import OutputError
 from echelon.core.files import write_whole
 from echelon.core.types import PathLike
 from echelon.engine.result import Result
 from echelon.engine.simulate import reassemble
+from echelon.gains.file import save_gain
 from echelon.reports.run import report
 from echelon.results.dataset import dataset, save_dataset, summary
 from echelon.results.recording import recording
@@ -72,8 +73,10 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
         save_dataset(data, folder / DATA)
         # NaN is no JSON: whoever reads the file with another parser would stop there.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
-        write_whole(folder / "summary.json", content + "\n")
+        write_whole(folder / SUMMARY, content + "\n")
         write_whole(folder / "report.txt", report(result) + "\n")
+        if result.drive.gain is not None:
+            save_gain(result.drive.gain, result.model, result.graph, folder / GAIN)
         if figures and len(result.times):
             # Here, since matplotlib takes long to load, and a run without figures needs none of it.
             from echelon.plots.run import save_figures

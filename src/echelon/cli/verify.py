@@ -16,20 +16,23 @@ _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 
 
 def verify(
-    gain: Annotated[Path, typer.Argument(help="A gain file, as `design --out` writes it.")],
+    gain: Annotated[
+        Path, typer.Argument(help="The folder of a run, or a gain file, as `design` writes it.")
+    ],
     scenario: Annotated[
         str | None,
-        typer.Option(help="A scenario whose model the agents are, where it is one of your own."),
+        typer.Option(help="A scenario or run whose model, not a bundled one, the agents are."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Recompute what a saved gain promises, from its file alone.
+    """Recompute what a run's gain promises, or a saved one, from its file alone.
 
     Exit code 0 if all of it holds, 1 if a claim does not, 5 if one could not be checked.
     """
+    from echelon.archive.open import promise_file
     from echelon.verifier.verify import verify as recompute
 
-    found = recompute(gain, None if scenario is None else _model(scenario))
+    found = recompute(promise_file(gain), None if scenario is None else _model(scenario))
     if as_json:
         lines = [each._asdict() for each in found.findings]
         told = {

@@ -23,6 +23,7 @@ from echelon.network.edges import (
     split_weights,
 )
 from echelon.network.exchange import Exchange
+from echelon.network.reach import advising
 from echelon.network.spectrum import Spectrum
 
 if TYPE_CHECKING:
@@ -169,7 +170,8 @@ class Graph:
         # The tree returns pairs in no promised order; sorted, a seed is one graph everywhere. One
         # number a pair sorts ten times faster than two.
         number = np.sort(pairs[:, 0] * agents + pairs[:, 1])
-        return cls(np.stack(np.divmod(number, agents), axis=1), leaders, agents)
+        with advising(points, radius):
+            return cls(np.stack(np.divmod(number, agents), axis=1), leaders, agents)
 
     def adjacency(self) -> sp.csr_array:
         """Return the symmetric adjacency matrix (N, N), sparse."""

@@ -13,7 +13,7 @@ from echelon.results.recording import Recording
 
 _FEW = 60
 """Agents that are drawn as vehicles; more are dots, each kind of them one stroke of the pen."""
-_LINK, _GOAL = "#4f5b68", "#d99000"
+_LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
 def moving_of(ax: Any, run: Recording, space: Space, camera: Camera) -> "Moving":
@@ -83,15 +83,19 @@ class _Vehicles(Moving):
         self.goals = PolyCollection([], facecolors="none", edgecolors=_GOAL, linewidths=1.2)
         self.arms = LineCollection([], linewidths=2.2)
         self.rotors = PolyCollection([], linewidths=0.4, edgecolors="white")
-        for part in (self.trails, self.goals, self.arms, self.rotors):
+        self.shadows = PolyCollection([], facecolors=_SHADOW, edgecolors="none")
+        self.falls = LineCollection([], colors=_SHADOW, linewidths=0.8)
+        for part in (self.shadows, self.falls, self.trails, self.goals, self.arms, self.rotors):
             self.ax.add_collection(part)
-        self.artists = [self.trails, self.links, self.goals, self.arms, self.rotors]
+        ground = [self.shadows, self.falls] if self.space.kind == "space" else []
+        self.artists = [*ground, self.trails, self.links, self.goals, self.arms, self.rotors]
 
     def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
         project = self.camera.project
         self.trails.set_segments(list(project(passed.swapaxes(0, 1))[0]))
         rings = goals[list(self.run.followers)][:, None] + 0.55 * self.size * self.ring
         self.goals.set_verts(list(project(rings)[0]))
+        self._shade(now)
         # Far ones first, so that near ones cover them.
         order = np.argsort(-project(now)[1], kind="stable")
         if self.space.shape != "quadrotor" or angles is None:
@@ -100,6 +104,13 @@ class _Vehicles(Moving):
             self.rotors.set_facecolor(self.colours[order])
             return
         self._quadrotors(now, angles, order)
+
+    def _shade(self, now: Array) -> None:
+        """Put shadows under the agents: without them no height is told from a distance."""
+        project = self.camera.project
+        below = now * (1.0, 1.0, 0.0) + (0.0, 0.0, self.space.low[2])
+        self.shadows.set_verts(list(project(below[:, None] + 0.35 * self.size * self.ring)[0]))
+        self.falls.set_segments(list(project(np.stack([now, below], axis=1))[0]))
 
     def _quadrotors(self, now: Array, angles: Array, order: Array) -> None:
         project, size, turns = self.camera.project, self.size, rotations(angles)

@@ -174,7 +174,7 @@ def draw_floor(ax: Any, camera: Camera, space: Space) -> None:
     low, high, stretch = space.low, space.high, (*space.stretch, 1.0)
     lines, said = [], []
     for k in (0, 1):
-        step = _nice((high[k] - low[k]) / stretch[k] / 7.0)
+        step = _nice((high[k] - low[k]) / stretch[k] / 10.0)
         said.append(f"{step:g}{f' {space.units[k]}' if space.units[k] else ''}")
         ends = np.array([low, high])
         ends[:, 2] = low[2]

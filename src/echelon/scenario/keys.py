@@ -10,7 +10,7 @@ from echelon.scenario.scenario import json_schema
 
 _HEAD = """# Scenario keys
 
-All keys of a scenario file; a first one, line by line, is in the [tutorial](tutorial.md), and words
+All keys of a scenario file; a first one is in the [first quarter of an hour](start.md), and words
 such as *trim* and *gain* in the [glossary](glossary.md). A *section* is a mapping with the keys of
 its own table below; where no default stands, a key may be left out. *By state or group* means a
 mapping from names of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates.

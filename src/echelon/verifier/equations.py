@@ -50,7 +50,9 @@ def model_of(saved: SavedModel) -> ControlAffine | NoModel:
     module, _, name = saved.path.partition(":")
     # With the dot, since other packages may begin with the same letters.
     if not (module + ".").startswith("echelon.models."):
-        return NoModel(f"`{name}` is not bundled; `verify(path, model)` takes it", False)
+        return NoModel(
+            f"`{name}` is not bundled; `--scenario`, or `verify(path, model)`, takes its own", False
+        )
     if saved.parameters is None:
         return NoModel(f"the file holds no parameters of `{name}`", False)
     try:

@@ -58,7 +58,14 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verified:
         GainError: the file is no gain, or lacks a part.
     """
     tube = read_tube(path)
-    found = _findings(read(path), model) if tube is None else tube_findings(tube)
+    if tube is not None:
+        return _verdict(_gathered(tube_findings(tube)))
+    saved = read(path)
+    found = _verdict(_gathered(_findings(saved, model)))
+    return found._replace(sentence=found.sentence + _without_decay(saved))
+
+
+def _gathered(found: Iterator[Finding]) -> tuple[Finding, ...]:
     findings = list[Finding]()
     # Numbers of a false file may overflow: what is not finite fails the comparisons that follow.
     with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -69,7 +76,7 @@ def verify(path: PathLike, model: ControlAffine | None = None) -> Verified:
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:
             # Numbers at which an algorithm gives up are no certificate.
             findings.append(said("all of it can be computed", False, text=str(error)))
-    return _verdict(tuple(findings))
+    return tuple(findings)
 
 
 def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding]:
@@ -99,6 +106,13 @@ def _verdict(findings: tuple[Finding, ...]) -> Verified:
         text = f"Incomplete: {count}, and could not be checked: {'; '.join(open_)}."
         return Verified(findings, "incomplete", text)
     return Verified(findings, "verified", f"Verified: {count}.")
+
+
+def _without_decay(saved: SavedGain) -> str:
+    """Return what a file that tells the truth about a gain that promises nothing is told."""
+    if saved.abscissa < 0.0:
+        return ""
+    return f" By them nothing decays: the slowest mode is {saved.abscissa:.3g} 1/s."
 
 
 def _definite(saved: SavedGain) -> Iterator[Finding]:
