@@ -16,7 +16,7 @@ from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm
 from echelon.engine.scalars import Rows, body_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import SLOTS, Code, Plan, aligned, program
+from echelon.kernels import SLOTS, Code, Plan, aligned, program, shared
 from echelon.laws.law import Law, Memory
 from echelon.world.disturbance import draw
 
@@ -26,6 +26,8 @@ _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some tenths of a second."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
+_STEPS = 2_048
+"""Of a call: what all agents have in common is kept for each of them."""
 _KEPT = 8
 """Kernels that are kept for other runs."""
 
@@ -41,6 +43,7 @@ class _Kernel(NamedTuple):
     code: Code
     rows: Rows
     plan: Plan
+    common: int
 
 
 def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
@@ -70,7 +73,8 @@ def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
     )
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    return _Kernel(Code(program(plan), Path(cache) if cache else None), rows, plan)
+    code = Code(program(plan), Path(cache) if cache else None)
+    return _Kernel(code, rows, plan, len(shared(plan)))
 
 
 @final
@@ -139,7 +143,8 @@ class NativeStepper(Stepper):
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
-        self.code, self.rows, self.plan = (kernels or Kernels()).of(self.own, bits, together)
+        made = (kernels or Kernels()).of(self.own, bits, together)
+        self.code, self.rows, self.plan, self.common = made
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
@@ -244,11 +249,11 @@ class NativeStepper(Stepper):
         """Take steps under one draw of the wind after the other."""
         wind = self.loop.motion.wind
         while steps:
-            count = steps
+            count = min(steps, _STEPS)
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
-                count = min(steps, hold - step % hold)
+                count = min(count, hold - step % hold)
             self._call(step, count, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
 
@@ -277,9 +282,10 @@ class NativeStepper(Stepper):
         groups = self.places.groups
 
         def fly(some: Array) -> None:
+            common = np.empty(steps * self.common, self.dtype)
             own = {name: array[len(array) // groups * some[0] :] for name, array in firsts.items()}
             told = values | {name: array.ctypes.data for name, array in own.items()}
-            told["groups"] = len(some)
+            told |= {"groups": len(some), "common": common.ctypes.data}
             self.code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
 
         self._share(fly, np.arange(groups))

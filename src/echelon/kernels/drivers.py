@@ -11,6 +11,7 @@ next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.kernels.common import apart, shared
 from echelon.kernels.frame import (
     ADDRESSES,
     SLOTS,
@@ -27,25 +28,60 @@ from echelon.kernels.frame import (
 )
 from echelon.kernels.neighbours import exchange, measure_edges, write_mirror
 from echelon.kernels.scalar import Node, needed
-from echelon.kernels.vector_ir import Emitter, Writer, number
+from echelon.kernels.usual import usual, whole
+from echelon.kernels.vector_ir import Emitter, Writer, choices, number
 
 
 def program(plan: Plan) -> str:
     """Return a kernel as text for LLVM."""
-    w = Writer(plan.bits, plan.lanes)
+    w, numbers, plan = Writer(plan.bits, plan.lanes), shared(plan), apart(plan)
     w.label("entry")
     slots = dict[str, str]()
     for place, name in enumerate(SLOTS):
         at = w.put(f"getelementptr i64, ptr %slots, i64 {place}")
         slots[name] = w.put(f"load {'ptr' if place < ADDRESSES else 'i64'}, ptr {at}")
     last = w.put(f"add i64 {slots['first_step']}, {slots['steps']}")
+    if numbers:
+        _share(w, plan, slots, numbers, last)
     with loop(w, "0", slots["groups"], []) as (group, _, _):
-        _steps(w, plan, _group(w, plan, slots, group), last)
+        _steps(w, plan, _group(w, plan, slots, group), last, len(numbers))
     w.do("ret void")
     head = "define void @run(ptr noalias %slots) #0 {"
     # 512 bits also where a processor would rather have halves: the types say what is meant.
     attributes = 'attributes #0 = { nounwind "prefer-vector-width"="512" }'
-    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, ""])
+    # A branch that is hardly ever taken.
+    seldom = '!0 = !{!"branch_weights", i32 1, i32 1000}'
+    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, seldom, ""])
+
+
+def _share(
+    w: Writer, plan: Plan, slots: dict[str, str], numbers: Sequence[Node], last: str
+) -> None:
+    """Write the loop over the steps that computes what all agents have in common."""
+    with loop(w, slots["first_step"], last, []) as (step, _, _):
+        passed = w.put(f"sub i64 {step}, {slots['first_step']}")
+        table, common = (
+            w.put(
+                f"getelementptr {w.scalar}, ptr {slots[name]}, i64 {w.put(f'mul i64 {passed}, {n}')}"
+            )
+            for name, n in (("table", plan.table), ("common", len(numbers)))
+        )
+        around = Context(plan, slots, "", "", step, table, common)
+        complete = whole(numbers)
+        numbers = [complete[node] for node in numbers]
+        emitter = Emitter(w, lambda leaf: _same_for_all(w, around, *_named(leaf)))
+        emitter.emit(numbers)
+        for k, node in enumerate(numbers):
+            value = emitter.value(node, uniform=True)
+            if node.truth:
+                value = w.put(f"uitofp i1 {value} to {w.scalar}")
+            at = w.put(f"getelementptr {w.scalar}, ptr {common}, i64 {k}")
+            w.do(f"store {w.scalar} {value}, ptr {at}")
+
+
+def _named(leaf: Node) -> tuple[str, Sequence[int]]:
+    kind, *rest = leaf.value
+    return kind, rest
 
 
 def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str, str]:
@@ -64,14 +100,14 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
     return slots | own
 
 
-def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str) -> None:
+def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str, numbers: int) -> None:
     """Write all steps of a group."""
     mirrors = [("ptr", slots["mirror"]), ("ptr", slots["next_mirror"])]
     with loop(w, slots["first_step"], last, mirrors) as (step, carried, following):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
-        row = w.put(f"mul i64 {passed}, {plan.table}")
-        table = w.put(f"getelementptr {w.scalar}, ptr {slots['table']}, i64 {row}")
-        around = Context(plan, slots, carried[0], carried[1], step, table)
+        row = w.put(f"mul i64 {passed}, {numbers}")
+        common = w.put(f"getelementptr {w.scalar}, ptr {slots['common']}, i64 {row}")
+        around = Context(plan, slots, carried[0], carried[1], step, "", common)
         if plan.edges:
             measure_edges(w, around)
         with _blocks(w, around, "0") as block:
@@ -96,35 +132,57 @@ def _blocks(w: Writer, around: Context, level: str) -> Iterator[str]:
 
 
 def _act(w: Writer, around: Context, body: Body, block: str) -> None:
-    """Write what the agents of a block do."""
-    plan = around.plan
+    """Write what the agents of a block do: as it usually is, and whole where it is not."""
+    plan, all_ = around.plan, body.all()
     size = plan.rows * plan.lanes
     begin = w.put(f"mul i64 {block}, {size}")
     base = w.put(f"getelementptr {w.scalar}, ptr {around.slots['rows']}, i64 {begin}")
-    results = body.results()
-    heard = sorted(n.value[1] for n in needed(results) if n.op == "leaf" and n.value[0] == "z")
+    complete = body.become(whole(all_))
+    heard = sorted(
+        n.value[1] for n in needed(complete.results()) if n.op == "leaf" and n.value[0] == "z"
+    )
 
     def row(leaf: Node) -> str:
         return load_row(w, base, leaf.value[1], plan.lanes)
 
-    z = exchange(w, around, body, block, heard, row) if heard else {}
+    z = exchange(w, around, complete, block, heard, row) if heard else {}
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        if kind == "z":
-            return z[rest[0]]
-        if kind == "row":
-            return row(leaf)
-        if kind == "told":
-            start, row_ = around.slots["rows"], plan.tell + rest[0]
-            return _look_up(w, around, "sources", start, row_, block, plan.one_source)
-        if kind == "leader":
-            start = around.mirror
-            return _look_up(w, around, "leaders", start, rest[0], block, plan.one_leader)
-        return _same_for_all(w, around, kind, rest)
+        return z[rest[0]] if kind == "z" else _load(w, around, block, base, kind, rest)
 
+    usually = usual(all_, choices(body.results()))
+    if usually.levels:
+        done, otherwise = w.fresh("done"), w.fresh("otherwise")
+        emitter = Emitter(w, load)
+        simple = body.become(usually.nodes)
+        emitter.emit_usual(simple.results(), usually.levels, otherwise)
+        _write(w, around, simple, emitter, base, block)
+        w.do(f"br label %{done}")
+        w.label(otherwise)
     emitter = Emitter(w, load)
-    emitter.emit(results)
+    emitter.emit(complete.results())
+    _write(w, around, complete, emitter, base, block)
+    if usually.levels:
+        w.do(f"br label %{done}")
+        w.label(done)
+
+
+def _load(w: Writer, around: Context, block: str, base: str, kind: str, rest: Sequence[int]) -> str:
+    """Write the load of what a body rests on, sums over neighbours apart."""
+    plan = around.plan
+    if kind == "row":
+        return load_row(w, base, rest[0], plan.lanes)
+    if kind == "told":
+        start, row = around.slots["rows"], plan.tell + rest[0]
+        return _look_up(w, around, "sources", start, row, block, plan.one_source)
+    if kind == "leader":
+        return _look_up(w, around, "leaders", around.mirror, rest[0], block, plan.one_leader)
+    return _same_for_all(w, around, kind, rest)
+
+
+def _write(w: Writer, around: Context, body: Body, emitter: Emitter, base: str, block: str) -> None:
+    """Write what a body leaves: in the rows of its block, and for its neighbours."""
     _write_rows(w, around, body, emitter, base)
     write_mirror(w, around, [emitter.value(node) for node in body.mirror], block)
 
@@ -139,6 +197,8 @@ def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: 
             store_row(w, base, row, lanes, emitter.value(node))
     for kept, op in ((body.sums, "add"), (body.greatest, "max"), (body.least, "min")):
         for row, node in kept.items():
+            if op == "add" and node.op == "constant" and node.value == 0.0:
+                continue
             both = [load_row(w, base, row, lanes), emitter.value(node)]
             store_row(w, base, row, lanes, w.operation(op, both, False, False))
 
@@ -148,8 +208,9 @@ def _same_for_all(w: Writer, around: Context, kind: str, rest: Sequence[int]) ->
     if kind == "steady":
         late = w.put(f"icmp sge i64 {around.step}, {around.slots['first_steady']}")
         return w.put(f"uitofp i1 {late} to {w.scalar}")
-    if kind == "table":
-        at = w.put(f"getelementptr {w.scalar}, ptr {around.table}, i64 {rest[0]}")
+    if kind in ("table", "common"):
+        start = around.table if kind == "table" else around.common
+        at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {rest[0]}")
         return w.put(f"load {w.scalar}, ptr {at}")
     step = w.put(f"sitofp i64 {around.step} to {w.scalar}")
     if kind == "step":

@@ -1,7 +1,7 @@
 """What the loops of a kernel are made of: what is written of it, loops, loads and stores."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from echelon.kernels.scalar import Node
@@ -39,6 +39,21 @@ class Body(NamedTuple):
         """Return all that is written."""
         rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
         return [*(node for row in rows for node in row.values()), *self.mirror]
+
+    def all(self) -> list[Node]:
+        """Return all that is written, and what of it is made of what neighbours read."""
+        return [*self.results(), *self.now, *self.difference]
+
+    def become(self, made: Mapping[Node, Node]) -> "Body":
+        """Return the body whose nodes have become others, where they have."""
+
+        def rows(of: dict[int, Node]) -> dict[int, Node]:
+            return {row: made.get(node, node) for row, node in of.items()}
+
+        def listed(of: Sequence[Node]) -> list[Node]:
+            return [made.get(node, node) for node in of]
+
+        return Body(*map(rows, self[:5]), *map(listed, self[5:]))
 
 
 class Plan(NamedTuple):
@@ -98,6 +113,7 @@ SLOTS = (
     "leaders",
     "edges",
     "edge_ends",
+    "common",
     "first_step",
     "steps",
     "levels",
@@ -106,12 +122,13 @@ SLOTS = (
     "shown",
     "groups",
 )
-"""What a kernel is called with: 12 addresses and 7 whole numbers of 64 bits.
+"""What a kernel is called with: 13 addresses and 7 whole numbers of 64 bits.
 
 Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
-those of the first of some groups. A swarm is one group.
+those of the first of some groups. A swarm is one group. `common` has room for the numbers of
+`common.shared` at each step.
 """
-ADDRESSES = 12
+ADDRESSES = 13
 
 
 def stride(width: int, lanes: int) -> int:
@@ -128,6 +145,7 @@ class Context(NamedTuple):
     following: str
     step: str
     table: str
+    common: str
 
 
 @contextlib.contextmanager

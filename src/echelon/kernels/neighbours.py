@@ -35,8 +35,7 @@ def exchange(
         return _subtract(w, around, (start, end), first, heard)
     leaves = [n for n in needed(wanted) if n.op == "leaf"]
     own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
-    mine = Emitter(w, load)
-    mine.emit(list(own.values()))
+    mine = _own(w, around, own, block, load)
     zero = [(w.vector, "zeroinitializer")] * len(heard)
     entries = sorted({n.value[1] for n in leaves if n.value[0] == "their"})
     with loop(w, start, end, zero) as (slot, totals, on):
@@ -45,7 +44,7 @@ def exchange(
 
         def entry_of(leaf: Node) -> str:
             kind, entry = leaf.value
-            return mine.value(own[leaf]) if kind == "own" else theirs[entry]
+            return mine[leaf] if kind == "own" else theirs[entry]
 
         emitter = Emitter(w, entry_of)
         emitter.emit(wanted)
@@ -59,6 +58,19 @@ def exchange(
                 value = w.put(f"fmul contract {w.vector} {value}, {weight}")
             on[k] = w.put(f"fadd contract {w.vector} {totals[k]}, {value}")
     return dict(zip(heard, totals, strict=True))
+
+
+def _own(
+    w: Writer, around: Context, own: dict[Node, Node], block: str, load: Callable[[Node], str]
+) -> dict[Node, str]:
+    """Write what the agents of a block show themselves: leaf -> a vector."""
+    if around.plan.together:
+        begin = w.put(f"mul i64 {block}, {around.plan.mirror}")
+        start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
+        return {leaf: load_row(w, start, leaf.value[1], w.lanes) for leaf in own}
+    emitter = Emitter(w, load)
+    emitter.emit(list(own.values()))
+    return {leaf: emitter.value(node) for leaf, node in own.items()}
 
 
 def _shown(

@@ -225,9 +225,73 @@ class Emitter:
         self._write([n for n in nodes if n.uniform])
         self._write_with_branches([n for n in nodes if not n.uniform], results)
 
-    def uniform(self, results: Sequence[Node]) -> None:
-        """Write what of the results' operands is the same for all agents."""
-        self._write([n for n in needed(results) if n.uniform])
+    def emit_usual(
+        self, results: Sequence[Node], levels: Sequence[Sequence[Node]], otherwise: str
+    ) -> None:
+        """Write all that results rest on, and go to a label where a truth of a level holds."""
+        nodes = needed([*results, *(node for level in levels for node in level)])
+        self._write([n for n in nodes if n.uniform])
+        rest = [n for n in nodes if not n.uniform]
+        for level in levels:
+            wanted = set(needed(level))
+            rest = self._early([n for n in rest if n in wanted], rest, results)
+            self._leave(level, otherwise)
+        self._write(rest)
+
+    def _early(
+        self, wanted: Sequence[Node], rest: Sequence[Node], results: Sequence[Node]
+    ) -> list[Node]:
+        """Write what is wanted, and what then takes fewer registers than it frees; return others.
+
+        A sum over the stages of an integrator is such: it would hold all of them to the end.
+        """
+        self._write(wanted)
+        left = [n for n in rest if n not in self.values]
+        users = dict[Node, int]()
+        for node in left:
+            for a in set(node.args):
+                users[a] = users.get(a, 0) + 1
+        kept, others = set(results), list[Node]()
+        for node in left:
+            ready = node.args and all(
+                a in self.values or a.op in ("constant", "leaf") for a in node.args
+            )
+            held = {a for a in node.args if not a.uniform and a.op != "leaf" and a not in kept}
+            if ready and sum(users[a] == 1 for a in held) >= 1:
+                self._write([a for a in node.args if a.op == "leaf"])
+                self._write([node])
+                for a in set(node.args):
+                    users[a] -= 1
+            else:
+                others.append(node)
+        return [n for n in others if n not in self.values]
+
+    def _leave(self, level: Sequence[Node], otherwise: str) -> None:
+        """Write a branch that is taken where one of some truths holds in any lane."""
+        w, truths = self.writer, self.writer.kind(True, False)
+        name = f"llvm.vector.reduce.or.v{w.lanes}i1"
+        w.declare("i1", name, truths)
+        found = list[str]()
+        bounds = dict[float, str]()
+        for node in level:
+            if node.op == "lt" and node.args[0].op == "constant":
+                value, x = node.args[0].value, self.value(node.args[1])
+                if value in bounds:
+                    more = w.put(f"fcmp ogt {w.vector} {x}, {bounds[value]}")
+                    x = w.put(f"select {truths} {more}, {w.vector} {x}, {w.vector} {bounds[value]}")
+                bounds[value] = x
+            else:
+                found.append(self.value(node))
+        for value, x in bounds.items():
+            bound = f"splat ({w.scalar} {number(value, w.bits)})"
+            # Of what is no number as well: the other code looks at it lane by lane.
+            found.append(w.put(f"fcmp ugt {w.vector} {x}, {bound}"))
+        one = found[0]
+        for other in found[1:]:
+            one = w.put(f"or {truths} {one}, {other}")
+        some, after = w.put(f"call i1 @{name}({truths} {one})"), w.fresh("usual")
+        w.do(f"br i1 {some}, label %{otherwise}, label %{after}, !prof !0")
+        w.label(after)
 
     def value(self, node: Node, uniform: bool = False) -> str:
         """Return the operand that a node is, for scalars or for vectors."""
@@ -318,6 +382,12 @@ class _Arm:
         self, which: Node, side: bool, nodes: list[Node], left: list[Node], first: Node
     ) -> None:
         self.which, self.side, self.nodes, self.left, self.first = which, side, nodes, left, first
+
+
+def choices(results: Sequence[Node]) -> list[tuple[Node, bool]]:
+    """Return the truths by which much is chosen, and at which side of them that is."""
+    nodes = [node for node in needed(results) if not node.uniform]
+    return [(arm.which, arm.side) for arm in _arms(nodes, results)]
 
 
 def _arms(nodes: list[Node], results: Sequence[Node]) -> list[_Arm]:
