@@ -1,6 +1,6 @@
 """The closed loop stepped by code for this machine: agents in the lanes of vectors."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm
 from echelon.engine.scalars import Rows, body_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import SLOTS, Code, Plan, aligned, program, shared
+from echelon.kernels import Code, Plan, aligned, program, shared
 from echelon.laws.law import Law, Memory
 from echelon.world.disturbance import draw
 
@@ -46,7 +47,7 @@ class _Kernel(NamedTuple):
     common: int
 
 
-def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
+def _kernel(own: Own, bits: int, together: bool, lines: bool) -> _Kernel:
     """Return the code that steps some loops, the rows that it works on, and its plan.
 
     Raises:
@@ -58,6 +59,7 @@ def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
         bits=bits,
         lanes=_LANES[bits],
         together=together,
+        lines=lines,
         rows=rows.total,
         width=n + signals_of(loop),
         first=body_of(own, bits, rows, True, wanted),
@@ -85,18 +87,18 @@ class Kernels:
         """Begin with none."""
         self._made: dict[Hashable, _Kernel] = {}
 
-    def of(self, own: Own, bits: int, together: bool) -> _Kernel:
+    def of(self, own: Own, bits: int, together: bool, lines: bool = False) -> _Kernel:
         """Return what steps some loops.
 
         Raises:
             Unsupported: a law or the model uses what has no scalar operations.
         """
-        key = (own.signature, bits, together)
+        key = (own.signature, bits, together, lines)
         if key not in self._made:
             # The oldest goes: a sweep over models has one after the other.
             while len(self._made) >= _KEPT:
                 self._made.pop(next(iter(self._made)))
-            self._made[key] = _kernel(own, bits, together)
+            self._made[key] = _kernel(own, bits, together, lines)
         return self._made[key]
 
 
@@ -117,6 +119,7 @@ class NativeStepper(Stepper):
             caller looks.
         pool: threads that step formations; None for the caller's alone.
         kernels: those that were made before.
+        threads: that share the steps of one formation; by its size when left out.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -130,20 +133,21 @@ class NativeStepper(Stepper):
         far: Stepper | None,
         pool: Executor | None = None,
         kernels: Kernels | None = None,
+        threads: int | None = None,
     ) -> None:
         """Write and compile the step."""
-        self.pool = pool
         self.own = Own(loops)
         self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
         self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, _LANES[bits]
         self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
+        self.crew = Crew(self.places, pool, threads)
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
-        made = (kernels or Kernels()).of(self.own, bits, together)
+        made = (kernels or Kernels()).of(self.own, bits, together, self.places.lines)
         self.code, self.rows, self.plan, self.common = made
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
@@ -156,7 +160,8 @@ class NativeStepper(Stepper):
         """Make what never changes during a run, and room for what does."""
         places, plan = self.places, self.plan
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
-        self.mirrors = [aligned((places.blocks, plan.mirror), self.dtype) for _ in range(2)]
+        shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
+        self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
         self.found = places.find(plan.width, plan.rows, self.dtype)
         self.edges = self.found.edges
 
@@ -276,29 +281,14 @@ class NativeStepper(Stepper):
         values |= {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
         # The inputs of single steps are read afterwards; those of many would be stored for nothing.
         values |= {"edge_blocks": len(self.found.edge_ends), "shown": int(steps == 1)}
+        values["line"] = self.places.line
         values["first_steady"] = int(self.loop.meter.first_steady)
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
         firsts["edges"] = self.edges
-        groups = self.places.groups
-
-        def fly(some: Array) -> None:
-            common = np.empty(steps * self.common, self.dtype)
-            own = {name: array[len(array) // groups * some[0] :] for name, array in firsts.items()}
-            told = values | {name: array.ctypes.data for name, array in own.items()}
-            told |= {"groups": len(some), "common": common.ctypes.data}
-            self.code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
-
-        self._share(fly, np.arange(groups))
+        common = np.empty(steps * self.common, self.dtype)
+        self.crew.run(self.code, values, firsts, common)
         if steps % 2:
             self.mirrors.reverse()
-
-    def _share(self, fly: Callable[[Array], None], groups: Array) -> None:
-        """Let threads take the groups; no group knows of another."""
-        if self.pool is None or len(groups) < 2:
-            fly(groups)
-            return
-        # More parts than threads, since another process may take a processor from one of them.
-        list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
 
     # ---- moments and sums ----
 
@@ -337,6 +327,9 @@ class NativeStepper(Stepper):
 
     def _show(self, values: Array) -> None:
         """Write what neighbours read of all agents, (N, n), or more beside their states."""
+        if self.plan.lines:
+            self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
+            return
         shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         if self.plan.together:
             self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)

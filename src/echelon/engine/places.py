@@ -25,6 +25,8 @@ class Found(NamedTuple):
         edges: rows of the edges, for the sums of how far distances are off: the differences of the
             goals, the distances that they make, and room for the sums.
         edge_ends: (edges, 2, lanes) where the two ends of each show their numbers.
+        smooth: (blocks,) whether the k-th neighbours of a block follow each other, for all k.
+        smooth_edges: (edges,) whether both ends of a block of edges do.
     """
 
     neighbour_starts: Array
@@ -34,6 +36,8 @@ class Found(NamedTuple):
     leaders: Array
     edges: Array
     edge_ends: Array
+    smooth: Array
+    smooth_edges: Array
 
 
 class Places(abc.ABC):
@@ -49,6 +53,8 @@ class Places(abc.ABC):
         of: where each agent stands.
         segments: (levels + 1,) the first block of the leaders, of each level, and the end.
         groups: of formations, which are stepped one after the other.
+        together: whether vectors hold agents of as many formations.
+        lines: whether what neighbours read lies row by row over all positions.
     """
 
     loop: Loop
@@ -57,6 +63,15 @@ class Places(abc.ABC):
     of: Array
     segments: Array
     groups: int
+    together: bool
+    lines: bool
+
+    @property
+    def line(self) -> int:
+        """How many numbers lie between two rows of what neighbours read, where it lies in lines."""
+        # A row begins on a line of memory of its own, of 64 that a cache tells apart.
+        lines = self.blocks + (5 - self.blocks) % 64
+        return lines * self.lanes
 
     @property
     def blocks(self) -> int:
@@ -72,6 +87,8 @@ class Places(abc.ABC):
         """Return the sums that rows of edges hold, one an edge."""
 
 
+_MOSTLY = 0.75
+"""Of the blocks: how many find their neighbours one after the other where they lie in lines."""
 _LARGE = 10_000
 """Agents whose numbers no longer stay in a processor's own memory from one to the next."""
 
@@ -129,14 +146,24 @@ class Swarm(Places):
 
     def __init__(self, loop: Loop, lanes: int) -> None:
         """Place the agents of a loop."""
-        self.loop, self.lanes, self.groups = loop, lanes, 1
+        self.loop, self.lanes, self.groups, self.together = loop, lanes, 1, False
         self.agents, self.segments = _ordered(loop, lanes)
         self.of = _first(self.agents)
+        self.heard = heard(loop, self)
+        starts, positions, _ = self.heard
+        slots = _follow(positions)
+        self.smooth = (
+            np.bincount(np.repeat(np.arange(self.blocks), np.diff(starts)), ~slots, self.blocks)
+            == 0
+        )
+        # A number that is gathered lane by lane costs some times what one of a line does.
+        self.lines = bool(self.smooth.mean() > _MOSTLY)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
-        loop, lanes, far = self.loop, self.lanes, stride(width, self.lanes)
-        starts, positions, weights = heard(loop, self)
+        loop, lanes = self.loop, self.lanes
+        far = 1 if self.lines else stride(width, lanes)
+        starts, positions, weights = self.heard
         heavy = aligned(weights.shape, dtype)
         heavy[:] = weights
         held = self.of[_senders(loop)[self.agents]]
@@ -147,7 +174,9 @@ class Swarm(Places):
             heavy,
             ((held // lanes) * rows * lanes + held % lanes).astype(np.int32),
             (self.of[nearest] * far).astype(np.int32),
-            *edge_blocks(loop, self, dtype, width),
+            *(edges := edge_blocks(loop, self, dtype, far)),
+            self.smooth.astype(np.int8),
+            _follow(edges[1]).all(axis=1).astype(np.int8),
         )
 
     def spacing(self, edges: Array) -> Array:
@@ -166,7 +195,7 @@ class Formations(Places):
         """Place the agents of loops that are alike."""
         self.loops, self.loop, self.lanes = loops, loops[0], lanes
         self.groups = -(-len(loops) // lanes)
-        self.alone = Swarm(self.loop, 1)
+        self.alone, self.together, self.lines = Swarm(self.loop, 1), True, False
         # The last group is filled with copies.
         formation = np.minimum(np.arange(self.groups * lanes), len(loops) - 1)
         formation = formation.reshape(self.groups, 1, lanes)
@@ -177,7 +206,7 @@ class Formations(Places):
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other in a group: what they show stands row by row."""
         loop, lanes, of, far = self.loop, self.lanes, self.alone.of, width * self.lanes
-        starts, positions, weights = heard(loop, self.alone)
+        starts, positions, weights = self.alone.heard
         heavy = aligned((len(weights), lanes), dtype)
         heavy[:] = weights
         ends = of[np.asarray(loop.meter.edges)] * far
@@ -189,6 +218,8 @@ class Formations(Places):
             (of[np.asarray(loop.meter.nearest)[self.alone.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
+            np.zeros(1, np.int8),
+            np.zeros(1, np.int8),
         )
 
     def _edges(self, dtype: np.dtype) -> Array:
@@ -207,6 +238,11 @@ class Formations(Places):
         """Return the sums that rows of edges hold, (formations E,)."""
         each = edges[:, :, -1].transpose(0, 2, 1).reshape(self.groups * self.lanes, -1)
         return each[: len(self.loops)].reshape(-1)
+
+
+def _follow(positions: Array) -> Array:
+    """Return which of some lists of positions (..., lanes) are each one more than the last."""
+    return (np.diff(positions, axis=-1) == 1).all(axis=-1)
 
 
 def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
@@ -233,10 +269,10 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     return first, positions, np.where(there, weights[edge], 0.0)
 
 
-def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, width: int) -> tuple[Array, Array]:
+def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, far: int) -> tuple[Array, Array]:
     """Return the edges in blocks for the sums of how far distances are off.
 
-    Neighbours read `width` numbers of each agent.
+    What two agents show that follow each other lies `far` apart.
 
     Returns:
         Rows (blocks, q + 2, lanes): the differences of the goals, the distances that they make, and
@@ -245,7 +281,7 @@ def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, width: int) -> tupl
     """
     meter, lanes = loop.meter, places.lanes
     edges, q = np.asarray(meter.edges), len(meter.measured)
-    blocks, far = -(-len(edges) // lanes), stride(width, lanes)
+    blocks = -(-len(edges) // lanes)
     goals = np.asarray(meter.offsets)[:, list(meter.measured)]
     apart = np.resize(goals[edges[:, 0]] - goals[edges[:, 1]], (blocks * lanes, q))
     rows = aligned((blocks, q + 2, lanes), dtype)

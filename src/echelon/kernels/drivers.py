@@ -26,7 +26,7 @@ from echelon.kernels.frame import (
     only_if,
     store_row,
 )
-from echelon.kernels.neighbours import exchange, measure_edges, write_mirror
+from echelon.kernels.neighbours import exchange, line, measure_edges, write_mirror
 from echelon.kernels.scalar import Node, needed
 from echelon.kernels.usual import usual, whole
 from echelon.kernels.vector_ir import Emitter, Writer, choices, number
@@ -60,11 +60,10 @@ def _share(
     """Write the loop over the steps that computes what all agents have in common."""
     with loop(w, slots["first_step"], last, []) as (step, _, _):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
+        far = (w.put(f"mul i64 {passed}, {n}") for n in (plan.table, len(numbers)))
         table, common = (
-            w.put(
-                f"getelementptr {w.scalar}, ptr {slots[name]}, i64 {w.put(f'mul i64 {passed}, {n}')}"
-            )
-            for name, n in (("table", plan.table), ("common", len(numbers)))
+            w.put(f"getelementptr {w.scalar}, ptr {slots[name]}, i64 {place}")
+            for name, place in zip(("table", "common"), far, strict=True)
         )
         around = Context(plan, slots, "", "", step, table, common)
         complete = whole(numbers)
@@ -112,20 +111,61 @@ def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str, numbers: int
             measure_edges(w, around)
         with _blocks(w, around, "0") as block:
             _act(w, around, plan.first, block)
+        _meet(w, around, passed, "0")
         with loop(w, "1", slots["levels"], []) as (level, _, _):
             with _blocks(w, around, level) as block:
                 _act(w, around, plan.others, block)
+            _meet(w, around, passed, level)
         following[:] = [carried[1], carried[0]]
 
 
 @contextlib.contextmanager
 def _blocks(w: Writer, around: Context, level: str) -> Iterator[str]:
     """Write the loop over the blocks of a level."""
-    at = w.put(f"getelementptr i64, ptr {around.slots['segments']}, i64 {level}")
-    following = w.put(f"getelementptr i64, ptr {at}, i64 1")
-    start, end = (w.put(f"load i64, ptr {place}") for place in (at, following))
+    places = (
+        w.put(f"getelementptr i64, ptr {around.slots[name]}, i64 {level}")
+        for name in ("starts", "ends")
+    )
+    start, end = (w.put(f"load i64, ptr {place}") for place in places)
     with loop(w, start, end, []) as (block, _, _):
         yield block
+
+
+_TURNS = 1_000
+"""That a thread waits before it leaves the processor: another may need it to come here."""
+
+
+def _meet(w: Writer, around: Context, passed: str, level: str) -> None:
+    """Write that a thread waits until all have come here."""
+    slots = around.slots
+    alone = w.put(f"icmp eq i64 {slots['threads']}, 1")
+    come, turn, here = (w.fresh(stem) for stem in ("come", "turn", "here"))
+    w.do(f"br i1 {alone}, label %{here}, label %{come}")
+    w.label(come)
+    # They come once a level and step, and none goes on before all came: a count says which it is.
+    before = w.put(f"mul i64 {passed}, {slots['levels']}")
+    number = w.put(f"add i64 {w.put(f'add i64 {before}, {level}')}, 1")
+    wanted = w.put(f"mul i64 {number}, {slots['threads']}")
+    w.put(f"atomicrmw add ptr {slots['met']}, i64 1 acq_rel")
+    turns, more = "%" + w.fresh("t"), "%" + w.fresh("t")
+    w.do(f"br label %{turn}")
+    w.label(turn)
+    rested = w.fresh("rested")
+    w.do(f"{turns} = phi i64 [ 0, %{come} ], [ {more}, %{rested} ]")
+    w.do(f"{more} = add i64 {turns}, 1")
+    seen = w.put(f"load atomic i64, ptr {slots['met']} acquire, align 8")
+    all_ = w.put(f"icmp sge i64 {seen}, {wanted}")
+    wait, rest = w.fresh("wait"), w.fresh("rest")
+    w.do(f"br i1 {all_}, label %{here}, label %{wait}")
+    w.label(wait)
+    tired = w.put(f"icmp sgt i64 {turns}, {_TURNS}")
+    w.do(f"br i1 {tired}, label %{rest}, label %{rested}")
+    w.label(rest)
+    w.put(f"call i32 {slots['rest']}()")
+    w.do(f"br label %{rested}")
+    w.label(rested)
+    w.do(f"br label %{turn}")
+    w.label(here)
 
 
 # ---- a body --------------------------------------------------------------------------------------
@@ -226,8 +266,10 @@ def _look_up(
     places, plan = around.slots[which], around.plan
     if plan.together:
         return load_row(w, far_block(w, places, block, start), row, plan.lanes)
-    # What is told stands in rows, and what is shown agent by agent.
+    # What is told stands in rows, and what is shown agent by agent or in lines.
     offset = row * plan.lanes if which == "sources" else row
+    if plan.lines and which == "leaders":
+        start, offset = line(w, around, row), 0
     first = w.put(f"mul i64 {block}, {plan.lanes}")
     if not one:
         return gather(w, start, load_places(w, places, first), offset)

@@ -1,7 +1,7 @@
 """What the loops of a kernel are made of: what is written of it, loops, loads and stores."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from echelon.kernels.scalar import Node
@@ -64,6 +64,8 @@ class Plan(NamedTuple):
         lanes: of a vector.
         together: whether a vector holds one agent of as many formations, which are all alike, and
             not as many agents of one.
+        lines: whether what neighbours read of a swarm lies row by row, since most vectors of
+            neighbours are agents that follow each other: rings, paths, grids.
         rows: of a block.
         width: numbers that neighbours read of an agent; they stand in whole vectors.
         first: the body of those that act first.
@@ -81,6 +83,7 @@ class Plan(NamedTuple):
     bits: int
     lanes: int
     together: bool
+    lines: bool
     rows: int
     width: int
     first: Body
@@ -97,7 +100,8 @@ class Plan(NamedTuple):
     @property
     def mirror(self) -> int:
         """How many numbers neighbours read of a block."""
-        return self.lanes * (self.width if self.together else stride(self.width, self.lanes))
+        in_rows = self.together or self.lines
+        return self.lanes * (self.width if in_rows else stride(self.width, self.lanes))
 
 
 SLOTS = (
@@ -114,6 +118,12 @@ SLOTS = (
     "edges",
     "edge_ends",
     "common",
+    "smooth",
+    "smooth_edges",
+    "starts",
+    "ends",
+    "met",
+    "rest",
     "first_step",
     "steps",
     "levels",
@@ -121,14 +131,21 @@ SLOTS = (
     "first_steady",
     "shown",
     "groups",
+    "line",
+    "threads",
+    "first_edge",
 )
-"""What a kernel is called with: 13 addresses and 7 whole numbers of 64 bits.
+"""What a kernel is called with: 19 addresses and 10 whole numbers of 64 bits.
 
 Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
 those of the first of some groups. A swarm is one group. `common` has room for the numbers of
-`common.shared` at each step.
+`common.shared` at each step. `line` is how many numbers lie between two rows of a mirror in lines;
+`smooth` tells of each block, and `smooth_edges` of each block of edges, whether its others follow
+each other there. A thread steps the blocks of each level from `starts` to `ends`, and its blocks of
+edges, and waits for the others after each level: `met` counts how many came, and `rest` is a
+function that leaves the processor to others.
 """
-ADDRESSES = 13
+ADDRESSES = 19
 
 
 def stride(width: int, lanes: int) -> int:
@@ -190,6 +207,26 @@ def only_if(w: Writer, wanted: str) -> Iterator[None]:
     yield
     w.do(f"br label %{after}")
     w.label(after)
+
+
+def either(w: Writer, truths: str, place: str, makes: Callable[[bool], Sequence[str]]) -> list[str]:
+    """Write vectors in one of two ways, by entry `place` of a list of bytes."""
+    at = w.put(f"getelementptr i8, ptr {truths}, i64 {place}")
+    which = w.put(f"icmp ne i8 {w.put(f'load i8, ptr {at}')}, 0")
+    ways, after = {True: w.fresh("so"), False: w.fresh("else")}, w.fresh("both")
+    w.do(f"br i1 {which}, label %{ways[True]}, label %{ways[False]}")
+    made, ends = dict[bool, Sequence[str]](), dict[bool, str]()
+    for way, label in ways.items():
+        w.label(label)
+        made[way], ends[way] = makes(way), w.fresh("end")
+        w.do(f"br label %{ends[way]}")
+        w.label(ends[way])
+        w.do(f"br label %{after}")
+    w.label(after)
+    pairs = zip(made[True], made[False], strict=True)
+    return [
+        w.put(f"phi {w.vector} [ {a}, %{ends[True]} ], [ {b}, %{ends[False]} ]") for a, b in pairs
+    ]
 
 
 def bytes_of(w: Writer) -> int:
