@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.engine import native, places
+from echelon.engine import crew, native, places
 from echelon.engine.drive import numbers
 from echelon.engine.prepare import prepare
 
@@ -177,6 +177,18 @@ def test_bits_do_not_depend_on_how_wide_a_vector_is(monkeypatch):
     narrow, _ = stepped(parts, chosen, (5, 40), "native")
     assert wide.states.tobytes() == narrow.states.tobytes()
     assert wide.sums.errors.tobytes() == narrow.sums.errors.tobytes()
+
+
+def test_bits_do_not_depend_on_threads():
+    parts, chosen = flock(ech.Graph.path(40), feedforward="parent"), run_settings()
+    _, stepper = stepped(parts, chosen, (1,), "native")
+    with jax.enable_x64(True):
+        stepper.crew = crew.Crew(stepper.places, None, 3)
+        shared = stepper.advance(stepper.start(), np.array([5, 40]), np.zeros((46, 12)))
+        stepper.crew = crew.Crew(stepper.places, None, 1)
+        again = stepper.advance(stepper.start(), np.array([5, 40]), np.zeros((46, 12)))
+    assert shared.now.states.tobytes() == again.now.states.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, again.sums, strict=True))
 
 
 # ---- what is told ----

@@ -89,11 +89,13 @@ class Places(abc.ABC):
 
 _MOSTLY = 0.75
 """Of the blocks: how many find their neighbours one after the other where they lie in lines."""
+_WINDOW = 1_024
+"""Agents among which those of one degree are brought together: so few stay near each other."""
 _LARGE = 10_000
 """Agents whose numbers no longer stay in a processor's own memory from one to the next."""
 
 
-def _ordered(loop: Loop, lanes: int) -> tuple[Array, Array]:
+def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Array]:
     """Return the agents in the order of their acting, and the first block of each level.
 
     A level fills its last block with copies, which do what the agent does and are read by nobody.
@@ -103,6 +105,12 @@ def _ordered(loop: Loop, lanes: int) -> tuple[Array, Array]:
         levels = [loop.followers[np.unique(row)] for row in loop.levels]
     rank = _nearby(loop)
     levels = [level[np.argsort(rank[level], kind="stable")] for level in levels]
+    if degrees is not None:
+        window = [np.arange(len(level)) // _WINDOW for level in levels]
+        levels = [
+            level[np.lexsort((degrees[level], near))]
+            for level, near in zip(levels, window, strict=True)
+        ]
     filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
     segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
     return np.concatenate(filled), segments
@@ -147,7 +155,18 @@ class Swarm(Places):
     def __init__(self, loop: Loop, lanes: int) -> None:
         """Place the agents of a loop."""
         self.loop, self.lanes, self.groups, self.together = loop, lanes, 1, False
-        self.agents, self.segments = _ordered(loop, lanes)
+        self._stand(None)
+        if len(loop.offsets) >= _LARGE and not self.lines:
+            # A block has as many slots as the most that one of its agents hears.
+            self._stand(np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of)))
+        # Ends that are near in memory follow each other.
+        edges = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1)
+        self.edge_order = np.lexsort(edges.T[::-1])
+
+    def _stand(self, degrees: Array | None) -> None:
+        """Give all agents their places, those of one degree side by side where they are given."""
+        loop, lanes = self.loop, self.lanes
+        self.agents, self.segments = _ordered(loop, lanes, degrees)
         self.of = _first(self.agents)
         self.heard = heard(loop, self)
         starts, positions, _ = self.heard
@@ -181,7 +200,9 @@ class Swarm(Places):
 
     def spacing(self, edges: Array) -> Array:
         """Return the sums that rows of edges hold, (E,)."""
-        return edges[:, -1].reshape(-1)[: len(self.loop.meter.edges)]
+        sums = np.empty(len(self.edge_order), edges.dtype)
+        sums[self.edge_order] = edges[:, -1].reshape(-1)[: len(sums)]
+        return sums
 
 
 @final
@@ -269,7 +290,7 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     return first, positions, np.where(there, weights[edge], 0.0)
 
 
-def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, far: int) -> tuple[Array, Array]:
+def edge_blocks(loop: Loop, places: "Swarm", dtype: np.dtype, far: int) -> tuple[Array, Array]:
     """Return the edges in blocks for the sums of how far distances are off.
 
     What two agents show that follow each other lies `far` apart.
@@ -280,13 +301,14 @@ def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, far: int) -> tuple[
         lanes).
     """
     meter, lanes = loop.meter, places.lanes
-    edges, q = np.asarray(meter.edges), len(meter.measured)
+    edges, q = np.asarray(meter.edges)[places.edge_order], len(meter.measured)
     blocks = -(-len(edges) // lanes)
     goals = np.asarray(meter.offsets)[:, list(meter.measured)]
     apart = np.resize(goals[edges[:, 0]] - goals[edges[:, 1]], (blocks * lanes, q))
     rows = aligned((blocks, q + 2, lanes), dtype)
     rows[:, :q] = apart.reshape(blocks, lanes, q).transpose(0, 2, 1)
-    rows[:, q] = np.resize(meter.spacings, blocks * lanes).reshape(blocks, lanes)
+    spacings = np.asarray(meter.spacings)[places.edge_order]
+    rows[:, q] = np.resize(spacings, blocks * lanes).reshape(blocks, lanes)
     ends = np.resize(places.of[edges] * far, (blocks * lanes, 2))
     pairs = ends.reshape(blocks, lanes, 2).transpose(0, 2, 1)
     return rows, np.ascontiguousarray(pairs, np.int32)
