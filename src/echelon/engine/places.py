@@ -156,12 +156,19 @@ class Swarm(Places):
         """Place the agents of a loop."""
         self.loop, self.lanes, self.groups, self.together = loop, lanes, 1, False
         self._stand(None)
-        if len(loop.offsets) >= _LARGE and not self.lines:
-            # A block has as many slots as the most that one of its agents hears.
-            self._stand(np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of)))
+        degrees = np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of))
+        if len(loop.offsets) >= _LARGE and not self.lines and self._uneven(degrees[self.agents]):
+            self._stand(degrees)
         # Ends that are near in memory follow each other.
         edges = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1)
         self.edge_order = np.lexsort(edges.T[::-1])
+
+    def _uneven(self, degrees: Array) -> bool:
+        """Tell whether blocks have fewer slots where those of one degree stand side by side."""
+        # A block has as many slots as the most that one of its agents hears.
+        sorted_ = degrees[np.lexsort((degrees, np.arange(len(degrees)) // _WINDOW))]
+        now, then = (part.reshape(-1, self.lanes).max(axis=1).sum() for part in (degrees, sorted_))
+        return bool(then < 0.9 * now)
 
     def _stand(self, degrees: Array | None) -> None:
         """Give all agents their places, those of one degree side by side where they are given."""

@@ -11,6 +11,7 @@ next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.kernels.arms import choices
 from echelon.kernels.common import apart, shared
 from echelon.kernels.frame import (
     ADDRESSES,
@@ -29,7 +30,7 @@ from echelon.kernels.frame import (
 from echelon.kernels.neighbours import exchange, line, measure_edges, write_mirror
 from echelon.kernels.scalar import Node, needed
 from echelon.kernels.usual import usual, whole
-from echelon.kernels.vector_ir import Emitter, Writer, choices, number
+from echelon.kernels.vector_ir import Emitter, Writer, number
 
 
 def program(plan: Plan) -> str:

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from typing import final
 
+from echelon.kernels.arms import Arm, arms
 from echelon.kernels.scalar import Node, needed
 
 _INSTRUCTIONS = {
@@ -39,8 +40,6 @@ _INSTRUCTIONS = {
     "or": "or {T} {0}, {1}",
     "xor": "xor {T} {0}, {1}",
 }
-_MANY = 40
-"""Operations behind a choice from which on a branch is worth its cost."""
 
 
 def number(value: float, bits: int) -> str:
@@ -327,7 +326,7 @@ class Emitter:
 
     def _write_with_branches(self, nodes: list[Node], results: Sequence[Node]) -> None:
         """Write nodes in order; those that one side of a choice alone needs, behind a branch."""
-        behind = _arms(nodes, results)
+        behind = arms(nodes, results)
         owned = {node: arm for arm in behind for node in arm.nodes}
         for node in nodes:
             arm = owned.get(node)
@@ -337,7 +336,7 @@ class Emitter:
                         self._branch(other)
                 self._write([node])
 
-    def _branch(self, arm: "_Arm") -> None:
+    def _branch(self, arm: Arm) -> None:
         """Write an arm behind a branch, and what it leaves as values that hold after it."""
         w, which = self.writer, self.value(arm.which)
         truths = f"<{w.lanes} x i1>"
@@ -364,80 +363,3 @@ class Emitter:
             kind = w.kind(node.truth, False)
             held = f"[ {self.values[node]}, %{end} ], [ zeroinitializer, %{before} ]"
             self.values[node] = w.put(f"phi {kind} {held}")
-
-
-@final
-class _Arm:
-    """What only one side of the choices by one truth needs.
-
-    Attributes:
-        which: the truth.
-        side: whether the arm is taken where it holds, or where it does not.
-        nodes: of the arm, in order.
-        left: those of them that the choices read.
-        first: the first of the choices.
-    """
-
-    def __init__(
-        self, which: Node, side: bool, nodes: list[Node], left: list[Node], first: Node
-    ) -> None:
-        self.which, self.side, self.nodes, self.left, self.first = which, side, nodes, left, first
-
-
-def choices(results: Sequence[Node]) -> list[tuple[Node, bool]]:
-    """Return the truths by which much is chosen, and at which side of them that is."""
-    nodes = [node for node in needed(results) if not node.uniform]
-    return [(arm.which, arm.side) for arm in _arms(nodes, results)]
-
-
-def _arms(nodes: list[Node], results: Sequence[Node]) -> list[_Arm]:
-    """Return the arms that are worth a branch; none within another."""
-    users: dict[Node, list[Node]] = {node: [] for node in nodes}
-    for node in nodes:
-        for operand in set(node.args):
-            if operand in users:
-                users[operand].append(node)
-    outside = set(results)
-    choices: dict[tuple[Node, bool], list[Node]] = {}
-    for node in nodes:
-        if node.op == "select" and not node.args[0].uniform:
-            for side in (True, False):
-                choices.setdefault((node.args[0], side), []).append(node)
-    found, taken = list[_Arm](), set[Node]()
-    # Those of the later choices hold those of the earlier ones, and are worth more.
-    for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
-        arm = _exclusive(nodes, users, outside, which, side, selects)
-        arm = [node for node in arm if node.op != "leaf"]
-        if len(arm) >= _MANY and not taken.intersection([*arm, *selects, which]):
-            inside = set(arm)
-            left = [n for n in arm if any(u not in inside for u in users[n])]
-            found.append(_Arm(which, side, arm, left, selects[0]))
-            taken.update(arm)
-    return found
-
-
-def _exclusive(
-    nodes: list[Node],
-    users: dict[Node, list[Node]],
-    outside: set[Node],
-    which: Node,
-    side: bool,
-    selects: list[Node],
-) -> list[Node]:
-    """Return the nodes that nothing needs but one side of some choices."""
-    chosen, inside = set(selects), set[Node]()
-    for node in reversed(nodes):
-        if node in outside or node is which or not users[node]:
-            continue
-        wanted = True
-        for user in users[node]:
-            if user in inside:
-                continue
-            # The choice itself may read it at that side only, and not as its truth.
-            other = user.args[2 if side else 1] if user.op == "select" else None
-            wanted = user in chosen and node is not other and node is not user.args[0]
-            if not wanted:
-                break
-        if wanted:
-            inside.add(node)
-    return [node for node in nodes if node in inside]
