@@ -367,17 +367,23 @@ class NativeStepper(Stepper):
         """Return the sums over the steps from one to another."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
+        begin = rows.errors.start
+        kept = self._read(range(begin, rows.total)).astype(np.float64)
+
+        def of(places: range) -> Array:
+            return kept[:, places.start - begin : places.stop - begin]
+
         found = Sums(
             steps=np.array([end - first, steady]),
-            errors=self._read(rows.errors).T,
-            tracking=self._read(rows.tracking)[leaders].T,
-            outputs=self._read(rows.outputs)[leaders],
-            effort=self._read(rows.effort)[:, 0],
+            errors=of(rows.errors).T,
+            tracking=of(rows.tracking)[leaders].T,
+            outputs=of(rows.outputs)[leaders],
+            effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
-            limited=self._read(rows.limited)[:, 0],
-            unsettled=self._read(rows.unsettled)[:, 0],
-            inside=np.minimum(self._read(rows.inside).astype(np.float64), ALWAYS),
-            chatter=self._read(rows.chatter)[:, 0],
+            limited=of(rows.limited)[:, 0],
+            unsettled=of(rows.unsettled)[:, 0],
+            inside=np.minimum(of(rows.inside), ALWAYS),
+            chatter=of(rows.chatter)[:, 0],
         )
         return Sums(*(np.asarray(part, np.float64) for part in found))
 
