@@ -180,15 +180,20 @@ def test_bits_do_not_depend_on_how_wide_a_vector_is(monkeypatch):
 
 
 def test_bits_do_not_depend_on_threads():
-    parts, chosen = flock(ech.Graph.path(40), feedforward="parent"), run_settings()
-    _, stepper = stepped(parts, chosen, (1,), "native")
+    model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(40)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="parent"))
+    formation = ech.Formation(np.zeros((40, 2)))
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    _, stepper = stepped(parts, run_settings(), (1,), "native")
+    chunks = []
     with jax.enable_x64(True):
-        stepper.crew = crew.Crew(stepper.places, None, 3)
-        shared = stepper.advance(stepper.start(), np.array([5, 40]), np.zeros((46, 12)))
-        stepper.crew = crew.Crew(stepper.places, None, 1)
-        again = stepper.advance(stepper.start(), np.array([5, 40]), np.zeros((46, 12)))
-    assert shared.now.states.tobytes() == again.now.states.tobytes()
-    assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, again.sums, strict=True))
+        for threads in (1, 3):
+            stepper.crew = crew.Crew(stepper.places, None, threads)
+            chunks.append(stepper.advance(stepper.start(), np.array([5, 40]), None))
+    alone, shared = chunks
+    assert shared.now.states.tobytes() == alone.now.states.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, alone.sums, strict=True))
 
 
 # ---- what is told ----
