@@ -97,7 +97,7 @@ def measure(agents: int, bits: int, yardstick: Path | None) -> dict[str, float]:
     """Return the rates of a ring, in millions of agent-steps a second, and their ratios."""
     native, by_jax, reference = steppers(ech.Graph.ring(agents), bits)
     few = agents <= 10_000
-    steps, fewer = max(4, 1_000_000 // agents), max(2, 100_000 // agents)
+    steps, fewer = max(4, 2_000_000 // agents), max(2, 100_000 // agents)
     found: dict[str, list[float]] = {"native": [], **({"JAX": []} if few else {}), "C": []}
     limit: Any = None
     kernel: Any = None
