@@ -51,7 +51,7 @@ class Crew:
         self._own = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
 
     def run(
-        self, code: Code, values: Mapping[str, int], firsts: Mapping[str, Array], common: Array
+        self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
     ) -> None:
         """Run a kernel.
 
@@ -82,7 +82,7 @@ class Crew:
         list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
 
     def _swarm(
-        self, code: Code, values: Mapping[str, int], firsts: Mapping[str, Array], common: Array
+        self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
     ) -> None:
         """Let each thread take a part of each level, and of the edges."""
         assert self._own is not None
@@ -107,7 +107,7 @@ def _from(starts: Array, ends: Array) -> dict[str, Array]:
     return {"starts": np.ascontiguousarray(starts), "ends": np.ascontiguousarray(ends)}
 
 
-def _call(code: Code, values: Mapping[str, int], arrays: Mapping[str, Array]) -> None:
+def _call(code: Code, values: dict[str, int], arrays: Mapping[str, Array]) -> None:
     """Call a kernel; its arrays live until it returns."""
     told = dict(values) | {name: array.ctypes.data for name, array in arrays.items()}
     code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))

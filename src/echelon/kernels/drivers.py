@@ -193,8 +193,8 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
         return z[rest[0]] if kind == "z" else _load(w, around, block, base, kind, rest)
 
     usually = usual(all_, choices(body.results()))
+    done, otherwise = w.fresh("done"), w.fresh("otherwise")
     if usually.levels:
-        done, otherwise = w.fresh("done"), w.fresh("otherwise")
         emitter = Emitter(w, load)
         simple = body.become(usually.nodes)
         emitter.emit_usual(simple.results(), usually.levels, otherwise)

@@ -53,7 +53,16 @@ class Body(NamedTuple):
         def listed(of: Sequence[Node]) -> list[Node]:
             return [made.get(node, node) for node in of]
 
-        return Body(*map(rows, self[:5]), *map(listed, self[5:]))
+        return Body(
+            stores=rows(self.stores),
+            sums=rows(self.sums),
+            greatest=rows(self.greatest),
+            least=rows(self.least),
+            shown=rows(self.shown),
+            now=listed(self.now),
+            mirror=listed(self.mirror),
+            difference=listed(self.difference),
+        )
 
 
 class Plan(NamedTuple):
