@@ -24,6 +24,7 @@ def text_of(function, count, bits=64, lanes=None):
         bits=bits,
         lanes=lanes or 512 // bits,
         together=False,
+        lines=False,
         rows=count + len(results),
         width=0,
         first=body,
@@ -50,7 +51,8 @@ def run(function, columns, bits=64, lanes=None, cache=None):
     rows[:, :count] = padded.reshape(blocks, lanes, count).transpose(0, 2, 1)
     segments, slots = np.array([0, blocks], np.int64), np.zeros(len(SLOTS), np.int64)
     values = {"rows": rows.ctypes.data, "segments": segments.ctypes.data}
-    values |= dict.fromkeys(("steps", "levels", "groups"), 1)
+    values |= {"starts": segments.ctypes.data, "ends": segments[1:].ctypes.data}
+    values |= dict.fromkeys(("steps", "levels", "groups", "threads"), 1)
     for name, value in values.items():
         slots[SLOTS.index(name)] = value
     Code(text, cache).call(slots)

@@ -232,6 +232,21 @@ def test_nothing_is_told_twice_and_what_is_plain_is_folded():
     assert (x * 0.0).value == 0.0 and (graph.constant(2.0) * 3.0).value == 6.0
 
 
+def test_a_lane_that_is_not_as_usual_changes_no_bit_of_the_others():
+    def turned(v):
+        return jnp.stack([jnp.sin(v[0]) * v[1], jnp.cos(jnp.sin(v[0]) + v[1]), jnp.cos(v[1])])
+
+    drawn = np.random.default_rng(3)
+    small = drawn.uniform(-0.3, 0.3, (2, 16))
+    mixed = small.copy()
+    mixed[:, 1::2] = drawn.uniform(-9.0, 9.0, (2, 8))
+    mixed[0, 3] = np.nan
+    alone, beside = (run(turned, columns) for columns in (small, mixed))
+    assert alone[:, ::2].tobytes() == beside[:, ::2].tobytes()
+    by_numpy = [np.sin(mixed[0]) * mixed[1], np.cos(np.sin(mixed[0]) + mixed[1]), np.cos(mixed[1])]
+    np.testing.assert_allclose(beside, by_numpy, atol=1e-15)
+
+
 def test_much_that_few_need_stands_behind_a_branch():
     assert "vector.reduce.or" in text_of(much, 3)[0]
     assert "vector.reduce.or" not in text_of(lambda v: jnp.where(v[0] > 1.0, -v, v), 3)[0]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.engine import native, places
+from echelon.engine import crew, native, places
 from echelon.engine.drive import numbers
 from echelon.engine.prepare import prepare
 
@@ -173,10 +173,27 @@ def test_bits_do_not_depend_on_where_a_run_is_cut(cuts):
 def test_bits_do_not_depend_on_how_wide_a_vector_is(monkeypatch):
     parts, chosen = flock(ech.Graph.ring(13)), run_settings()
     wide, _ = stepped(parts, chosen, (5, 40), "native")
-    monkeypatch.setattr(native, "_LANES", {64: 4, 32: 4})
+    monkeypatch.setitem(native.LANES, 64, 4)
     narrow, _ = stepped(parts, chosen, (5, 40), "native")
     assert wide.states.tobytes() == narrow.states.tobytes()
     assert wide.sums.errors.tobytes() == narrow.sums.errors.tobytes()
+
+
+def test_bits_do_not_depend_on_threads():
+    model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(40)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="parent"))
+    formation = ech.Formation(np.zeros((40, 2)))
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    _, stepper = stepped(parts, run_settings(), (1,), "native")
+    chunks = []
+    with jax.enable_x64(True):
+        for threads in (1, 3):
+            stepper.crew = crew.Crew(stepper.places, None, threads)
+            chunks.append(stepper.advance(stepper.start(), np.array([5, 40]), None))
+    alone, shared = chunks
+    assert shared.now.states.tobytes() == alone.now.states.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, alone.sums, strict=True))
 
 
 # ---- what is told ----

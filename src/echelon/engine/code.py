@@ -11,7 +11,7 @@ import numpy as np
 from echelon.engine.loop import Loop
 from echelon.engine.own import Own
 from echelon.engine.scalars import Rows, body_of, signals_of
-from echelon.kernels import Code, Plan, program
+from echelon.kernels import Code, Plan, program, shared
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
@@ -25,14 +25,15 @@ def follows(loop: Loop) -> bool:
 
 
 class _Kernel(NamedTuple):
-    """The code that steps some loops, the rows that it works on, and its plan."""
+    """The code that steps some loops, the rows that it works on, its plan, and `common.shared`."""
 
     code: Code
     rows: Rows
     plan: Plan
+    common: int
 
 
-def _kernel(own: Own, bits: int, together: bool, weighted: bool) -> _Kernel:
+def _kernel(own: Own, bits: int, together: bool, lines: bool, weighted: bool) -> _Kernel:
     """Return the code that steps some loops, the rows that it works on, and its plan.
 
     Raises:
@@ -44,6 +45,7 @@ def _kernel(own: Own, bits: int, together: bool, weighted: bool) -> _Kernel:
         bits=bits,
         lanes=LANES[bits],
         together=together,
+        lines=lines,
         rows=rows.total,
         width=n + signals_of(loop),
         first=body_of(own, bits, rows, True, wanted),
@@ -59,7 +61,8 @@ def _kernel(own: Own, bits: int, together: bool, weighted: bool) -> _Kernel:
     )
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    return _Kernel(Code(program(plan), Path(cache) if cache else None), rows, plan)
+    code = Code(program(plan), Path(cache) if cache else None)
+    return _Kernel(code, rows, plan, len(shared(plan)))
 
 
 @final
@@ -70,16 +73,18 @@ class Kernels:
         """Begin with none."""
         self._made: dict[Hashable, _Kernel] = {}
 
-    def of(self, own: Own, bits: int, together: bool, weighted: bool = False) -> _Kernel:
+    def of(
+        self, own: Own, bits: int, together: bool, lines: bool = False, weighted: bool = False
+    ) -> _Kernel:
         """Return what steps some loops, `weighted` where their edges' weights may become others.
 
         Raises:
             Unsupported: a law or the model uses what has no scalar operations.
         """
-        key = (own.signature, bits, together, weighted)
+        key = (own.signature, bits, together, lines, weighted)
         if key not in self._made:
             # The oldest goes: a sweep over models has one after the other.
             while len(self._made) >= _KEPT:
                 self._made.pop(next(iter(self._made)))
-            self._made[key] = _kernel(own, bits, together, weighted)
+            self._made[key] = _kernel(own, bits, together, lines, weighted)
         return self._made[key]

@@ -4,7 +4,6 @@ Runs that are alike but for numbers are stepped together by native code, a forma
 others run one after the other.
 """
 
-import os
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ import numpy as np
 from echelon.core.errors import EchelonError, MissingExtraError, Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.engine.crew import processors
 from echelon.engine.drive import Chunk
 from echelon.engine.family import Families
 from echelon.engine.grid import Grid
@@ -69,7 +69,7 @@ class Fleet:
 
     def __init__(self, threads: int | None = None) -> None:
         """Begin with nothing prepared."""
-        self.threads = threads or _processors()
+        self.threads = threads or processors()
         self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self.kernels, self.kinds = Kernels(), Families()
         self._cases: WeakKeyDictionary[Parts, dict[Settings, _Case]] = WeakKeyDictionary()
@@ -253,10 +253,3 @@ def _fit(jobs: list[_Job]) -> bool:
     if len(jobs) < 2 or agents > _SMALL and len(jobs) < 8:
         return False
     return worth_native(problem.settings, len(jobs) * agents)
-
-
-def _processors() -> int:
-    """Return how many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -1,6 +1,6 @@
 """The closed loop stepped by code for this machine: agents in the lanes of vectors."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from typing import Any, final
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.code import LANES, Kernels, follows
+from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
-from echelon.engine.scalars import signals_of
+from echelon.engine.scalars import memories_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import SLOTS, aligned
-from echelon.laws.law import Law, Memory
+from echelon.kernels import aligned
 from echelon.world.disturbance import draw
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
@@ -26,6 +26,8 @@ _AHEAD, _AT_ONCE = 64, 50_000
 """Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
+_STEPS = 2_048
+"""Of a call: what all agents have in common is kept for each of them."""
 
 
 def beyond(states: Array, bits: int) -> Array:
@@ -47,6 +49,7 @@ class NativeStepper(Stepper):
         kernels: those that were made before.
         unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
             weights of edges anyway; None where nothing is turned.
+        threads: that share the steps of one formation; by its size when left out.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -61,21 +64,23 @@ class NativeStepper(Stepper):
         pool: Executor | None = None,
         kernels: Kernels | None = None,
         unlike: Loop | None = None,
+        threads: int | None = None,
     ) -> None:
         """Write and compile the step."""
-        self.pool = pool
         self.own = Own(loops, unlike)
         self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
         self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
         self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
+        self.crew = Crew(self.places, pool, threads)
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
-        made = (kernels or Kernels()).of(self.own, bits, together, unlike is not None)
-        self.code, self.rows, self.plan = made
+        lines, turned = self.places.lines, unlike is not None
+        made = (kernels or Kernels()).of(self.own, bits, together, lines, turned)
+        self.code, self.rows, self.plan, self.common = made
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
@@ -88,7 +93,8 @@ class NativeStepper(Stepper):
         """Make what never changes during a run, and room for what does."""
         places, plan = self.places, self.plan
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
-        self.mirrors = [aligned((places.blocks, plan.mirror), self.dtype) for _ in range(2)]
+        shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
+        self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
         self.found = places.find(plan.width, plan.rows, self.dtype)
         self.edges = self.found.edges
 
@@ -189,11 +195,11 @@ class NativeStepper(Stepper):
         """Take steps under one draw of the wind after the other."""
         wind = self.loop.motion.wind
         while steps:
-            count = steps
+            count = min(steps, _STEPS)
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
-                count = min(steps, hold - step % hold)
+                count = min(count, hold - step % hold)
             self._call(step, count, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
 
@@ -221,28 +227,14 @@ class NativeStepper(Stepper):
         values |= {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
         # The inputs of single steps are read afterwards; those of many would be stored for nothing.
         values |= {"edge_blocks": len(self.found.edge_ends), "shown": int(steps == 1)}
+        values["line"] = self.places.line
         values["first_steady"] = int(self.loop.meter.first_steady)
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
         firsts["edges"] = self.edges
-        groups = self.places.groups
-
-        def fly(some: Array) -> None:
-            own = {name: array[len(array) // groups * some[0] :] for name, array in firsts.items()}
-            told = values | {name: array.ctypes.data for name, array in own.items()}
-            told["groups"] = len(some)
-            self.code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
-
-        self._share(fly, np.arange(groups))
+        common = np.empty(steps * self.common, self.dtype)
+        self.crew.run(self.code, values, firsts, common)
         if steps % 2:
             self.mirrors.reverse()
-
-    def _share(self, fly: Callable[[Array], None], groups: Array) -> None:
-        """Let threads take the groups; no group knows of another."""
-        if self.pool is None or len(groups) < 2:
-            fly(groups)
-            return
-        # More parts than threads, since another process may take a processor from one of them.
-        list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
 
     # ---- moments and sums ----
 
@@ -281,6 +273,9 @@ class NativeStepper(Stepper):
 
     def _show(self, values: Array) -> None:
         """Write what neighbours read of all agents, (N, n), or more beside their states."""
+        if self.plan.lines:
+            self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
+            return
         shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         if self.plan.together:
             self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)
@@ -294,8 +289,8 @@ class NativeStepper(Stepper):
         now: Any = [
             np.asarray(step, np.int32),
             self._read(self.rows.state),
-            _memory(loop.leader, flat[self.leaders]),
-            _memory(loop.follower, flat[self.followers]),
+            memories_of(loop.leader, flat[self.leaders]),
+            memories_of(loop.follower, flat[self.followers]),
             self._read(self.rows.cut).astype(np.int8),
         ]
         return Moment._make(now)
@@ -311,29 +306,25 @@ class NativeStepper(Stepper):
         """Return the sums over the steps from one to another."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
+        begin = rows.errors.start
+        kept = self._read(range(begin, rows.total)).astype(np.float64)
+
+        def of(places: range) -> Array:
+            return kept[:, places.start - begin : places.stop - begin]
+
         found = Sums(
             steps=np.array([end - first, steady]),
-            errors=self._read(rows.errors).T,
-            tracking=self._read(rows.tracking)[leaders].T,
-            outputs=self._read(rows.outputs)[leaders],
-            effort=self._read(rows.effort)[:, 0],
+            errors=of(rows.errors).T,
+            tracking=of(rows.tracking)[leaders].T,
+            outputs=of(rows.outputs)[leaders],
+            effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
-            limited=self._read(rows.limited)[:, 0],
-            unsettled=self._read(rows.unsettled)[:, 0],
-            inside=np.minimum(self._read(rows.inside).astype(np.float64), ALWAYS),
-            chatter=self._read(rows.chatter)[:, 0],
+            limited=of(rows.limited)[:, 0],
+            unsettled=of(rows.unsettled)[:, 0],
+            inside=np.minimum(of(rows.inside), ALWAYS),
+            chatter=of(rows.chatter)[:, 0],
         )
         return Sums(*(np.asarray(part, np.float64) for part in found))
-
-
-def _memory(law: Law, flat: Array) -> Memory:
-    """Return memories of agents from their numbers (agents, numbers)."""
-    leaves, tree = jax.tree.flatten(law.init())
-    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
-    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
-    return tree.unflatten(
-        [flat[:, a:b].reshape(len(flat), *np.shape(leaf)) for leaf, a, b in parts]
-    )
 
 
 @jax.jit

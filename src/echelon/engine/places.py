@@ -25,6 +25,8 @@ class Found(NamedTuple):
         edges: rows of the edges, for the sums of how far distances are off: the differences of the
             goals, the distances that they make, and room for the sums.
         edge_ends: (edges, 2, lanes) where the two ends of each show their numbers.
+        smooth: (blocks,) whether the k-th neighbours of a block follow each other, for all k.
+        smooth_edges: (edges,) whether both ends of a block of edges do.
     """
 
     neighbour_starts: Array
@@ -34,6 +36,8 @@ class Found(NamedTuple):
     leaders: Array
     edges: Array
     edge_ends: Array
+    smooth: Array
+    smooth_edges: Array
 
 
 class Places(abc.ABC):
@@ -49,6 +53,8 @@ class Places(abc.ABC):
         of: where each agent stands.
         segments: (levels + 1,) the first block of the leaders, of each level, and the end.
         groups: of formations, which are stepped one after the other.
+        together: whether vectors hold agents of as many formations.
+        lines: whether what neighbours read lies row by row over all positions.
     """
 
     loop: Loop
@@ -57,6 +63,15 @@ class Places(abc.ABC):
     of: Array
     segments: Array
     groups: int
+    together: bool
+    lines: bool
+
+    @property
+    def line(self) -> int:
+        """How many numbers lie between two rows of what neighbours read, where it lies in lines."""
+        # A row begins on a line of memory of its own, of 64 that a cache tells apart.
+        lines = self.blocks + (5 - self.blocks) % 64
+        return lines * self.lanes
 
     @property
     def blocks(self) -> int:
@@ -72,11 +87,15 @@ class Places(abc.ABC):
         """Return the sums that rows of edges hold, one an edge."""
 
 
+_MOSTLY = 0.75
+"""Of the blocks: how many find their neighbours one after the other where they lie in lines."""
+_WINDOW = 1_024
+"""Agents among which those of one degree are brought together: so few stay near each other."""
 _LARGE = 10_000
 """Agents whose numbers no longer stay in a processor's own memory from one to the next."""
 
 
-def _ordered(loop: Loop, lanes: int) -> tuple[Array, Array]:
+def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Array]:
     """Return the agents in the order of their acting, and the first block of each level.
 
     A level fills its last block with copies, which do what the agent does and are read by nobody.
@@ -86,6 +105,12 @@ def _ordered(loop: Loop, lanes: int) -> tuple[Array, Array]:
         levels = [loop.followers[np.unique(row)] for row in loop.levels]
     rank = _nearby(loop)
     levels = [level[np.argsort(rank[level], kind="stable")] for level in levels]
+    if degrees is not None:
+        window = [np.arange(len(level)) // _WINDOW for level in levels]
+        levels = [
+            level[np.lexsort((degrees[level], near))]
+            for level, near in zip(levels, window, strict=True)
+        ]
     filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
     segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
     return np.concatenate(filled), segments
@@ -129,14 +154,42 @@ class Swarm(Places):
 
     def __init__(self, loop: Loop, lanes: int) -> None:
         """Place the agents of a loop."""
-        self.loop, self.lanes, self.groups = loop, lanes, 1
-        self.agents, self.segments = _ordered(loop, lanes)
+        self.loop, self.lanes, self.groups, self.together = loop, lanes, 1, False
+        self._stand(None)
+        degrees = np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of))
+        if len(loop.offsets) >= _LARGE and not self.lines and self._uneven(degrees[self.agents]):
+            self._stand(degrees)
+        # Ends that are near in memory follow each other.
+        edges = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1)
+        self.edge_order = np.lexsort(edges.T[::-1])
+
+    def _uneven(self, degrees: Array) -> bool:
+        """Tell whether blocks have fewer slots where those of one degree stand side by side."""
+        # A block has as many slots as the most that one of its agents hears.
+        sorted_ = degrees[np.lexsort((degrees, np.arange(len(degrees)) // _WINDOW))]
+        now, then = (part.reshape(-1, self.lanes).max(axis=1).sum() for part in (degrees, sorted_))
+        return bool(then < 0.9 * now)
+
+    def _stand(self, degrees: Array | None) -> None:
+        """Give all agents their places, those of one degree side by side where they are given."""
+        loop, lanes = self.loop, self.lanes
+        self.agents, self.segments = _ordered(loop, lanes, degrees)
         self.of = _first(self.agents)
+        self.heard = heard(loop, self)
+        starts, positions, _ = self.heard
+        slots = _follow(positions)
+        self.smooth = (
+            np.bincount(np.repeat(np.arange(self.blocks), np.diff(starts)), ~slots, self.blocks)
+            == 0
+        )
+        # A number that is gathered lane by lane costs some times what one of a line does.
+        self.lines = bool(self.smooth.mean() > _MOSTLY)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
-        loop, lanes, far = self.loop, self.lanes, stride(width, self.lanes)
-        starts, positions, weights = heard(loop, self)
+        loop, lanes = self.loop, self.lanes
+        far = 1 if self.lines else stride(width, lanes)
+        starts, positions, weights = self.heard
         heavy = aligned(weights.shape, dtype)
         heavy[:] = weights
         held = self.of[_senders(loop)[self.agents]]
@@ -147,12 +200,16 @@ class Swarm(Places):
             heavy,
             ((held // lanes) * rows * lanes + held % lanes).astype(np.int32),
             (self.of[nearest] * far).astype(np.int32),
-            *edge_blocks(loop, self, dtype, width),
+            *(edges := edge_blocks(loop, self, dtype, far)),
+            self.smooth.astype(np.int8),
+            _follow(edges[1]).all(axis=1).astype(np.int8),
         )
 
     def spacing(self, edges: Array) -> Array:
         """Return the sums that rows of edges hold, (E,)."""
-        return edges[:, -1].reshape(-1)[: len(self.loop.meter.edges)]
+        sums = np.empty(len(self.edge_order), edges.dtype)
+        sums[self.edge_order] = edges[:, -1].reshape(-1)[: len(sums)]
+        return sums
 
 
 @final
@@ -166,7 +223,7 @@ class Formations(Places):
         """Place the agents of loops that are alike."""
         self.loops, self.loop, self.lanes = loops, loops[0], lanes
         self.groups = -(-len(loops) // lanes)
-        self.alone = Swarm(self.loop, 1)
+        self.alone, self.together, self.lines = Swarm(self.loop, 1), True, False
         # The last group is filled with copies.
         formation = np.minimum(np.arange(self.groups * lanes), len(loops) - 1)
         formation = formation.reshape(self.groups, 1, lanes)
@@ -177,7 +234,7 @@ class Formations(Places):
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other in a group: what they show stands row by row."""
         loop, lanes, of, far = self.loop, self.lanes, self.alone.of, width * self.lanes
-        starts, positions, weights = heard(loop, self.alone)
+        starts, positions, weights = self.alone.heard
         heavy = aligned((len(weights), lanes), dtype)
         heavy[:] = weights
         ends = of[np.asarray(loop.meter.edges)] * far
@@ -189,6 +246,8 @@ class Formations(Places):
             (of[np.asarray(loop.meter.nearest)[self.alone.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
+            np.zeros(1, np.int8),
+            np.zeros(1, np.int8),
         )
 
     def _edges(self, dtype: np.dtype) -> Array:
@@ -207,6 +266,11 @@ class Formations(Places):
         """Return the sums that rows of edges hold, (formations E,)."""
         each = edges[:, :, -1].transpose(0, 2, 1).reshape(self.groups * self.lanes, -1)
         return each[: len(self.loops)].reshape(-1)
+
+
+def _follow(positions: Array) -> Array:
+    """Return which of some lists of positions (..., lanes) are each one more than the last."""
+    return (np.diff(positions, axis=-1) == 1).all(axis=-1)
 
 
 def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
@@ -233,10 +297,10 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     return first, positions, np.where(there, weights[edge], 0.0)
 
 
-def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, width: int) -> tuple[Array, Array]:
+def edge_blocks(loop: Loop, places: "Swarm", dtype: np.dtype, far: int) -> tuple[Array, Array]:
     """Return the edges in blocks for the sums of how far distances are off.
 
-    Neighbours read `width` numbers of each agent.
+    What two agents show that follow each other lies `far` apart.
 
     Returns:
         Rows (blocks, q + 2, lanes): the differences of the goals, the distances that they make, and
@@ -244,13 +308,14 @@ def edge_blocks(loop: Loop, places: Places, dtype: np.dtype, width: int) -> tupl
         lanes).
     """
     meter, lanes = loop.meter, places.lanes
-    edges, q = np.asarray(meter.edges), len(meter.measured)
-    blocks, far = -(-len(edges) // lanes), stride(width, lanes)
+    edges, q = np.asarray(meter.edges)[places.edge_order], len(meter.measured)
+    blocks = -(-len(edges) // lanes)
     goals = np.asarray(meter.offsets)[:, list(meter.measured)]
     apart = np.resize(goals[edges[:, 0]] - goals[edges[:, 1]], (blocks * lanes, q))
     rows = aligned((blocks, q + 2, lanes), dtype)
     rows[:, :q] = apart.reshape(blocks, lanes, q).transpose(0, 2, 1)
-    rows[:, q] = np.resize(meter.spacings, blocks * lanes).reshape(blocks, lanes)
+    spacings = np.asarray(meter.spacings)[places.edge_order]
+    rows[:, q] = np.resize(spacings, blocks * lanes).reshape(blocks, lanes)
     ends = np.resize(places.of[edges] * far, (blocks * lanes, 2))
     pairs = ends.reshape(blocks, lanes, 2).transpose(0, 2, 1)
     return rows, np.ascontiguousarray(pairs, np.int32)

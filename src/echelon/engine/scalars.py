@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.types import Array
 from echelon.engine.loop import Loop, act_alone, what_limits_did
 from echelon.engine.own import Own
 from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes
@@ -81,6 +82,16 @@ def memory_size(law: Law) -> int:
         if not jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating):
             raise Unsupported(f"a memory of the type {jnp.asarray(leaf).dtype}")
     return sum(np.size(leaf) for leaf in leaves)
+
+
+def memories_of(law: Law, flat: Array) -> Memory:
+    """Return memories of agents from their numbers (agents, numbers)."""
+    leaves, tree = jax.tree.flatten(law.init())
+    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
+    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
+    return tree.unflatten(
+        [flat[:, a:b].reshape(len(flat), *np.shape(leaf)) for leaf, a, b in parts]
+    )
 
 
 def told_by(loop: Loop) -> int:

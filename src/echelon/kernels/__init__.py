@@ -1,5 +1,6 @@
 """Code for this machine: from a trace to scalars, to vectors, to the loops about them."""
 
+from echelon.kernels.common import shared
 from echelon.kernels.drivers import program
 from echelon.kernels.frame import SLOTS, Body, Plan, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
@@ -19,6 +20,7 @@ __all__ = [
     "lower",
     "nodes",
     "program",
+    "shared",
     "stride",
     "vectors",
 ]

@@ -11,6 +11,8 @@ next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.kernels.arms import choices
+from echelon.kernels.common import apart, shared
 from echelon.kernels.frame import (
     ADDRESSES,
     SLOTS,
@@ -25,27 +27,61 @@ from echelon.kernels.frame import (
     only_if,
     store_row,
 )
-from echelon.kernels.neighbours import exchange, measure_edges, write_mirror
+from echelon.kernels.neighbours import exchange, line, measure_edges, write_mirror
 from echelon.kernels.scalar import Node, needed
+from echelon.kernels.usual import usual, whole
 from echelon.kernels.vector_ir import Emitter, Writer, number
 
 
 def program(plan: Plan) -> str:
     """Return a kernel as text for LLVM."""
-    w = Writer(plan.bits, plan.lanes)
+    w, numbers, plan = Writer(plan.bits, plan.lanes), shared(plan), apart(plan)
     w.label("entry")
     slots = dict[str, str]()
     for place, name in enumerate(SLOTS):
         at = w.put(f"getelementptr i64, ptr %slots, i64 {place}")
         slots[name] = w.put(f"load {'ptr' if place < ADDRESSES else 'i64'}, ptr {at}")
     last = w.put(f"add i64 {slots['first_step']}, {slots['steps']}")
+    if numbers:
+        _share(w, plan, slots, numbers, last)
     with loop(w, "0", slots["groups"], []) as (group, _, _):
-        _steps(w, plan, _group(w, plan, slots, group), last)
+        _steps(w, plan, _group(w, plan, slots, group), last, len(numbers))
     w.do("ret void")
     head = "define void @run(ptr noalias %slots) #0 {"
     # 512 bits also where a processor would rather have halves: the types say what is meant.
     attributes = 'attributes #0 = { nounwind "prefer-vector-width"="512" }'
-    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, ""])
+    # A branch that is hardly ever taken.
+    seldom = '!0 = !{!"branch_weights", i32 1, i32 1000}'
+    return "\n".join([*sorted(w.declared), "", head, *w.lines, "}", "", attributes, seldom, ""])
+
+
+def _share(
+    w: Writer, plan: Plan, slots: dict[str, str], numbers: Sequence[Node], last: str
+) -> None:
+    """Write the loop over the steps that computes what all agents have in common."""
+    with loop(w, slots["first_step"], last, []) as (step, _, _):
+        passed = w.put(f"sub i64 {step}, {slots['first_step']}")
+        far = (w.put(f"mul i64 {passed}, {n}") for n in (plan.table, len(numbers)))
+        table, common = (
+            w.put(f"getelementptr {w.scalar}, ptr {slots[name]}, i64 {place}")
+            for name, place in zip(("table", "common"), far, strict=True)
+        )
+        around = Context(plan, slots, "", "", step, table, common)
+        complete = whole(numbers)
+        numbers = [complete[node] for node in numbers]
+        emitter = Emitter(w, lambda leaf: _same_for_all(w, around, *_named(leaf)))
+        emitter.emit(numbers)
+        for k, node in enumerate(numbers):
+            value = emitter.value(node, uniform=True)
+            if node.truth:
+                value = w.put(f"uitofp i1 {value} to {w.scalar}")
+            at = w.put(f"getelementptr {w.scalar}, ptr {common}, i64 {k}")
+            w.do(f"store {w.scalar} {value}, ptr {at}")
+
+
+def _named(leaf: Node) -> tuple[str, Sequence[int]]:
+    kind, *rest = leaf.value
+    return kind, rest
 
 
 def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str, str]:
@@ -64,67 +100,130 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
     return slots | own
 
 
-def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str) -> None:
+def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str, numbers: int) -> None:
     """Write all steps of a group."""
     mirrors = [("ptr", slots["mirror"]), ("ptr", slots["next_mirror"])]
     with loop(w, slots["first_step"], last, mirrors) as (step, carried, following):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
-        row = w.put(f"mul i64 {passed}, {plan.table}")
-        table = w.put(f"getelementptr {w.scalar}, ptr {slots['table']}, i64 {row}")
-        around = Context(plan, slots, carried[0], carried[1], step, table)
+        row = w.put(f"mul i64 {passed}, {numbers}")
+        common = w.put(f"getelementptr {w.scalar}, ptr {slots['common']}, i64 {row}")
+        around = Context(plan, slots, carried[0], carried[1], step, "", common)
         if plan.edges:
             measure_edges(w, around)
         with _blocks(w, around, "0") as block:
             _act(w, around, plan.first, block)
+        _meet(w, around, passed, "0")
         with loop(w, "1", slots["levels"], []) as (level, _, _):
             with _blocks(w, around, level) as block:
                 _act(w, around, plan.others, block)
+            _meet(w, around, passed, level)
         following[:] = [carried[1], carried[0]]
 
 
 @contextlib.contextmanager
 def _blocks(w: Writer, around: Context, level: str) -> Iterator[str]:
     """Write the loop over the blocks of a level."""
-    at = w.put(f"getelementptr i64, ptr {around.slots['segments']}, i64 {level}")
-    following = w.put(f"getelementptr i64, ptr {at}, i64 1")
-    start, end = (w.put(f"load i64, ptr {place}") for place in (at, following))
+    places = (
+        w.put(f"getelementptr i64, ptr {around.slots[name]}, i64 {level}")
+        for name in ("starts", "ends")
+    )
+    start, end = (w.put(f"load i64, ptr {place}") for place in places)
     with loop(w, start, end, []) as (block, _, _):
         yield block
+
+
+_TURNS = 1_000
+"""That a thread waits before it leaves the processor: another may need it to come here."""
+
+
+def _meet(w: Writer, around: Context, passed: str, level: str) -> None:
+    """Write that a thread waits until all have come here."""
+    slots = around.slots
+    alone = w.put(f"icmp eq i64 {slots['threads']}, 1")
+    come, turn, here = (w.fresh(stem) for stem in ("come", "turn", "here"))
+    w.do(f"br i1 {alone}, label %{here}, label %{come}")
+    w.label(come)
+    # They come once a level and step, and none goes on before all came: a count says which it is.
+    before = w.put(f"mul i64 {passed}, {slots['levels']}")
+    number = w.put(f"add i64 {w.put(f'add i64 {before}, {level}')}, 1")
+    wanted = w.put(f"mul i64 {number}, {slots['threads']}")
+    w.put(f"atomicrmw add ptr {slots['met']}, i64 1 acq_rel")
+    turns, more = "%" + w.fresh("t"), "%" + w.fresh("t")
+    w.do(f"br label %{turn}")
+    w.label(turn)
+    rested = w.fresh("rested")
+    w.do(f"{turns} = phi i64 [ 0, %{come} ], [ {more}, %{rested} ]")
+    w.do(f"{more} = add i64 {turns}, 1")
+    seen = w.put(f"load atomic i64, ptr {slots['met']} acquire, align 8")
+    all_ = w.put(f"icmp sge i64 {seen}, {wanted}")
+    wait, rest = w.fresh("wait"), w.fresh("rest")
+    w.do(f"br i1 {all_}, label %{here}, label %{wait}")
+    w.label(wait)
+    tired = w.put(f"icmp sgt i64 {turns}, {_TURNS}")
+    w.do(f"br i1 {tired}, label %{rest}, label %{rested}")
+    w.label(rest)
+    w.put(f"call i32 {slots['rest']}()")
+    w.do(f"br label %{rested}")
+    w.label(rested)
+    w.do(f"br label %{turn}")
+    w.label(here)
 
 
 # ---- a body --------------------------------------------------------------------------------------
 
 
 def _act(w: Writer, around: Context, body: Body, block: str) -> None:
-    """Write what the agents of a block do."""
-    plan = around.plan
+    """Write what the agents of a block do: as it usually is, and whole where it is not."""
+    plan, all_ = around.plan, body.all()
     size = plan.rows * plan.lanes
     begin = w.put(f"mul i64 {block}, {size}")
     base = w.put(f"getelementptr {w.scalar}, ptr {around.slots['rows']}, i64 {begin}")
-    results = body.results()
-    heard = sorted(n.value[1] for n in needed(results) if n.op == "leaf" and n.value[0] == "z")
+    complete = body.become(whole(all_))
+    heard = sorted(
+        n.value[1] for n in needed(complete.results()) if n.op == "leaf" and n.value[0] == "z"
+    )
 
     def row(leaf: Node) -> str:
         return load_row(w, base, leaf.value[1], plan.lanes)
 
-    z = exchange(w, around, body, block, heard, row) if heard else {}
+    z = exchange(w, around, complete, block, heard, row) if heard else {}
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        if kind == "z":
-            return z[rest[0]]
-        if kind == "row":
-            return row(leaf)
-        if kind == "told":
-            start, row_ = around.slots["rows"], plan.tell + rest[0]
-            return _look_up(w, around, "sources", start, row_, block, plan.one_source)
-        if kind == "leader":
-            start = around.mirror
-            return _look_up(w, around, "leaders", start, rest[0], block, plan.one_leader)
-        return _same_for_all(w, around, kind, rest)
+        return z[rest[0]] if kind == "z" else _load(w, around, block, base, kind, rest)
 
+    usually = usual(all_, choices(body.results()))
+    done, otherwise = w.fresh("done"), w.fresh("otherwise")
+    if usually.levels:
+        emitter = Emitter(w, load)
+        simple = body.become(usually.nodes)
+        emitter.emit_usual(simple.results(), usually.levels, otherwise)
+        _write(w, around, simple, emitter, base, block)
+        w.do(f"br label %{done}")
+        w.label(otherwise)
     emitter = Emitter(w, load)
-    emitter.emit(results)
+    emitter.emit(complete.results())
+    _write(w, around, complete, emitter, base, block)
+    if usually.levels:
+        w.do(f"br label %{done}")
+        w.label(done)
+
+
+def _load(w: Writer, around: Context, block: str, base: str, kind: str, rest: Sequence[int]) -> str:
+    """Write the load of what a body rests on, sums over neighbours apart."""
+    plan = around.plan
+    if kind == "row":
+        return load_row(w, base, rest[0], plan.lanes)
+    if kind == "told":
+        start, row = around.slots["rows"], plan.tell + rest[0]
+        return _look_up(w, around, "sources", start, row, block, plan.one_source)
+    if kind == "leader":
+        return _look_up(w, around, "leaders", around.mirror, rest[0], block, plan.one_leader)
+    return _same_for_all(w, around, kind, rest)
+
+
+def _write(w: Writer, around: Context, body: Body, emitter: Emitter, base: str, block: str) -> None:
+    """Write what a body leaves: in the rows of its block, and for its neighbours."""
     _write_rows(w, around, body, emitter, base)
     write_mirror(w, around, [emitter.value(node) for node in body.mirror], block)
 
@@ -139,6 +238,8 @@ def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: 
             store_row(w, base, row, lanes, emitter.value(node))
     for kept, op in ((body.sums, "add"), (body.greatest, "max"), (body.least, "min")):
         for row, node in kept.items():
+            if op == "add" and node.op == "constant" and node.value == 0.0:
+                continue
             both = [load_row(w, base, row, lanes), emitter.value(node)]
             store_row(w, base, row, lanes, w.operation(op, both, False, False))
 
@@ -148,8 +249,9 @@ def _same_for_all(w: Writer, around: Context, kind: str, rest: Sequence[int]) ->
     if kind == "steady":
         late = w.put(f"icmp sge i64 {around.step}, {around.slots['first_steady']}")
         return w.put(f"uitofp i1 {late} to {w.scalar}")
-    if kind == "table":
-        at = w.put(f"getelementptr {w.scalar}, ptr {around.table}, i64 {rest[0]}")
+    if kind in ("table", "common"):
+        start = around.table if kind == "table" else around.common
+        at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {rest[0]}")
         return w.put(f"load {w.scalar}, ptr {at}")
     step = w.put(f"sitofp i64 {around.step} to {w.scalar}")
     if kind == "step":
@@ -165,8 +267,10 @@ def _look_up(
     places, plan = around.slots[which], around.plan
     if plan.together:
         return load_row(w, far_block(w, places, block, start), row, plan.lanes)
-    # What is told stands in rows, and what is shown agent by agent.
+    # What is told stands in rows, and what is shown agent by agent or in lines.
     offset = row * plan.lanes if which == "sources" else row
+    if plan.lines and which == "leaders":
+        start, offset = line(w, around, row), 0
     first = w.put(f"mul i64 {block}, {plan.lanes}")
     if not one:
         return gather(w, start, load_places(w, places, first), offset)

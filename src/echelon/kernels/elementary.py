@@ -59,17 +59,19 @@ def signed(x: Node, like: Node) -> Node:
 
 def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
     """Return both; the graph keeps what they share once."""
-    g, eps = x.graph, EPS[x.graph.bits]
+    g, eps, width = x.graph, EPS[x.graph.bits], 0.62  # (pi / 4)^2 is 0.617
+    # Below, nothing is taken off, and no quarter is turned.
+    far = g.make("rare", _less(g.constant(0.61), x * x))
     # Adding 1.5 2^52 leaves the whole number nearest to x / (pi / 2) in the last bits.
     magic = 1.5 * 2.0 ** (52 if g.bits == 64 else 23)
     shifted = x * (2.0 / math.pi) + magic
-    r = _reduce(x, g.make("apart", shifted, magic), PI / 2)
-    s, width = r * r, 0.62  # (pi / 4)^2 is 0.617
+    r = choose(far, _reduce(x, g.make("apart", shifted, magic), PI / 2), x)
+    s = r * r
     sine = r + r * s * polynomial(s, economized(sine_series, width, eps))
     cosine = polynomial(s, economized(cosine_series, width, eps))
     cosine = (1.0 - 0.5 * s) + s * s * cosine
     # The quarter of the circle, 0 to 3, in two bits.
-    odd, lower = g.make("bit0", shifted), g.make("bit1", shifted)
+    odd, lower = (g.make("and", far, g.make(bit, shifted)) for bit in ("bit0", "bit1"))
     left = g.make("xor", odd, lower)
     first, second = choose(odd, cosine, sine), choose(odd, sine, cosine)
     return choose(lower, -first, first), choose(left, -second, second)

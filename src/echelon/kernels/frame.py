@@ -1,7 +1,7 @@
 """What the loops of a kernel are made of: what is written of it, loops, loads and stores."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from echelon.kernels.scalar import Node
@@ -40,6 +40,30 @@ class Body(NamedTuple):
         rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
         return [*(node for row in rows for node in row.values()), *self.mirror]
 
+    def all(self) -> list[Node]:
+        """Return all that is written, and what of it is made of what neighbours read."""
+        return [*self.results(), *self.now, *self.difference]
+
+    def become(self, made: Mapping[Node, Node]) -> "Body":
+        """Return the body whose nodes have become others, where they have."""
+
+        def rows(of: dict[int, Node]) -> dict[int, Node]:
+            return {row: made.get(node, node) for row, node in of.items()}
+
+        def listed(of: Sequence[Node]) -> list[Node]:
+            return [made.get(node, node) for node in of]
+
+        return Body(
+            stores=rows(self.stores),
+            sums=rows(self.sums),
+            greatest=rows(self.greatest),
+            least=rows(self.least),
+            shown=rows(self.shown),
+            now=listed(self.now),
+            mirror=listed(self.mirror),
+            difference=listed(self.difference),
+        )
+
 
 class Plan(NamedTuple):
     """A kernel before it is code.
@@ -49,6 +73,8 @@ class Plan(NamedTuple):
         lanes: of a vector.
         together: whether a vector holds one agent of as many formations, which are all alike, and
             not as many agents of one.
+        lines: whether what neighbours read of a swarm lies row by row, since most vectors of
+            neighbours are agents that follow each other: rings, paths, grids.
         rows: of a block.
         width: numbers that neighbours read of an agent; they stand in whole vectors.
         first: the body of those that act first.
@@ -66,6 +92,7 @@ class Plan(NamedTuple):
     bits: int
     lanes: int
     together: bool
+    lines: bool
     rows: int
     width: int
     first: Body
@@ -82,7 +109,8 @@ class Plan(NamedTuple):
     @property
     def mirror(self) -> int:
         """How many numbers neighbours read of a block."""
-        return self.lanes * (self.width if self.together else stride(self.width, self.lanes))
+        in_rows = self.together or self.lines
+        return self.lanes * (self.width if in_rows else stride(self.width, self.lanes))
 
 
 SLOTS = (
@@ -98,6 +126,13 @@ SLOTS = (
     "leaders",
     "edges",
     "edge_ends",
+    "common",
+    "smooth",
+    "smooth_edges",
+    "starts",
+    "ends",
+    "met",
+    "rest",
     "first_step",
     "steps",
     "levels",
@@ -105,13 +140,21 @@ SLOTS = (
     "first_steady",
     "shown",
     "groups",
+    "line",
+    "threads",
+    "first_edge",
 )
-"""What a kernel is called with: 12 addresses and 7 whole numbers of 64 bits.
+"""What a kernel is called with: 19 addresses and 10 whole numbers of 64 bits.
 
 Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
-those of the first of some groups. A swarm is one group.
+those of the first of some groups. A swarm is one group. `common` has room for the numbers of
+`common.shared` at each step. `line` is how many numbers lie between two rows of a mirror in lines;
+`smooth` tells of each block, and `smooth_edges` of each block of edges, whether its others follow
+each other there. A thread steps the blocks of each level from `starts` to `ends`, and its blocks of
+edges, and waits for the others after each level: `met` counts how many came, and `rest` is a
+function that leaves the processor to others.
 """
-ADDRESSES = 12
+ADDRESSES = 19
 
 
 def stride(width: int, lanes: int) -> int:
@@ -128,6 +171,7 @@ class Context(NamedTuple):
     following: str
     step: str
     table: str
+    common: str
 
 
 @contextlib.contextmanager
@@ -172,6 +216,26 @@ def only_if(w: Writer, wanted: str) -> Iterator[None]:
     yield
     w.do(f"br label %{after}")
     w.label(after)
+
+
+def either(w: Writer, truths: str, place: str, makes: Callable[[bool], Sequence[str]]) -> list[str]:
+    """Write vectors in one of two ways, by entry `place` of a list of bytes."""
+    at = w.put(f"getelementptr i8, ptr {truths}, i64 {place}")
+    which = w.put(f"icmp ne i8 {w.put(f'load i8, ptr {at}')}, 0")
+    ways, after = {True: w.fresh("so"), False: w.fresh("else")}, w.fresh("both")
+    w.do(f"br i1 {which}, label %{ways[True]}, label %{ways[False]}")
+    made, ends = dict[bool, Sequence[str]](), dict[bool, str]()
+    for way, label in ways.items():
+        w.label(label)
+        made[way], ends[way] = makes(way), w.fresh("end")
+        w.do(f"br label %{ends[way]}")
+        w.label(ends[way])
+        w.do(f"br label %{after}")
+    w.label(after)
+    pairs = zip(made[True], made[False], strict=True)
+    return [
+        w.put(f"phi {w.vector} [ {a}, %{ends[True]} ], [ {b}, %{ends[False]} ]") for a, b in pairs
+    ]
 
 
 def bytes_of(w: Writer) -> int:

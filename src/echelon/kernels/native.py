@@ -45,7 +45,10 @@ def is_installed() -> bool:
     return True
 
 
-_MODEL = "jitdefault"
+_LINKED = platform.system() != "Windows"
+"""Whether code and constants are laid side by side: elsewhere they may lie anywhere in memory, and
+code that reaches only 2 GiB far, as the small model's does, would end the process."""
+_MODEL = "small" if _LINKED else "jitdefault"
 _WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256}
 
 
@@ -73,10 +76,13 @@ class Code:
         """Compile a text, or take what was compiled of it before."""
         binding = llvm()
         target = binding.Target.from_default_triple()
-        # Constants may lie anywhere in memory: code that reaches only 2 GiB far, as the small
-        # model's does, would end the process where they lie farther.
+        # By the small model a constant is an operand, and not an address to be kept first.
         self._machine = target.create_target_machine(
-            cpu=binding.get_host_cpu_name(), features=features(), opt=3, codemodel=_MODEL
+            cpu=binding.get_host_cpu_name(),
+            features=features(),
+            opt=3,
+            codemodel=_MODEL,
+            reloc="pic" if _LINKED else "default",
         )
         stored = _stored(text, binding, cache_folder)
         made = None if stored is None else _read(stored)
@@ -84,7 +90,7 @@ class Code:
             made = self._compile(binding, text)
             if stored is not None:
                 _keep(stored, made)
-        self._jit = binding.create_lljit_compiler(self._machine)
+        self._jit = binding.create_lljit_compiler(self._machine, use_jit_link=_LINKED)
         name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
         builder = binding.JITLibraryBuilder().add_object_img(made).export_symbol("run")
         self._library = builder.link(self._jit, name)

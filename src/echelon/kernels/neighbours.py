@@ -6,7 +6,10 @@ from echelon.kernels.frame import (
     Body,
     Context,
     bytes_of,
+    either,
     far_block,
+    gather,
+    load_places,
     load_row,
     loop,
     store_row,
@@ -30,46 +33,92 @@ def exchange(
     after = w.put(f"getelementptr i64, ptr {at}, i64 1")
     start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
     wanted = [body.difference[k] for k in heard]
-    if all(_is_plain(node) for node in wanted) and not plan.together:
+    agent_by_agent = not (plan.together or plan.lines)
+    if all(_is_plain(node) for node in wanted) and agent_by_agent:
         first = w.put(f"mul i64 {block}, {plan.lanes}")
         return _subtract(w, around, (start, end), first, heard)
     leaves = [n for n in needed(wanted) if n.op == "leaf"]
     own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
-    mine = Emitter(w, load)
-    mine.emit(list(own.values()))
-    zero = [(w.vector, "zeroinitializer")] * len(heard)
+    mine = _own(w, around, own, block, load)
+
+    def add_up(smooth: bool) -> list[str]:
+        return _sums(w, around, (start, end), wanted, mine, smooth)
+
+    totals = either(w, slots["smooth"], block, add_up) if plan.lines else add_up(False)
+    return dict(zip(heard, totals, strict=True))
+
+
+def _sums(
+    w: Writer,
+    around: Context,
+    slots: tuple[str, str],
+    wanted: Sequence[Node],
+    mine: dict[Node, str],
+    smooth: bool,
+) -> list[str]:
+    """Write the sums of some entries of the difference over the neighbours."""
+    plan = around.plan
+    leaves = [n for n in needed(wanted) if n.op == "leaf"]
     entries = sorted({n.value[1] for n in leaves if n.value[0] == "their"})
-    with loop(w, start, end, zero) as (slot, totals, on):
+    zero = [(w.vector, "zeroinitializer")] * len(wanted)
+    with loop(w, *slots, zero) as (slot, totals, on):
         place = w.put(f"mul i64 {slot}, {plan.lanes}")
-        theirs = _shown(w, around, "neighbours", slot, entries)
+        theirs = _shown(w, around, "neighbours", slot, entries, smooth)
 
         def entry_of(leaf: Node) -> str:
-            kind, entry = leaf.value
-            return mine.value(own[leaf]) if kind == "own" else theirs[entry]
+            return mine[leaf] if leaf.value[0] == "own" else theirs[leaf.value[1]]
 
         emitter = Emitter(w, entry_of)
         emitter.emit(wanted)
         weight = None
         if plan.weighted:
-            at = w.put(f"getelementptr {w.scalar}, ptr {slots['weights']}, i64 {place}")
+            at = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
             weight = w.put(f"load {w.vector}, ptr {at}, align {plan.lanes * bytes_of(w)}")
         for k, node in enumerate(wanted):
             value = emitter.value(node)
             if weight is not None:
                 value = w.put(f"fmul contract {w.vector} {value}, {weight}")
             on[k] = w.put(f"fadd contract {w.vector} {totals[k]}, {value}")
-    return dict(zip(heard, totals, strict=True))
+    return totals
+
+
+def _own(
+    w: Writer, around: Context, own: dict[Node, Node], block: str, load: Callable[[Node], str]
+) -> dict[Node, str]:
+    """Write what the agents of a block show themselves: leaf -> a vector."""
+    if around.plan.together:
+        begin = w.put(f"mul i64 {block}, {around.plan.mirror}")
+        start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
+        return {leaf: load_row(w, start, leaf.value[1], w.lanes) for leaf in own}
+    if around.plan.lines:
+        first = w.put(f"mul i64 {block}, {w.lanes}")
+        return {leaf: _load_at(w, line(w, around, leaf.value[1], first), 0) for leaf in own}
+    emitter = Emitter(w, load)
+    emitter.emit(list(own.values()))
+    return {leaf: emitter.value(node) for leaf, node in own.items()}
 
 
 def _shown(
-    w: Writer, around: Context, which: str, slot: str, entries: Sequence[int]
+    w: Writer, around: Context, which: str, slot: str, entries: Sequence[int], smooth: bool
 ) -> dict[int, str]:
-    """Write the load of what some agents show, whose places stand in a list: entry -> a vector."""
+    """Write the load of what some agents show, whose places stand in a list: entry -> a vector.
+
+    In lines they follow each other if they are smooth.
+    """
     if around.plan.together:
         there = far_block(w, around.slots[which], slot, around.mirror)
         return {k: load_row(w, there, k, w.lanes) for k in entries}
     first = w.put(f"mul i64 {slot}, {w.lanes}")
     at = w.put(f"getelementptr i32, ptr {around.slots[which]}, i64 {first}")
+    if around.plan.lines and smooth:
+        place = w.put(f"sext i32 {w.put(f'load i32, ptr {at}, align 4')} to i64")
+        return {
+            k: w.put(f"load {w.vector}, ptr {line(w, around, k, place)}, align {bytes_of(w)}")
+            for k in entries
+        }
+    if around.plan.lines:
+        places = load_places(w, around.slots[which], first)
+        return {k: gather(w, line(w, around, k), places, 0) for k in entries}
     others = [_their(w, around.mirror, at, lane) for lane in range(w.lanes)]
     found = dict[int, str]()
     for piece in sorted({k // w.lanes for k in entries}):
@@ -77,6 +126,13 @@ def _shown(
         rows = [_load_at(w, other, piece * w.lanes) for other in others]
         found |= enumerate(_transposed(w, rows), piece * w.lanes)
     return found
+
+
+def line(w: Writer, around: Context, row: int, place: str = "0", start: str = "") -> str:
+    """Write the address of a place in a row of a mirror in lines."""
+    far = w.put(f"mul i64 {around.slots['line']}, {row}")
+    begin = w.put(f"getelementptr {w.scalar}, ptr {start or around.mirror}, i64 {far}")
+    return w.put(f"getelementptr {w.scalar}, ptr {begin}, i64 {place}")
 
 
 def _is_plain(node: Node) -> bool:
@@ -134,6 +190,12 @@ def _load_at(w: Writer, start: str, place: int) -> str:
 def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) -> None:
     """Write what neighbours will read: of formations row by row, else agent after agent."""
     lanes, far = w.lanes, stride(len(values), w.lanes)
+    if around.plan.lines:
+        first = w.put(f"mul i64 {block}, {lanes}")
+        for k, value in enumerate(values):
+            at = line(w, around, k, first, around.following)
+            w.do(f"store {w.vector} {value}, ptr {at}, align {lanes * bytes_of(w)}")
+        return
     begin = w.put(f"mul i64 {block}, {around.plan.mirror}")
     start = w.put(f"getelementptr {w.scalar}, ptr {around.following}, i64 {begin}")
     if around.plan.together:
@@ -180,15 +242,21 @@ def measure_edges(w: Writer, around: Context) -> None:
     plan, slots = around.plan, around.slots
     axes = plan.edges
     size = (len(axes) + 2) * plan.lanes
-    with loop(w, "0", slots["edge_blocks"], []) as (block, _, _):
+    with loop(w, slots["first_edge"], slots["edge_blocks"], []) as (block, _, _):
         begin = w.put(f"mul i64 {block}, {size}")
         base = w.put(f"getelementptr {w.scalar}, ptr {slots['edges']}, i64 {begin}")
         first = w.put(f"mul i64 {block}, 2")
         second = w.put(f"add i64 {first}, 1")
-        ends = [_shown(w, around, "edge_ends", end, axes) for end in (first, second)]
+
+        def ends(smooth: bool, pair: tuple[str, str] = (first, second)) -> list[str]:
+            found = [_shown(w, around, "edge_ends", end, axes, smooth) for end in pair]
+            return [end[axis] for axis in axes for end in found]
+
+        smooth = slots["smooth_edges"]
+        found = either(w, smooth, block, ends) if plan.lines else ends(False)
         squares = "zeroinitializer"
-        for k, axis in enumerate(axes):
-            apart = w.operation("sub", [end[axis] for end in ends], False, False)
+        for k in range(len(axes)):
+            apart = w.operation("sub", found[2 * k : 2 * k + 2], False, False)
             apart = w.operation("add", [apart, load_row(w, base, k, plan.lanes)], False, False)
             square = w.operation("mul", [apart, apart], False, False)
             squares = w.operation("add", [squares, square], False, False)

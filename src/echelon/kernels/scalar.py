@@ -51,8 +51,10 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "bit1": lambda x: int(x) // 2 % 2 == 1,
     "exponent": lambda x: float(np.round(np.log2(x))),
     "mantissa": lambda x: x / 2.0 ** float(np.round(np.log2(x))),
+    # A truth that may also be taken to hold always (`usual.py`).
+    "rare": lambda a: a,
 }
-TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1"}
+TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "rare"}
 _COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
 _NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1"}
 
@@ -234,6 +236,8 @@ def _both(a: Node, b: Node) -> Node | None:
     for one, other in ((a, b), (b, a)):
         if one.op == "constant":
             return other if one.value else one
+        if one.op == "not" and one.args[0] is other:
+            return one.graph.constant(False)
     return a if a is b else None
 
 
@@ -242,6 +246,28 @@ def _either(a: Node, b: Node) -> Node | None:
         if one.op == "constant":
             return one if one.value else other
     return a if a is b else None
+
+
+def _is_square(node: Node) -> bool:
+    """Tell whether a number is a sum of squares, so that it is not below 0."""
+    if node.op == "add":
+        return all(_is_square(a) for a in node.args)
+    return node.op == "mul" and node.args[0] is node.args[1]
+
+
+def _at_most(a: Node, b: Node) -> Node | None:
+    """Return a comparison without the root of a sum of squares: the largest that has it decides."""
+    if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not _is_square(a.args[0]):
+        return None
+    kind = np.float64 if a.graph.bits == 64 else np.float32
+    wanted = kind(b.value)
+    most = wanted * wanted
+    # Rounded roots do not decrease, so that a few steps find the last one.
+    for _ in range(8):
+        most = np.nextafter(most, kind(np.inf))
+    while np.sqrt(most) > wanted:
+        most = np.nextafter(most, kind(0.0))
+    return a.graph.make("le", a.args[0], float(most))
 
 
 _SIMPLER: dict[str, Callable[..., Node | None]] = {
@@ -253,6 +279,7 @@ _SIMPLER: dict[str, Callable[..., Node | None]] = {
     "abs": lambda a: a if a.op == "abs" else None,
     "eq": lambda a, b: a.graph.make("not", a.graph.make("xor", a, b)) if a.truth else None,
     "ne": lambda a, b: a.graph.make("xor", a, b) if a.truth else None,
+    "le": _at_most,
     "not": lambda a: a.args[0] if a.op == "not" else None,
     "select": _choice,
     "and": _both,

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from typing import final
 
+from echelon.kernels.arms import Arm, arms
 from echelon.kernels.scalar import Node, needed
 
 _INSTRUCTIONS = {
@@ -39,8 +40,6 @@ _INSTRUCTIONS = {
     "or": "or {T} {0}, {1}",
     "xor": "xor {T} {0}, {1}",
 }
-_MANY = 40
-"""Operations behind a choice from which on a branch is worth its cost."""
 
 
 def number(value: float, bits: int) -> str:
@@ -225,9 +224,73 @@ class Emitter:
         self._write([n for n in nodes if n.uniform])
         self._write_with_branches([n for n in nodes if not n.uniform], results)
 
-    def uniform(self, results: Sequence[Node]) -> None:
-        """Write what of the results' operands is the same for all agents."""
-        self._write([n for n in needed(results) if n.uniform])
+    def emit_usual(
+        self, results: Sequence[Node], levels: Sequence[Sequence[Node]], otherwise: str
+    ) -> None:
+        """Write all that results rest on, and go to a label where a truth of a level holds."""
+        nodes = needed([*results, *(node for level in levels for node in level)])
+        self._write([n for n in nodes if n.uniform])
+        rest = [n for n in nodes if not n.uniform]
+        for level in levels:
+            wanted = set(needed(level))
+            rest = self._early([n for n in rest if n in wanted], rest, results)
+            self._leave(level, otherwise)
+        self._write(rest)
+
+    def _early(
+        self, wanted: Sequence[Node], rest: Sequence[Node], results: Sequence[Node]
+    ) -> list[Node]:
+        """Write what is wanted, and what then takes fewer registers than it frees; return others.
+
+        A sum over the stages of an integrator is such: it would hold all of them to the end.
+        """
+        self._write(wanted)
+        left = [n for n in rest if n not in self.values]
+        users = dict[Node, int]()
+        for node in left:
+            for a in set(node.args):
+                users[a] = users.get(a, 0) + 1
+        kept, others = set(results), list[Node]()
+        for node in left:
+            ready = node.args and all(
+                a in self.values or a.op in ("constant", "leaf") for a in node.args
+            )
+            held = {a for a in node.args if not a.uniform and a.op != "leaf" and a not in kept}
+            if ready and sum(users[a] == 1 for a in held) >= 1:
+                self._write([a for a in node.args if a.op == "leaf"])
+                self._write([node])
+                for a in set(node.args):
+                    users[a] -= 1
+            else:
+                others.append(node)
+        return [n for n in others if n not in self.values]
+
+    def _leave(self, level: Sequence[Node], otherwise: str) -> None:
+        """Write a branch that is taken where one of some truths holds in any lane."""
+        w, truths = self.writer, self.writer.kind(True, False)
+        name = f"llvm.vector.reduce.or.v{w.lanes}i1"
+        w.declare("i1", name, truths)
+        found = list[str]()
+        bounds = dict[float, str]()
+        for node in level:
+            if node.op == "lt" and node.args[0].op == "constant":
+                value, x = node.args[0].value, self.value(node.args[1])
+                if value in bounds:
+                    more = w.put(f"fcmp ogt {w.vector} {x}, {bounds[value]}")
+                    x = w.put(f"select {truths} {more}, {w.vector} {x}, {w.vector} {bounds[value]}")
+                bounds[value] = x
+            else:
+                found.append(self.value(node))
+        for value, x in bounds.items():
+            bound = f"splat ({w.scalar} {number(value, w.bits)})"
+            # Of what is no number as well: the other code looks at it lane by lane.
+            found.append(w.put(f"fcmp ugt {w.vector} {x}, {bound}"))
+        one = found[0]
+        for other in found[1:]:
+            one = w.put(f"or {truths} {one}, {other}")
+        some, after = w.put(f"call i1 @{name}({truths} {one})"), w.fresh("usual")
+        w.do(f"br i1 {some}, label %{otherwise}, label %{after}, !prof !0")
+        w.label(after)
 
     def value(self, node: Node, uniform: bool = False) -> str:
         """Return the operand that a node is, for scalars or for vectors."""
@@ -263,7 +326,7 @@ class Emitter:
 
     def _write_with_branches(self, nodes: list[Node], results: Sequence[Node]) -> None:
         """Write nodes in order; those that one side of a choice alone needs, behind a branch."""
-        behind = _arms(nodes, results)
+        behind = arms(nodes, results)
         owned = {node: arm for arm in behind for node in arm.nodes}
         for node in nodes:
             arm = owned.get(node)
@@ -273,7 +336,7 @@ class Emitter:
                         self._branch(other)
                 self._write([node])
 
-    def _branch(self, arm: "_Arm") -> None:
+    def _branch(self, arm: Arm) -> None:
         """Write an arm behind a branch, and what it leaves as values that hold after it."""
         w, which = self.writer, self.value(arm.which)
         truths = f"<{w.lanes} x i1>"
@@ -300,74 +363,3 @@ class Emitter:
             kind = w.kind(node.truth, False)
             held = f"[ {self.values[node]}, %{end} ], [ zeroinitializer, %{before} ]"
             self.values[node] = w.put(f"phi {kind} {held}")
-
-
-@final
-class _Arm:
-    """What only one side of the choices by one truth needs.
-
-    Attributes:
-        which: the truth.
-        side: whether the arm is taken where it holds, or where it does not.
-        nodes: of the arm, in order.
-        left: those of them that the choices read.
-        first: the first of the choices.
-    """
-
-    def __init__(
-        self, which: Node, side: bool, nodes: list[Node], left: list[Node], first: Node
-    ) -> None:
-        self.which, self.side, self.nodes, self.left, self.first = which, side, nodes, left, first
-
-
-def _arms(nodes: list[Node], results: Sequence[Node]) -> list[_Arm]:
-    """Return the arms that are worth a branch; none within another."""
-    users: dict[Node, list[Node]] = {node: [] for node in nodes}
-    for node in nodes:
-        for operand in set(node.args):
-            if operand in users:
-                users[operand].append(node)
-    outside = set(results)
-    choices: dict[tuple[Node, bool], list[Node]] = {}
-    for node in nodes:
-        if node.op == "select" and not node.args[0].uniform:
-            for side in (True, False):
-                choices.setdefault((node.args[0], side), []).append(node)
-    found, taken = list[_Arm](), set[Node]()
-    # Those of the later choices hold those of the earlier ones, and are worth more.
-    for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
-        arm = _exclusive(nodes, users, outside, which, side, selects)
-        arm = [node for node in arm if node.op != "leaf"]
-        if len(arm) >= _MANY and not taken.intersection([*arm, *selects, which]):
-            inside = set(arm)
-            left = [n for n in arm if any(u not in inside for u in users[n])]
-            found.append(_Arm(which, side, arm, left, selects[0]))
-            taken.update(arm)
-    return found
-
-
-def _exclusive(
-    nodes: list[Node],
-    users: dict[Node, list[Node]],
-    outside: set[Node],
-    which: Node,
-    side: bool,
-    selects: list[Node],
-) -> list[Node]:
-    """Return the nodes that nothing needs but one side of some choices."""
-    chosen, inside = set(selects), set[Node]()
-    for node in reversed(nodes):
-        if node in outside or node is which or not users[node]:
-            continue
-        wanted = True
-        for user in users[node]:
-            if user in inside:
-                continue
-            # The choice itself may read it at that side only, and not as its truth.
-            other = user.args[2 if side else 1] if user.op == "select" else None
-            wanted = user in chosen and node is not other and node is not user.args[0]
-            if not wanted:
-                break
-        if wanted:
-            inside.add(node)
-    return [node for node in nodes if node in inside]

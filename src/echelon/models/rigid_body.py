@@ -52,9 +52,10 @@ def check_inertia(inertia: tuple[float, float, float]) -> None:
 
 def free_spin(inertia: tuple[float, float, float], omega: Vector) -> Vector:
     """Return -J^-1 (omega x J omega), the angular acceleration without torque."""
-    # In principal axes J is diagonal, and J^-1 a division.
+    # Euler's equations: in principal axes J is diagonal, and each axis has one number of it.
     J = jnp.asarray(inertia, omega.dtype)
-    return -jnp.cross(omega, J * omega) / J
+    before, after = jnp.roll(J, 1), jnp.roll(J, -1)
+    return (after - before) / J * jnp.roll(omega, -1) * jnp.roll(omega, 1)
 
 
 def thrust_axis(zeta: Vector) -> Vector:

@@ -12,6 +12,7 @@ import numpy as np
 from echelon.core import numerics
 from echelon.core.errors import ModelError
 from echelon.core.provenance import versions
+from echelon.engine.crew import processors
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
@@ -44,7 +45,9 @@ def facts() -> dict[str, str]:
     devices = ", ".join(
         f"{device.platform}:{device.id} ({device.device_kind})" for device in jax.devices()
     )
-    return {**versions(), "devices": devices, "native code": vectors()}
+    count = processors()
+    native = f"{vectors()}; {count} thread{'s' * (count != 1)}, as many as processors"
+    return {**versions(), "devices": devices, "native code": native}
 
 
 def checks() -> Iterator[Check]:

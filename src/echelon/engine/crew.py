@@ -1,0 +1,113 @@
+"""Threads that run a kernel together: each some groups of formations, or a part of one swarm."""
+
+import ctypes
+import os
+import sys
+from collections.abc import Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import cache
+from typing import Any, final
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.engine.places import Places
+from echelon.kernels import SLOTS, Code
+
+_SHARED = 20_000
+"""Agents of a swarm from which on threads share its steps; they wait twice in each."""
+
+
+@cache
+def _rest() -> Any:
+    """Return a function of the system by which a thread leaves its processor to others."""
+    if sys.platform == "win32":
+        return ctypes.WinDLL("kernel32").SwitchToThread
+    return ctypes.CDLL(None).sched_yield
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@final
+class Crew:
+    """Runs a kernel on threads; no number depends on how many there are.
+
+    Args:
+        places: of the agents.
+        pool: threads for groups of formations; None for the caller's alone.
+        threads: for a swarm; as many as there are processors for a large one when left out.
+    """
+
+    def __init__(self, places: Places, pool: Executor | None, threads: int | None) -> None:
+        """Begin with no thread of its own."""
+        self.places, self.pool = places, pool
+        large = len(places.agents) >= _SHARED
+        self.threads = 1 if places.together else threads or (processors() if large else 1)
+        self._own = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+
+    def run(
+        self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
+    ) -> None:
+        """Run a kernel.
+
+        Args:
+            code: of the kernel.
+            values: of its slots, those apart that differ between threads.
+            firsts: arrays whose parts follow each other group by group.
+            common: room for what all agents have in common at each step.
+        """
+        if self._own is not None:
+            self._swarm(code, values, firsts, common)
+            return
+        groups = np.arange(self.places.groups)
+        segments = self.places.segments
+
+        def fly(some: Array) -> None:
+            own = {
+                name: array[len(array) // len(groups) * some[0] :] for name, array in firsts.items()
+            }
+            room = common if len(some) == len(groups) else np.empty_like(common)
+            told = {"groups": len(some), "threads": 1}
+            _call(code, values | told, own | _from(segments[:-1], segments[1:]) | {"common": room})
+
+        if self.pool is None or len(groups) < 2:
+            fly(groups)
+            return
+        # More parts than threads, since another process may take a processor from one of them.
+        list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
+
+    def _swarm(
+        self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
+    ) -> None:
+        """Let each thread take a part of each level, and of the edges."""
+        assert self._own is not None
+        segments, count, met = self.places.segments, self.threads, np.zeros(8, np.int64)
+        sizes = np.diff(segments)
+        rest = ctypes.cast(_rest(), ctypes.c_void_p).value or 0
+
+        def fly(k: int) -> None:
+            starts, ends = (segments[:-1] + sizes * part // count for part in (k, k + 1))
+            first, last = (values["edge_blocks"] * part // count for part in (k, k + 1))
+            told = {"groups": 1, "threads": count, "rest": rest}
+            told |= {"first_edge": first, "edge_blocks": last}
+            room = common if k == 0 else np.empty_like(common)
+            parts = _from(starts, ends) | {"common": room, "met": met}
+            _call(code, values | told, firsts | parts)
+
+        # A thread each, since they wait for each other.
+        list(self._own.map(fly, range(count)))
+
+
+def _from(starts: Array, ends: Array) -> dict[str, Array]:
+    return {"starts": np.ascontiguousarray(starts), "ends": np.ascontiguousarray(ends)}
+
+
+def _call(code: Code, values: dict[str, int], arrays: Mapping[str, Array]) -> None:
+    """Call a kernel; its arrays live until it returns."""
+    told = dict(values) | {name: array.ctypes.data for name, array in arrays.items()}
+    code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))

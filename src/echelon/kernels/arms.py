@@ -1,0 +1,86 @@
+"""What only one side of a choice needs: worth a branch where it is much."""
+
+from collections.abc import Sequence
+from typing import final
+
+from echelon.kernels.scalar import Node, needed
+
+_MANY = 40
+"""Operations behind a choice from which on a branch is worth its cost."""
+
+
+@final
+class Arm:
+    """What only one side of the choices by one truth needs.
+
+    Attributes:
+        which: the truth.
+        side: whether the arm is taken where it holds, or where it does not.
+        nodes: of the arm, in order.
+        left: those of them that the choices read.
+        first: the first of the choices.
+    """
+
+    def __init__(
+        self, which: Node, side: bool, nodes: list[Node], left: list[Node], first: Node
+    ) -> None:
+        self.which, self.side, self.nodes, self.left, self.first = which, side, nodes, left, first
+
+
+def choices(results: Sequence[Node]) -> list[tuple[Node, bool]]:
+    """Return the truths by which much is chosen, and at which side of them that is."""
+    nodes = [node for node in needed(results) if not node.uniform]
+    return [(arm.which, arm.side) for arm in arms(nodes, results)]
+
+
+def arms(nodes: list[Node], results: Sequence[Node]) -> list[Arm]:
+    """Return the arms that are worth a branch; none within another."""
+    users: dict[Node, list[Node]] = {node: [] for node in nodes}
+    for node in nodes:
+        for operand in set(node.args):
+            if operand in users:
+                users[operand].append(node)
+    outside = set(results)
+    choices: dict[tuple[Node, bool], list[Node]] = {}
+    for node in nodes:
+        if node.op == "select" and not node.args[0].uniform:
+            for side in (True, False):
+                choices.setdefault((node.args[0], side), []).append(node)
+    found, taken = list[Arm](), set[Node]()
+    # Those of the later choices hold those of the earlier ones, and are worth more.
+    for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
+        arm = _exclusive(nodes, users, outside, which, side, selects)
+        arm = [node for node in arm if node.op != "leaf"]
+        if len(arm) >= _MANY and not taken.intersection([*arm, *selects, which]):
+            inside = set(arm)
+            left = [n for n in arm if any(u not in inside for u in users[n])]
+            found.append(Arm(which, side, arm, left, selects[0]))
+            taken.update(arm)
+    return found
+
+
+def _exclusive(
+    nodes: list[Node],
+    users: dict[Node, list[Node]],
+    outside: set[Node],
+    which: Node,
+    side: bool,
+    selects: list[Node],
+) -> list[Node]:
+    """Return the nodes that nothing needs but one side of some choices."""
+    chosen, inside = set(selects), set[Node]()
+    for node in reversed(nodes):
+        if node in outside or node is which or not users[node]:
+            continue
+        wanted = True
+        for user in users[node]:
+            if user in inside:
+                continue
+            # The choice itself may read it at that side only, and not as its truth.
+            other = user.args[2 if side else 1] if user.op == "select" else None
+            wanted = user in chosen and node is not other and node is not user.args[0]
+            if not wanted:
+                break
+        if wanted:
+            inside.add(node)
+    return [node for node in nodes if node in inside]
