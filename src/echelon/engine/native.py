@@ -153,7 +153,7 @@ class NativeStepper(Stepper):
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
         self.mirrors = [aligned((places.blocks, plan.mirror), self.dtype) for _ in range(2)]
         self.found = places.find(plan.width, plan.rows, self.dtype)
-        self.edges = self.found.edges
+        self.edges, self.weights = self.found.edges, self.found.weights
 
     def _read(self, rows: range) -> Array:
         """Return rows of all agents, (N, rows)."""
@@ -241,16 +241,23 @@ class NativeStepper(Stepper):
         return found
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps under one draw of the wind after the other."""
+        """Take steps under one draw of the wind, and one stretch of the graph, after the other."""
         wind = self.loop.motion.wind
         while steps:
-            count = steps
+            count = min(steps, self._switch(step))
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
-                count = min(steps, hold - step % hold)
+                count = min(count, hold - step % hold)
             self._call(step, count, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
+
+    def _switch(self, step: int) -> int:
+        """Take the weights that hold at a step, and return for how many steps they do."""
+        switches = self.loop.switches
+        row, count = (0, _AGENT_STEPS) if switches is None else switches.at(step)
+        self.found = self.found._replace(weights=self.weights[row])
+        return count
 
     def _draw(self, number: int, hold: int) -> None:
         """Write what wind and noise are during a hold."""

@@ -187,10 +187,11 @@ class Panel:
         kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
         i, j = graph.edges[kept].T
         heavy, count = graph.weights[kept], graph.agents
-        A = sp.coo_array((heavy, (i, j)), shape=(count, count)).toarray()
-        L = np.diag((A + A.T).sum(axis=1)) - A - A.T
+        A = sp.coo_array((heavy, (j, i)), shape=(count, count)).toarray()
+        A = A if graph.directed else A + A.T
         rows = list(graph.followers)
-        values = np.linalg.eigvalsh(L[np.ix_(rows, rows)])
+        L = (np.diag(A.sum(axis=1)) - A)[np.ix_(rows, rows)]
+        values = np.linalg.eigvals(L) if graph.directed else np.linalg.eigvalsh(L)
         with precision("float64"):
             A, B = linearize(self.parts.model).with_inner(gain.inner)
         K = gain.R_inverse @ B.T @ gain.P
@@ -250,7 +251,8 @@ class Panel:
                 graph.edges[kept].tolist(), graph.weights[kept].tolist(), strict=True
             )
         ]
-        return {"edges": edges, "leaders": list(graph.leaders), "agents": graph.agents}
+        told = {"edges": edges, "leaders": list(graph.leaders), "agents": graph.agents}
+        return told | ({"directed": True} if graph.directed else {})
 
     def saved(self, events: Sequence[Mapping[str, Any]]) -> str:
         """Return the YAML of the scenario with what was done live, which it repeats."""

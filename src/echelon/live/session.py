@@ -203,9 +203,10 @@ class Session:
         return {name: getattr(self.panel.turned(self.knobs, name, value), name)}
 
     def _edge(self, pair: Any) -> int:
-        edges = self.swarm.parts.graph.edges.tolist()
-        for place, edge in enumerate(edges):
-            if isinstance(pair, list | tuple) and sorted(edge) == sorted(pair):
+        graph = self.swarm.parts.graph
+        for place, edge in enumerate(graph.edges.tolist()):
+            turned = [] if graph.directed else edge[::-1]
+            if isinstance(pair, list | tuple) and list(pair) in (edge, turned):
                 return place
         raise SimulationError(f"`{pair}` is no link of the graph.")
 

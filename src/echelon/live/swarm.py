@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.errors import SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 from echelon.core.words import Feedforward
@@ -99,7 +100,16 @@ class Swarm:
     """
 
     def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
-        """Prepare what the steps need."""
+        """Prepare what the steps need.
+
+        Raises:
+            SimulationError: the graph switches at times of its own.
+        """
+        if parts.graph.schedule is not None:
+            raise SimulationError(
+                "the graph has a `schedule`, and a live run has links cut by hand; use `echelon "
+                "run`, or leave the schedule out."
+            )
         world = World(parts.world.plant, parts.world.disturbance or Disturbance())
         self.many = parts.graph.agents > _MANY
         self.kind: Any = "float32" if self.many else settings.precision
@@ -140,7 +150,7 @@ class Swarm:
         """Let the loop run with the knobs so."""
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
-        weights[np.isin(self.edge, list(knobs.cut))] = 0.0
+        weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
             lambda each: (each.offsets, each.exchange.weights, each.follower.share),
             self.loop,
@@ -194,9 +204,10 @@ class Swarm:
 
 def _edges_of(heard: Exchange, graph: Graph) -> Array:
     """Return which edge each of the ways goes along on which agents hear each other."""
-    places = {tuple(sorted(pair)): k for k, pair in enumerate(graph.edges.tolist())}
-    pairs = zip(np.asarray(heard.receivers).tolist(), np.asarray(heard.senders).tolist())
-    return np.array([places[i, j] if i < j else places[j, i] for i, j in pairs])
+    places = {tuple(pair): k for k, pair in enumerate(graph.edges.tolist())}
+    # A directed edge (i, j) is heard by j, and an undirected one stands once.
+    pairs = zip(np.asarray(heard.senders).tolist(), np.asarray(heard.receivers).tolist())
+    return np.array([places[p] if p in places else places[p[::-1]] for p in pairs])
 
 
 def _inner(law: Any) -> Any:

@@ -45,10 +45,13 @@ def arrival_of(
         position: which outputs are one.
     """
     apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
-    if not position or law.feedforward is Feedforward.PARENT or apart > _SLACK:
+    known = graph.schedule is None and law.feedforward is not Feedforward.PARENT
+    if not (known and position) or apart > _SLACK:
         return None
     loop, followers = law.ready, list(graph.followers)
-    weights = _weights(graph, law.leaderward)
+    [L] = graph.stretches(law.leaderward)
+    # w = L_g^-1 1, all positive.
+    weights = spla.splu(sp.csc_array(L)).solve(np.ones(len(followers)))
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]
     times = _CELL * np.arange(_MOST + 1)
     square = np.zeros((len(followers), _MOST))
@@ -64,15 +67,6 @@ def arrival_of(
         return Arrival(0.0)
     last = int(outside[-1]) + 1
     return None if last >= _MOST else Arrival(float(times[last]))
-
-
-def _weights(graph: Graph, leaderward: bool) -> Array:
-    """Return w = L_g^-1 1 of the followers, all positive."""
-    heard, n = graph.exchange(leaderward), graph.agents
-    adjacency = sp.coo_array((heard.weights, (heard.receivers, heard.senders)), shape=(n, n))
-    rows = list(graph.followers)
-    whole = sp.csr_array(sp.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency)
-    return spla.splu(sp.csc_array(whole[rows][:, rows])).solve(np.ones(len(rows)))
 
 
 def _falling(start: float, c: float, heaviest: float, speed: float, times: Array) -> Array:

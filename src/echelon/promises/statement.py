@@ -21,6 +21,7 @@ class Hypothesis(Word):
     DECAYS = "disagreement decays"
     ALONG = "law along the leader's path"
     STEP = "step, input held"
+    SWITCHING = "graphs that take turns"
     REGION = "region of the gain"
     SET = "certified set"
     STARTS = "starts in the certified set"

@@ -37,6 +37,7 @@ class Tube(NamedTuple):
         arrival: when all are within 1 cm, if it can be told.
         who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
+        graphs: which graphs are meant, and this one, in words.
     """
 
     kind: Kind
@@ -47,6 +48,7 @@ class Tube(NamedTuple):
     arrival: Arrival | None
     who: str
     borders: tuple[dict[str, Any], ...]
+    graphs: tuple[str, str] = ("any graph in which the leader reaches everybody", "this graph")
 
     @property
     def theorem(self) -> Theorem:
@@ -62,8 +64,8 @@ class Tube(NamedTuple):
         )
         return (
             f"{self.kind.value}: from {self.who}, errors go to zero for any number of agents and "
-            "any graph in which the leader reaches everybody, where the model is exact and zeta' "
-            "is told at all times (T5); on this graph in the end at "
+            f"{self.graphs[0]}, where the model is exact and zeta' "
+            f"is told at all times (T5); on {self.graphs[1]} in the end at "
             f"{self.rate:.3g} 1/s or faster{when}."
         )
 
@@ -116,7 +118,13 @@ def tube_of(run: Stopping) -> _Found:
     arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
     far = math.inf if not borders else float(left)
     told = tuple(border.told for border in borders)
-    return _Found(Tube(kind, run.rate, gains, far, steepest, arrival, who, told), tuple(lines))
+    tube = Tube(kind, run.rate, gains, far, steepest, arrival, who, told)
+    schedule = run.parts.graph.schedule
+    if schedule is not None:
+        every = "in the end" if schedule.period is None else "in every period"
+        graphs = f"any graphs that take turns and by which the leader reaches everybody {every}"
+        tube = tube._replace(graphs=(graphs, "these"))
+    return _Found(tube, tuple(lines))
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
