@@ -153,7 +153,7 @@ class NativeStepper(Stepper):
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
         self.mirrors = [aligned((places.blocks, plan.mirror), self.dtype) for _ in range(2)]
         self.found = places.find(plan.width, plan.rows, self.dtype)
-        self.edges, self.weights = self.found.edges, self.found.weights
+        self.edges, self.heavy = self.found.edges, self.found.weights
 
     def _read(self, rows: range) -> Array:
         """Return rows of all agents, (N, rows)."""
@@ -256,7 +256,7 @@ class NativeStepper(Stepper):
         """Take the weights that hold at a step, and return for how many steps they do."""
         switches = self.loop.switches
         row, count = (0, _AGENT_STEPS) if switches is None else switches.at(step)
-        self.found = self.found._replace(weights=self.weights[row])
+        self.found = self.found._replace(weights=self.heavy[row])
         return count
 
     def _draw(self, number: int, hold: int) -> None:

@@ -48,6 +48,7 @@ class Line(Word):
     MARGINS = "margins"
     GAIN = "gain margin"
     DELAY = "delay margin"
+    SPREAD = "lambda_max by lambda_min"
     SCALING = "input scaling"
     PUSHED = "disturbance, network"
     PUSHED_MODE = "disturbance, one mode"

@@ -20,6 +20,7 @@ from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.chains import flat_output, flatten
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 from echelon.promises.statement import Hypothesis, Statement
 
 _PROOF = Kind.PROOF
@@ -238,13 +239,22 @@ def _strengths(run: Stopping) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
-    if run.law.leaderward:
-        return np.array([reach.slowest, reach.heaviest])
-    if graph.directed or graph.schedule is not None:
-        values = graph.spectrum().eigenvalues
-        return values if graph.schedule is None else values[np.abs(values) > 0.0]
+    if run.law.leaderward or graph.directed or graph.schedule is not None:
+        return agreement_modes(graph, run.law)
     # By Gershgorin none is larger than 2 d_max.
     return np.array([reach.slowest, 2.0 * reach.heaviest])
+
+
+def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
+    """Return eigenvalues lambda by which stopping points agree, zeta~' = -c lambda zeta~, (K,).
+
+    Of graphs that take turns, those of each but for 0, of who is not reached for a while.
+    """
+    values = graph.spectrum().eigenvalues
+    if law.leaderward:
+        # Triangular in the order of how far agents are from the leader.
+        values = np.unique([L.diagonal() for L in graph.stretches(True)])
+    return values[np.abs(values) > 1e-12 * np.abs(values).max()]
 
 
 def drift_reason(run: Stopping) -> Statement | None:
