@@ -21,7 +21,7 @@ from echelon.promises.stopping import agreement_modes
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
 _WIDE = 4
-"""Of lambda_max by lambda_min; beyond it the delay that is left is a small part of what could be."""
+"""Of lambda_max by lambda_min; beyond it little is left of the delay that could be borne."""
 _STIFF = 1e10
 """Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
 
@@ -29,6 +29,10 @@ _STIFF = 1e10
 def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
+    if parts.graph.schedule is not None:
+        text = "they are of one graph, and none is known for graphs that take turns"
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        return
     if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
         text = "any coupling; what delay is left depends on c and the graph alone"
         yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
@@ -89,8 +93,7 @@ def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
     shown = f"{1e3 * delays[at]:.3g} ms"
-    text = f"uniform delay of z, lost at lambda = {values[at]:.3g}; old data of neighbours alone, "
-    text += "carried on by zeta', costs no stability"
+    text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"
     yield Statement(Line.DELAY, _HOLDS, _KIND, float(delays[at]), shown, text)
     best = 0.5 * np.pi / (c * float(np.real(values).min()))
     yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
