@@ -254,8 +254,7 @@ class NativeStepper(Stepper):
 
     def _switch(self, step: int) -> int:
         """Take the weights that hold at a step, and return for how many steps they do."""
-        switches = self.loop.switches
-        row, count = (0, _AGENT_STEPS) if switches is None else switches.at(step)
+        row, count = self.loop.stretch(step)
         self.found = self.found._replace(weights=self.heavy[row])
         return count
 

@@ -58,7 +58,7 @@ def foreseen(swarm: Swarm, name: str, promise: dict[str, Any]) -> Recording:
         promise=promise,
         horizon=settings.horizon,
         dt=settings.dt,
-        attributes={"outcome": "completed", "message": ""},
+        attributes={"outcome": "completed", "message": "", "directed": int(graph.directed)},
     )
 
 

@@ -13,7 +13,13 @@ if TYPE_CHECKING:
 
 
 def ordered_outward(graph: "Graph") -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """Return what `Graph.outward` says."""
+    """Return what `Graph.outward` says.
+
+    Raises:
+        GraphError: the graph switches.
+    """
+    if graph.schedule is not None:
+        raise GraphError("the graph switches, and plans are made in one order for all times.")
     # Stable, which leaves the equally far in the order of their numbers.
     order = np.argsort(graph.depths(), kind="stable").tolist()
     known = {agent: order[:place] for place, agent in enumerate(order)}
