@@ -14,9 +14,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
-from beartype import beartype  # noqa: E402
 from hypothesis import settings  # noqa: E402
-from jaxtyping import install_import_hook  # noqa: E402
+from shapes import check_shapes  # noqa: E402
 
 # The command line's own cache is another matter, which its own tests turn on.
 os.environ["ECHELON_CACHE"] = "off"
@@ -41,14 +40,7 @@ def pytest_configure(config):
         os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)  # which JAX reads when it first runs
 
 
-def check_shapes(function):
-    """Check what is declared with a shape; a wrong type is for echelon to refuse, as for a user."""
-    hints = function.__annotations__.items()
-    function.__annotations__ = {name: hint for name, hint in hints if "jaxtyping" in repr(hint)}
-    return beartype(function)
-
-
-install_import_hook("echelon", "conftest.check_shapes")
+check_shapes()
 
 # The first example compiles, so none has a deadline.
 settings.register_profile("echelon", deadline=None, derandomize="CI" in os.environ)

@@ -161,6 +161,7 @@ def test_defaults():
             "store_every": 1,
             "precision": "float64",
             "engine": "auto",
+            "devices": 1,
         },
         "report": {"steady_window": 6.0},
         "live": (),

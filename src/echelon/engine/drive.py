@@ -133,6 +133,11 @@ class Stepper(abc.ABC):
         return None
 
     @property
+    def devices(self) -> int:
+        """Among how many devices the agents are parted."""
+        return 1
+
+    @property
     def engine(self) -> str:
         """What computes the steps."""
         return "jax"

@@ -128,7 +128,7 @@ class Laws(Drive):
             SimulationError: native code is asked for, and cannot be made.
         """
         loop, settings = assemble(problem, self.leader, self.follower), problem.settings
-        by_jax = JaxStepper(loop, problem.states)
+        by_jax = JaxStepper(loop, problem.states, devices=settings.devices)
         if not worth_native(settings, len(problem.states)):
             return by_jax
         try:
@@ -150,6 +150,8 @@ def worth_native(settings: Settings, agents: int) -> bool:
     """
     if settings.engine != "auto":
         return settings.engine == "native"
+    if settings.devices > 1:
+        return False
     long = settings.steps * agents >= _WORTH
     return long and is_installed() and jax.default_backend() == "cpu"
 

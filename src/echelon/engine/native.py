@@ -24,6 +24,8 @@ _LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some tenths of a second."""
+_AHEAD, _AT_ONCE = 64, 50_000
+"""Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
 _KEPT = 8
@@ -144,6 +146,7 @@ class NativeStepper(Stepper):
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
         self._drawn, self._left = -1, -1
+        self._ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
 
     # ---- memory ----
 
@@ -262,12 +265,17 @@ class NativeStepper(Stepper):
         """Write what wind and noise are during a hold."""
         if number == self._drawn:
             return
+        first, at = number - number % self._ahead, number % self._ahead
+        if first != self._drawn - self._drawn % self._ahead or self._drawn < 0:
+            # What is beyond the end of the run may wrap: nobody asks for it.
+            steps = ((first + np.arange(self._ahead)) * hold).astype(np.int32)
+            agents = np.arange(len(self.loop.offsets))
+            drawn = _drawn([loop.motion.wind for loop in self.loops], steps, agents)
+            self._winds = [part if part is None else np.asarray(part) for part in drawn]
         self._drawn = number
-        step, agents = jnp.asarray(number * hold, jnp.int32), jnp.arange(len(self.loop.offsets))
-        drawn = _drawn([loop.motion.wind for loop in self.loops], step, agents)
-        for rows, part in zip((self.rows.push, self.rows.noise), drawn, strict=True):
+        for rows, part in zip((self.rows.push, self.rows.noise), self._winds, strict=True):
             if part is not None:
-                self._write(rows, np.asarray(part).reshape(len(self.states), -1))
+                self._write(rows, part[at].reshape(len(self.states), -1))
 
     def _call(self, step: int, steps: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
@@ -393,8 +401,8 @@ def _memory(law: Law, flat: Array) -> Memory:
 
 
 @jax.jit
-def _drawn(winds: Sequence[Any], step: jax.Array, agents: jax.Array) -> Any:
-    """Return what each wind adds to the rates (F, N, n) and noise to the inputs at a step."""
+def _drawn(winds: Sequence[Any], steps: jax.Array, agents: jax.Array) -> Any:
+    """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
     many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
-    each = jax.vmap(lambda wind, agent: draw(wind, step, agent), (None, 0))
-    return jax.vmap(each, (0, None))(many, agents)
+    one = jax.vmap(draw, (None, None, 0))
+    return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)

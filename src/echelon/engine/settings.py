@@ -24,6 +24,8 @@ class Settings(NamedTuple):
         precision: `float64` or `float32`, whatever the flags of JAX are.
         engine: what steps agents under laws. `jax`; `native`, code for this machine's vectors; or
             `auto`, which takes that for long runs where it can.
+        devices: among how many of JAX's devices the agents are parted; more than one where JAX
+            steps them.
         steady_window: the last part of the run that counts as steady, s; a fifth when left out.
     """
 
@@ -35,6 +37,7 @@ class Settings(NamedTuple):
     seed: int = 0
     precision: Precision = "float64"
     engine: str = "auto"
+    devices: int = 1
     steady_window: float | None = None
 
     @property
@@ -84,7 +87,16 @@ class Settings(NamedTuple):
             ("engine", ENGINES),
         ):
             _check_name(name, getattr(self, name), allowed)
-        for name, least, most in (("seed", 0, 2**63 - 1), ("store_every", 1, MOST_STEPS)):
+        if self.engine == "native" and self.devices != 1:
+            raise SimulationError(
+                f"`devices` is {self.devices}, and must be 1 where `engine` is `native`, which"
+                " computes on processors, a thread each."
+            )
+        for name, least, most in (
+            ("seed", 0, 2**63 - 1),
+            ("store_every", 1, MOST_STEPS),
+            ("devices", 1, 2**31 - 1),
+        ):
             value = getattr(self, name)
             # By its type: neither a seed nor a count of list entries may be 2.0, or NaN.
             whole = isinstance(value, numbers.Integral)

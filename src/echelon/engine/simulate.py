@@ -8,7 +8,7 @@ from typing import TypeAlias, final
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import Outcome
+from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.engine.drive import Stepper, Stopped
@@ -60,10 +60,18 @@ def simulate(
     with precision("float64"):
         # Plans and solvers are made in float64, in whatever precision the run then is.
         stepper = prepared.parts.drive.stepper(prepared.problem)
+    _check_devices(settings, stepper)
     with precision(settings.precision):
         recorder = _recorder(prepared, stepper, before)
         _Flight(stepper, prepared, recorder, began).fly(progress, keep)
     return _result(prepared, recorder, stepper, Outcome.INTERRUPTED)
+
+
+def _check_devices(settings: Settings, stepper: Stepper) -> None:
+    if settings.devices != stepper.devices:
+        raise SimulationError(
+            f"`devices` is {settings.devices}, and must be 1 where a solver drives the agents."
+        )
 
 
 def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:

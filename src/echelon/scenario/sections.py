@@ -347,6 +347,9 @@ class SimulationSpec(BaseModel, **STRICT):
     engine: Annotated[str, OneOf(ENGINES)] = "auto"
     """What steps the agents: `jax`, or `native` code for this machine's vectors, which differs by
     rounding; `auto` takes that for long runs where it can."""
+    devices: Count = 1
+    """Among how many of JAX's devices the agents are parted, such as the GPUs of a host; more than
+    one where JAX steps them, and the agents a multiple of it."""
 
 
 @final
