@@ -14,10 +14,9 @@ from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm
-from echelon.engine.scalars import Rows, body_of, signals_of
+from echelon.engine.scalars import Rows, body_of, memory_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.kernels import SLOTS, Code, Plan, aligned, program
-from echelon.laws.law import Law, Memory
 from echelon.world.disturbance import draw
 
 _LANES = {64: 8, 32: 16}
@@ -358,8 +357,8 @@ class NativeStepper(Stepper):
         now: Any = [
             np.asarray(step, np.int32),
             self._read(self.rows.state),
-            _memory(loop.leader, flat[self.leaders]),
-            _memory(loop.follower, flat[self.followers]),
+            memory_of(loop.leader, flat[self.leaders]),
+            memory_of(loop.follower, flat[self.followers]),
             self._read(self.rows.cut).astype(np.int8),
         ]
         return Moment._make(now)
@@ -388,16 +387,6 @@ class NativeStepper(Stepper):
             chatter=self._read(rows.chatter)[:, 0],
         )
         return Sums(*(np.asarray(part, np.float64) for part in found))
-
-
-def _memory(law: Law, flat: Array) -> Memory:
-    """Return memories of agents from their numbers (agents, numbers)."""
-    leaves, tree = jax.tree.flatten(law.init())
-    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
-    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
-    return tree.unflatten(
-        [flat[:, a:b].reshape(len(flat), *np.shape(leaf)) for leaf, a, b in parts]
-    )
 
 
 @jax.jit

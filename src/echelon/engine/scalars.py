@@ -289,3 +289,13 @@ def _placed(rows: Rows, named: dict[str, list[Node]]) -> dict[int, Node]:
         for name, entries in named.items()
         for row, node in zip(getattr(rows, name), entries, strict=name != "memory")
     }
+
+
+def memory_of(law: Law, flat: Array) -> Memory:
+    """Return memories of agents from their numbers (agents, numbers)."""
+    leaves, tree = jax.tree.flatten(law.init())
+    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
+    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
+    return tree.unflatten(
+        [flat[:, a:b].reshape(len(flat), *np.shape(leaf)) for leaf, a, b in parts]
+    )

@@ -64,7 +64,7 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
 
 
 def _other_graph(graph: Graph) -> str:
-    """Return in what a graph is not the paper's, an undirected and static one; empty where it is."""
+    """Return in what a graph is not the paper's undirected and static one; empty where it is."""
     found = ["heard one way, along arrows by which a leader reaches everybody"] * graph.directed
     if graph.schedule is not None:
         times = ", ".join(f"{at:g}" for at in graph.schedule.starts[1:8])
