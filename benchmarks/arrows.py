@@ -11,6 +11,7 @@ Three kinds of attack, each on so many random graphs, half of them with arrows a
 """
 
 import functools
+import itertools
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -116,7 +117,8 @@ def vehicles(draw: np.random.Generator, count: int) -> Iterator[str]:
             x.append(far(draw, prepared.problem.states))
         least, up = fly(loop, jnp.asarray(rows), jnp.asarray(x))
         for low, state in zip(np.asarray(least), x, strict=True):
-            tube = tube_of(stopping_of(prepared.parts, settings, state)).tube
+            run = stopping_of(prepared.parts, settings, state)
+            tube = None if run is None else tube_of(run).tube
             slack = min(slack, low + model.gravity - tube.left if tube else np.inf)
         rose = max(rose, float(np.max(up)))
     yield f"vehicles: z'' stays {slack:.3g} m/s^2 above its bound at least (negative: a violation)"
@@ -140,8 +142,8 @@ def linear(draw: np.random.Generator, count: int) -> Iterator[str]:
         L, found = graph.grounded_laplacian().toarray(), graph.spectrum()
         network = functools.partial(_network, A, B @ B.T @ P)
         worst = max(worst, np.linalg.eigvals(network(L, 0.5 / found.low)).real.max())
-        V, whole = np.kron(np.diag(found.sums), P), network(L, 0.5 / found.proved)
-        slope = V @ whole + whole.T @ V + np.kron(np.diag(found.sums), np.eye(n))
+        V, whole = np.kron(np.diag(np.asarray(found.sums)), P), network(L, 0.5 / found.proved)
+        slope = V @ whole + whole.T @ V + np.kron(np.diag(np.asarray(found.sums)), np.eye(n))
         sums = max(sums, np.linalg.eigvalsh(slope)[-1] / np.abs(V @ whole).max())
         both = ech.Graph.switching([(0.0, edges[0]), (1.0, edges[1])], directed=True)
         if both.spectrum().low > 0.0:
@@ -159,7 +161,7 @@ def main() -> None:
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
     draw = np.random.default_rng(0)
     with precision("float64"):
-        for line in (*linear(draw, count), *vehicles(draw, count)):
+        for line in itertools.chain(linear(draw, count), vehicles(draw, count)):
             print(line, flush=True)
 
 

@@ -147,8 +147,8 @@ def _held(L: sp.csr_array, low: float) -> tuple[float, Array | None]:
     something positive: a positive definite one.
     """
     ones = np.ones(len(L.diagonal()))
-    shift: sp.csr_array = sp.csr_array(sp.diags_array(-_SHARE * low * ones))
-    shifted = sp.csc_array(L + shift)
+    shifted = sp.csc_array(L)
+    shifted.setdiag(L.diagonal() - _SHARE * low)
     with np.errstate(all="ignore"):
         solved = spla.splu(shifted)
         x, y = solved.solve(ones), solved.solve(ones, trans="T")

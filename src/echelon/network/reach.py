@@ -48,8 +48,8 @@ def _cut_off(graph: "Graph", lost: Array) -> str:
         )
     if graph.directed:
         return (
-            f"the graph leaves agents behind: {who} along its arrows, and hears none; an edge "
-            "[i, j] lets j hear i, so add one to it, or turn one round."
+            f"the graph leaves agents behind: {who} along its arrows; an edge "
+            "[i, j] lets j hear i, so add one, or turn one round."
         )
     return f"the graph is disconnected: {who}."
 

@@ -3,7 +3,6 @@
 from fractions import Fraction
 
 import numpy as np
-import scipy.linalg
 
 from echelon.core.types import Array
 from echelon.verifier import algebra, exact
@@ -29,7 +28,7 @@ def directed_spectrum(graph: SavedGraph, edges: Array) -> tuple[Array, float, fl
         return np.zeros(len(L), complex), 0.0, 0.0
     values, low = list[Array](), np.inf
     for circle in _circles(apart > 0.0):
-        values.append(scipy.linalg.eigvals(L[np.ix_(circle, circle)]))
+        values.append(np.linalg.eigvals(L[np.ix_(circle, circle)]).astype(complex))
         others = np.setdiff1d(np.arange(len(L)), circle)
         inside = apart[np.ix_(circle, circle)]
         outside = led[circle] + apart[np.ix_(circle, others)].sum(axis=1)

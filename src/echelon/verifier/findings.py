@@ -88,15 +88,15 @@ class Facts(NamedTuple):
 def facts(saved: SavedGain) -> Facts:
     """Recompute what claims rest on."""
     graph, B = saved.graph, saved.model.B
-    known = graph.edges is not None and not graph.switches
+    edges = None if graph.switches else graph.edges
     # What stands in the file, where nothing says otherwise; of graphs that take turns lambda_min is
     # none of their eigenvalues.
     low = saved.lambda_min if graph.switches else float(np.real(graph.spectrum[0]))
     values, bound = graph.spectrum, low
-    if known and graph.directed:
-        values, low, bound = directed_spectrum(graph, graph.edges)
-    elif known:
-        values, bound = algebra.spectrum(graph, graph.edges)
+    if edges is not None and graph.directed:
+        values, low, bound = directed_spectrum(graph, edges)
+    elif edges is not None:
+        values, bound = algebra.spectrum(graph, edges)
         low = float(values[0])
     closed = saved.model.A if saved.inner is None else saved.model.A - B @ saved.inner
     return Facts(
