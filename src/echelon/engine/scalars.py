@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.types import Array
 from echelon.engine.loop import Loop, act_alone, what_limits_did
 from echelon.engine.own import Own
 from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes

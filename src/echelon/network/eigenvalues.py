@@ -47,15 +47,15 @@ def symmetric_spectrum(L: sp.csr_array, grounded: Grounded) -> Spectrum:
     known = low if low > _RESOLVED * high else np.inf
     proved = least_eigenvalue_bound(grounded, _spread(L, vector), known)
     if not proved > 0.0:
-        raise _unknown(L)
+        raise _unknown(np.append(grounded.weights, grounded.held[:, 1]))
     # Where rounding may have raised it, the eigenvalue is no better known than its bound.
     eigenvalues[0] = min(eigenvalues[0], proved / _ROUNDED)
     eigenvalues.setflags(write=False)
     return Spectrum(eigenvalues, grounded.size, proved)
 
 
-def directed_spectrum(L: sp.csr_array) -> Spectrum:
-    """Return the spectrum of a directed graph, all eigenvalues.
+def directed_spectrum(L: sp.csr_array, weights: Array) -> Spectrum:
+    """Return the spectrum of a directed graph whose arrows have some weights, all eigenvalues.
 
     Followers that hear each other in circles make a block; in the order in which blocks hear each
     other L is block triangular, so that its eigenvalues are those of its blocks, and no chain of
@@ -69,7 +69,7 @@ def directed_spectrum(L: sp.csr_array) -> Spectrum:
     parts = np.split(order, np.cumsum(np.bincount(block, minlength=count))[:-1])
     alone = np.concatenate([part for part in parts if len(part) == 1] or [np.zeros(0, int)])
     found = [L.diagonal()[alone].astype(complex)]
-    found += [_of_block(L, part) for part in parts if len(part) > 1]
+    found += [_of_block(L, part, weights) for part in parts if len(part) > 1]
     values = in_order(np.concatenate(found))
     return Spectrum(values, len(values), *_held(L, float(np.real(values[0]))))
 
@@ -99,7 +99,7 @@ def in_order(values: Array, lost: float = 0.0) -> Array:
     return values
 
 
-def _of_block(L: sp.csr_array, part: Array) -> Array:
+def _of_block(L: sp.csr_array, part: Array, weights: Array) -> Array:
     """Return the eigenvalues of followers that hear each other in circles."""
     if len(part) > _LARGEST:
         raise GraphError(
@@ -114,7 +114,7 @@ def _of_block(L: sp.csr_array, part: Array) -> Array:
     least = int(np.real(values).argmin())
     low = _least(dense)
     if not low > 0.0:
-        raise _unknown(L)
+        raise _unknown(weights)
     # Real, and of no eigenvalue is the real part smaller (Perron and Frobenius).
     values[least] = low
     return values
@@ -161,9 +161,7 @@ def _held(L: sp.csr_array, low: float) -> tuple[float, Array | None]:
     return (held, w) if held > 0.0 else (0.0, None)
 
 
-def _unknown(L: sp.csr_array) -> GraphError:
-    weights = -L.data[L.data < 0.0]
-    weights = np.append(weights, L.diagonal()[L.diagonal() > 0.0])
+def _unknown(weights: Array) -> GraphError:
     return GraphError(
         f"the weights of the graph lie between {weights.min():.3g} and {weights.max():.3g}, too "
         "far apart to tell its smallest eigenvalue from 0; bring them nearer to each other."

@@ -289,7 +289,7 @@ class Graph:
             if self.schedule is not None:
                 self._spectrum = switching_spectrum(self.stretches())
             elif self.directed:
-                self._spectrum = directed_spectrum(self.grounded_laplacian())
+                self._spectrum = directed_spectrum(self.grounded_laplacian(), self.weights)
             else:
                 self._spectrum = symmetric_spectrum(self.grounded_laplacian(), self._grounded())
         return self._spectrum

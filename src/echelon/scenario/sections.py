@@ -70,7 +70,7 @@ class StretchSpec(BaseModel, **STRICT):
 
     at: Annotated[Positive, Unit("s")]
     """When they take the place of those before, s."""
-    edges: Edges
+    edges: Annotated[Edges, Unit("1")]
     """Edges `[i, j]` or `[i, j, weight]`; none where nobody hears anybody."""
 
 
