@@ -149,6 +149,7 @@ def test_defaults():
             },
             **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer", "hears")),
             "feedforward": "relay",
+            "frame": "heading",
             "trim": True,
         },
         "initial": {"spread": None, "states": None},
@@ -254,7 +255,7 @@ def test_the_table_of_laws_says_what_their_classes_say(role):
         stopping = ("roots", "rate", "coupling", "speed", "observer")
         offered = {
             "leader": ("gain", *stopping),
-            "follower": ("gain", "feedforward", "trim", *stopping, "hears"),
+            "follower": ("gain", "feedforward", "trim", "frame", *stopping, "hears"),
         }[role]
         taken = set(accepted(resolve(entry))) & {*offered}
         assert {*entry.needs, *entry.takes} == taken, name

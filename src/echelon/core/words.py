@@ -35,6 +35,13 @@ class Feedforward(Word):
     PARENT = "its parent's input of the same step"
 
 
+class Frame(Word):
+    """The axes in which a follower's gain stands."""
+
+    WORLD = "axes that stand still"
+    HEADING = "axes that turn with the heading that the leader follows, which is forwarded"
+
+
 class Hears(Word):
     """Which of its neighbours an agent under the law `stopping-point` hears."""
 

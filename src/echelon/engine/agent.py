@@ -78,7 +78,8 @@ class Agent:
 
     def _source_in(self, parts: Parts) -> int | None:
         """Return who must tell this agent something of the same step; None for nobody."""
-        if self.leads or self._loop.follower.feedforward is Feedforward.NONE:
+        silent = self._loop.follower.feedforward is Feedforward.NONE
+        if self.leads or silent and not self._loop.follower.turning:
             return None
         if self._loop.parents is not None:
             return int(self._loop.parents[self.number])
@@ -125,13 +126,7 @@ class Agent:
                 jnp.zeros(len(self._loop.model.input_names)) if told is None else jnp.asarray(told)
             )
             u, memory, signal, tells = _step(
-                self._loop,
-                self._law,
-                jnp.asarray(float(t)),
-                given,
-                heard,
-                weights[weights > 0.0],
-                sent,
+                self._loop, self.leads, jnp.asarray(float(t)), given, heard, weights, sent
             )
         self._memory = memory
         return np.asarray(u), Message(np.asarray(signal), np.asarray(tells))
@@ -173,7 +168,7 @@ def _signal(loop: Loop, law: Law, own: _Given) -> jax.Array:
 @eqx.filter_jit
 def _step(
     loop: Loop,
-    law: Law,
+    leads: bool,
     t: jax.Array,
     own: _Given,
     heard: jax.Array,
@@ -181,10 +176,11 @@ def _step(
     sent: jax.Array,
 ) -> tuple[jax.Array, Memory, jax.Array, jax.Array]:
     """Return the input, the next memory, the signal, and what is told."""
+    law = loop.leader if leads else loop.follower
     signal = _signal(loop, law, own)
     states = law.signal(loop.model, *own) is None
     apart = loop.model.difference if states else jnp.subtract
     gaps = jax.vmap(lambda theirs: apart(signal, theirs))(heard.reshape(-1, len(signal)))
     view = LocalView(t, own.x, own.offset, weights @ gaps, sent, loop.motion.dt)
-    _, got, memory, told = act_alone(loop, law, view, own.memory)
+    _, got, memory, told = act_alone(loop, law, view, own.memory, leads)
     return got, memory, signal, told

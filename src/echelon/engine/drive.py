@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import SimulationError
-from echelon.core.types import Array, State
-from echelon.core.words import Feedforward
+from echelon.core.types import Array, Scalar, State
+from echelon.core.words import Feedforward, Frame
 from echelon.engine.motion import Motion
 from echelon.engine.settings import Settings
 from echelon.engine.sums import Meter, Sums
@@ -182,6 +182,11 @@ class Drive(eqx.Module):
         return Feedforward.NONE
 
     @property
+    def frame(self) -> Frame:
+        """The axes of the followers' gain, as they are asked for."""
+        return Frame.WORLD
+
+    @property
     def reacts(self) -> bool:
         """Whether the leaders react to their neighbours."""
         return False
@@ -233,6 +238,13 @@ class Drive(eqx.Module):
         """Return P (n, n) of the paper's Lyapunov function; None where there is none."""
         return None
 
-    def drift(self, model: ControlAffine, x: State) -> State:
-        """Return a follower's xdot (n,) without disagreement and feed-forward."""
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
+        """Return the heading (rad) in whose axes the metric stands, with a leader at x.
+
+        None where it stands in those of the world.
+        """
+        return None
+
+    def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
+        """Return a follower's xdot (n,) without disagreement and feed-forward, at a heading."""
         return model.normalized_drift(x)

@@ -11,8 +11,8 @@ from echelon.core.errors import (
     SimulationError,
     check_kind,
 )
-from echelon.core.types import Array, State
-from echelon.core.words import Feedforward
+from echelon.core.types import Array, Scalar, State
+from echelon.core.words import Feedforward, Frame
 from echelon.engine.by_jax import JaxStepper
 from echelon.engine.drive import Drive, Information, Problem, Stepper
 from echelon.engine.loop import assemble
@@ -59,6 +59,12 @@ class Laws(Drive):
     def feedforward(self) -> Feedforward:
         """What the followers' law needs of others' inputs."""
         return self.follower.feedforward
+
+    @property
+    def frame(self) -> Frame:
+        """The axes of the followers' gain, as they are asked for."""
+        # Of another law one for the gain alone is made, which turns where it can.
+        return getattr(self.follower, "frame", Frame.HEADING)
 
     @property
     def reacts(self) -> bool:
@@ -117,9 +123,14 @@ class Laws(Drive):
         """Return the metric of the followers' law."""
         return self.follower.metric(model)
 
-    def drift(self, model: ControlAffine, x: State) -> State:
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
+        """Return the heading that a leader at x tells."""
+        return self.leader.heading(model, t, x) if self.follower.turning else None
+
+    def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
         """Return the drift under the followers' law."""
-        return self.follower.drift(model, x)
+        law = self.follower if heading is None else self.follower.facing(heading)
+        return law.drift(model, x)
 
     def stepper(self, problem: Problem) -> Stepper:
         """Return what steps the closed loop, by JAX or by native code.

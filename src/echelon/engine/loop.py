@@ -163,17 +163,17 @@ def control(loop: Loop, now: Moment) -> Control:
     # From the step number, since a sum of many dt would gather rounding.
     t = now.step.astype(x.dtype) * loop.motion.dt
 
-    def act(law: Law, who: Any, sent: jax.Array, memory: Memory) -> _Acted:
+    def act(law: Law, who: Any, sent: jax.Array, memory: Memory, leads: bool = False) -> _Acted:
         # One time for all; of everything else, an agent sees its own row and no other.
         def one(x: Any, offset: Any, z: Any, sent: Any, memory: Memory) -> _Acted:
             view = LocalView(t, x, offset, z, sent, loop.motion.dt)
-            return _Acted(*act_alone(loop, law, view, memory))
+            return _Acted(*act_alone(loop, law, view, memory, leads))
 
         return jax.vmap(one)(x[who], offsets[who], z[who], sent, memory)
 
     # Nobody is before a leader whose input it could be sent.
     silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
-    led = act(loop.leader, loop.leaders, silence, now.leader_memory)
+    led = act(loop.leader, loop.leaders, silence, now.leader_memory, leads=True)
     if loop.levels is None:
         sent = led.told[loop.sender]
         followed = act(loop.follower, loop.followers, sent, now.follower_memory)
@@ -215,14 +215,33 @@ def signals(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array | None:
 
 
 def act_alone(
-    loop: Loop, law: Law, view: LocalView, memory: Memory
+    loop: Loop, law: Law, view: LocalView, memory: Memory, leads: bool
 ) -> tuple[Input, Input, Memory, jax.Array]:
-    """Return what one agent wants and gets, its next memory, and what it tells its followers."""
+    """Return what one agent wants and gets, its next memory, and what it tells its followers.
+
+    What a follower is told of a heading stands behind the feed-forward, and goes on to who is told
+    by it.
+    """
+    follower, heading = loop.follower, jnp.zeros(0, view.x.dtype)
+    if loop.follower.turning:
+        view, now = _heading_told(loop, law, view, leads)
+        law, follower, heading = law.facing(now), follower.facing(now), now[None]
     wanted, memory = law.update(loop.model, view, memory)
     # After the limits: what a leader could not do its followers must not copy (theory page).
     got = loop.motion.deliver_one(wanted)
     memory = law.settle(loop.model, view, wanted, got, memory)
-    return wanted, got, memory, tell(loop, view.x, loop.model.normalized(got), memory)
+    told = tell(follower, loop.model, view.x, loop.model.normalized(got), memory)
+    return wanted, got, memory, jnp.concatenate([told, heading])
+
+
+def _heading_told(
+    loop: Loop, law: Law, view: LocalView, leads: bool
+) -> tuple[LocalView, jax.Array]:
+    """Return what an agent knows besides the heading that it leads with or is told, and that."""
+    if leads:
+        return view, law.heading(loop.model, view.t, view.x)
+    sent = view.feedforward
+    return eqx.tree_at(lambda known: known.feedforward, view, sent[:-1]), sent[-1]
 
 
 def what_limits_did(u: jax.Array, wanted: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -256,11 +275,11 @@ def _by_depth(loop: Loop, now: Moment, led: _Acted, act: Callable[..., _Acted]) 
     return jax.lax.scan(level, (told, start), jnp.asarray(loop.levels))[0][1]
 
 
-def tell(loop: Loop, x: State, v: Input, memory: Memory) -> jax.Array:
+def tell(follower: Law, model: ControlAffine, x: State, v: Input, memory: Memory) -> jax.Array:
     """Return what an agent at x with normalized input v and its next memory sends to followers."""
-    if loop.follower.feedforward is Feedforward.NONE:
+    if follower.feedforward is Feedforward.NONE:
         return jnp.zeros_like(v)
-    return loop.follower.message(loop.model, x, v, memory)
+    return follower.message(model, x, v, memory)
 
 
 def step(loop: Loop, now: Moment, acted: Control) -> Moment:

@@ -91,7 +91,7 @@ def told_by(loop: Loop) -> int:
 
     def told(x: Any, z: Any, sent: Any) -> Any:
         view = LocalView(x[0], x, x, z, sent, loop.motion.dt)
-        return act_alone(loop, loop.leader, view, loop.leader.init())[3]
+        return act_alone(loop, loop.leader, view, loop.leader.init(), leads=True)[3]
 
     return jax.eval_shape(told, *known).shape[0]
 
@@ -148,14 +148,15 @@ class _Done(NamedTuple):
     saying: Any
 
 
-def _agent(loop: Loop, law: Law) -> Callable[[_Known], _Done]:
-    """Return what an agent under a law does in a step, as a function for JAX."""
+def _agent(loop: Loop, leads: bool) -> Callable[[_Known], _Done]:
+    """Return what a leader or another agent does in a step, as a function for JAX."""
+    law = loop.leader if leads else loop.follower
     model, motion, meter = loop.model, loop.motion, loop.meter
 
     def act(known: _Known) -> _Done:
         x, offset = known.x, known.offset
         view = LocalView(known.t, x, offset, known.z, known.told, motion.dt)
-        asked, u, memory, told = act_alone(loop, law, view, known.memory)
+        asked, u, memory, told = act_alone(loop, law, view, known.memory, leads)
         limited, cut = what_limits_did(u, asked)
         read = meter.of_agent(known.step, known.steady, x, offset, known.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
@@ -201,8 +202,7 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
     known = _known(loop, graph, rows, law, leads, follows)
 
     def act(leaves: list[Any], known: _Known) -> _Done:
-        whole = own.filled(leaves)
-        return _agent(whole, whole.leader if leads else whole.follower)(known)
+        return _agent(own.filled(leaves), leads)(known)
 
     found = lower(act, graph, [own.leaves(_leaves(graph, "row", rows.own)), known])
     shapes = jax.tree.structure(_Done(*[0] * 15)._replace(memory=law.init()))

@@ -16,8 +16,9 @@ from echelon.certificates.certificate import Certificate, RegionCertificate, cer
 from echelon.core.errors import GainError, GraphError, check_kind
 from echelon.core.linear import check_definite
 from echelon.core.numerics import precision
-from echelon.core.types import Array, Input, State
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.models.check import check_model
+from echelon.models.heading import heading_index, input_turn, state_turn, turned
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -69,14 +70,41 @@ class Gain(eqx.Module):
         self.coupling, self.method, self.certificate = float(coupling), method, certificate
         self.inner = inner
 
-    def inner_loop(self, model: ControlAffine, x: State) -> Input:
-        """Return kappa(x) = -K (x - x*), the inner loop; zero without one."""
+    def inner_loop(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> Input:
+        """Return kappa(x) = -K (x - x*), the inner loop, about a heading; zero without one."""
         if self.inner is None:
             return jnp.zeros(len(model.input_names), x.dtype)
+        rest, K = jnp.asarray(model.trim[0], x.dtype), jnp.asarray(self.inner, x.dtype)
         # About the trim, where the loop gives nothing: the trim input stays the law's to add.
-        return -jnp.asarray(self.inner, x.dtype) @ model.difference(
-            x, jnp.asarray(model.trim[0], x.dtype)
-        )
+        if heading is None:
+            return -K @ model.difference(x, rest)
+        # T x* - x turned back, and the input turned forth again.
+        away = model.difference(x, turned(model, rest, heading))
+        return -input_turn(model)(K @ state_turn(model)(away, -heading), heading)
+
+    def feedback(
+        self, model: ControlAffine, x: State, error: State, heading: Scalar | None = None
+    ) -> Input:
+        """Return c R^-1 (g(x) S)'P error, a normalized input (m,), in the axes of a heading."""
+        P, R_inverse = (jnp.asarray(part, x.dtype) for part in (self.P, self.R_inverse))
+        if heading is None:
+            # From the right: vectors only, and in the precision of the states.
+            pulled = model.normalized_input_map(x).T @ (P @ error)
+            return self.coupling * (R_inverse @ pulled)
+        turn, turn_input = state_turn(model), input_turn(model)
+        weighted = turn(P @ turn(error, -heading), heading)
+        pulled = turn_input(model.normalized_input_map(x).T @ weighted, -heading)
+        return self.coupling * turn_input(R_inverse @ pulled, heading)
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell whether it is another one in the axes of another heading of the model."""
+        if model.heading is None:
+            return False
+        G, E = state_turn(model).slope, input_turn(model).slope
+        pairs = [(self.P, G, G), (self.R_inverse, E, E)]
+        pairs += [] if self.inner is None else [(self.inner, E, G)]
+        yaws = self.inner is not None and self.inner[:, heading_index(model)].any()
+        return bool(yaws) or any((left @ K != K @ right).any() for K, left, right in pairs)
 
 
 class Feedback(NamedTuple):

@@ -1,29 +1,42 @@
 """The paper's follower law, with the coupling, input weight and feed-forward that make it work."""
 
+import dataclasses
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from echelon.core.errors import LawError, did_you_mean, listing
-from echelon.core.types import Array, Input, State
-from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, Word
 from echelon.gains.gain import Gain
 from echelon.gains.strings import string_growth
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
+from echelon.models.heading import state_turn
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 
+_Word = TypeVar("_Word", bound=Word)
+
+
+def _member(key: str, kind: type[_Word], name: object) -> _Word:
+    try:
+        return kind.named(name)
+    except KeyError:
+        names = list(map(str, kind))
+        raise LawError(
+            f"`{key}` is `{name}`, allowed are {listing(names)}{did_you_mean(str(name), names)}."
+        ) from None
+
 
 def _feedforward(name: object) -> Feedforward:
-    try:
-        return Feedforward.named(name)
-    except KeyError:
-        names = list(map(str, Feedforward))
-        raise LawError(
-            f"`feedforward` is `{name}`, allowed are {listing(names)}"
-            f"{did_you_mean(str(name), names)}."
-        ) from None
+    return _member("feedforward", Feedforward, name)
+
+
+def _frame(name: object) -> Frame:
+    return _member("frame", Frame, name)
 
 
 class Consensus(Law):
@@ -40,6 +53,11 @@ class Consensus(Law):
             paper's network gives none of this.
         trim: whether the trim input u* is applied; the paper's printed law has none (literal:
             False).
+        frame: `heading`, the gain turns with the heading that the leader follows, which is
+            forwarded to everybody, where the model states one; `world`, it does not, as the paper
+            has it.
+        turning: whether it does; found by `following`.
+        told: that heading, rad; given by `facing`.
     """
 
     gain: Gain
@@ -48,6 +66,9 @@ class Consensus(Law):
         default=DEFAULT_FEEDFORWARD, static=True, converter=_feedforward
     )
     trim: bool = eqx.field(default=True, static=True)
+    frame: Frame = eqx.field(default=Frame.HEADING, static=True, converter=_frame)
+    turning: bool = eqx.field(default=False, static=True)
+    told: Scalar | None = None
 
     def __check_init__(self) -> None:
         """Refuse what is no gain."""
@@ -59,9 +80,17 @@ class Consensus(Law):
 
     @property
     def information(self) -> tuple[str, ...]:
-        """Neighbours' states, and what is fed forward."""
-        silent = self.feedforward is Feedforward.NONE
-        return ("neighbours' states", *(() if silent else (self.feedforward.value,)))
+        """Neighbours' states, what is fed forward, and the heading where the gain turns with it."""
+        sent = () if self.feedforward is Feedforward.NONE else (self.feedforward.value,)
+        return (
+            "neighbours' states",
+            *sent,
+            *(("the heading that the leader follows",) * self.turning),
+        )
+
+    def facing(self, heading: Scalar) -> "Consensus":
+        """Return the law with its gain in the axes of a heading (rad)."""
+        return eqx.tree_at(lambda law: law.told, self, heading, is_leaf=lambda part: part is None)
 
     def metric(self, model: ControlAffine) -> Array:
         """Return the gain's P."""
@@ -75,6 +104,12 @@ class Consensus(Law):
             graph.parents()
         return self
 
+    def following(self, leader: Law, model: ControlAffine) -> "Consensus":
+        """Let the gain turn if it can tell, and the leader is not known to keep its heading."""
+        turning = self.frame is Frame.HEADING and self.gain.turns(model)
+        turning = turning and not leader.keeps_heading(model)
+        return self if turning is self.turning else dataclasses.replace(self, turning=turning)
+
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
         """Tell by how much a branch amplifies, fed its parent's input or heard one way."""
         alone = graph.directed and graph.schedule is None
@@ -87,15 +122,16 @@ class Consensus(Law):
         """Return the input of one agent."""
         sent = view.feedforward
         if self.feedforward is Feedforward.RELAY_VELOCITY:
-            sent = _match_velocity(self.gain, model, view.x, sent)
-        v = sent - feedback(self.gain, model, view.x, view.disagreement)
-        return model.physical(v + self.gain.inner_loop(model, view.x), trim=self.trim), memory
+            sent = _match_velocity(self, model, view.x, sent)
+        v = sent - self.gain.feedback(model, view.x, view.disagreement, self.told)
+        v = v + self.gain.inner_loop(model, view.x, self.told)
+        return model.physical(v, trim=self.trim), memory
 
     def broadcast(self, model: ControlAffine, x: State, v: Input) -> Float[jax.Array, " k"]:
         """Return the input beyond the inner loop, v - kappa(x), or the velocity that it makes."""
         # A follower closes its own loop about its own state, and adds this; with the whole v the
         # loop would count twice wherever the two states differ.
-        beyond = v - self.gain.inner_loop(model, x)
+        beyond = v - self.gain.inner_loop(model, x, self.told)
         if self.feedforward is Feedforward.RELAY_VELOCITY:
             return model.normalized_input_map(x) @ beyond
         return beyond
@@ -103,21 +139,16 @@ class Consensus(Law):
     def drift(self, model: ControlAffine, x: State) -> State:
         """Return the drift with the inner loop closed."""
         # What Assumption 5 must hold of under this law: the loop is there without any neighbour.
-        return model.velocity(x, model.physical(self.gain.inner_loop(model, x)))
+        return model.velocity(x, model.physical(self.gain.inner_loop(model, x, self.told)))
 
 
-def _match_velocity(gain: Gain, model: ControlAffine, x: State, velocity: State) -> Input:
+def _match_velocity(law: Consensus, model: ControlAffine, x: State, velocity: State) -> Input:
     """Return the normalized input (m,) whose g(x) S v is nearest to a velocity in the metric P."""
-    G = model.normalized_input_map(x)
+    G, P = model.normalized_input_map(x), jnp.asarray(law.gain.P, x.dtype)
+    if law.told is not None:
+        turn, back = state_turn(model), -law.told
+        G, velocity = jax.vmap(turn, (1, None), 1)(G, back), turn(velocity, back)
     # Least |G v - velocity|_P: G'P G v = G'P velocity. The second sum of V' has just this P, so
     # that what no input can match pushes V least.
-    weighted = G.T @ jnp.asarray(gain.P, x.dtype)
+    weighted = G.T @ P
     return jnp.linalg.solve(weighted @ G, weighted @ velocity)
-
-
-def feedback(gain: Gain, model: ControlAffine, x: State, error: State) -> Input:
-    """Return c R^-1 (g(x) S)'P error, a normalized input (m,)."""
-    # From the right: vectors only, and in the precision of the states.
-    weighted = jnp.asarray(gain.P, x.dtype) @ error
-    pulled = model.normalized_input_map(x).T @ weighted
-    return gain.coupling * (jnp.asarray(gain.R_inverse, x.dtype) @ pulled)

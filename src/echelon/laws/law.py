@@ -15,6 +15,7 @@ from echelon.core.errors import LawError
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.gains.gain import Gain
+from echelon.models.heading import heading_index, rest_heading
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.references.guide import Guide
@@ -67,10 +68,12 @@ class Law(eqx.Module):
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
         leaderward: whether followers hear those neighbours alone that are nearer to a leader.
+        turning: whether a follower is told the heading that its leader follows.
     """
 
     feedforward = Feedforward.NONE
     leaderward = False
+    turning = False
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -110,6 +113,27 @@ class Law(eqx.Module):
             LawError: it cannot follow a leader under that law.
         """
         return self
+
+    def facing(self, heading: Scalar) -> "Law":
+        """Return a follower's law in the axes of a heading (rad), which it is told every step.
+
+        Called where `turning` is so.
+        """
+        return self
+
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar:
+        """Return how far the heading that a leader at x follows is turned from the trim's, rad.
+
+        Without a reference it is the leader's own. Asked for where the model states a heading.
+        """
+        reference = reference_of(self)
+        now = x[heading_index(model)] if reference is None else reference.heading(model, t)
+        return now - rest_heading(model)
+
+    def keeps_heading(self, model: ControlAffine) -> bool:
+        """Tell whether `heading` is known to be 0 at all times."""
+        reference = reference_of(self)
+        return reference is not None and not reference.turns(model)
 
     def init(self) -> Memory:
         """Return one agent's memory before the first step; none unless replaced."""

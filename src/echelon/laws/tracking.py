@@ -12,7 +12,6 @@ from echelon.core.errors import LawError, ReferenceError
 from echelon.core.types import Input, Scalar, State
 from echelon.gains.gain import Gain
 from echelon.gains.riccati import Riccati
-from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -33,11 +32,13 @@ class Tracking(Law):
         reference: the path to follow.
         gain: the tracking gain, used with coupling 1; the model's Riccati gain when left out.
         reaction: the followers' gain, when the leader reacts to them.
+        turns: whether the gains turn with the reference's heading; found by `prepared`.
     """
 
     reference: Guide
     gain: Gain | None = None
     reaction: Gain | None = None
+    turns: bool = eqx.field(default=False, static=True)
 
     def __check_init__(self) -> None:
         """Refuse what is no reference."""
@@ -63,7 +64,10 @@ class Tracking(Law):
                 f"`{type(model).__name__}`: its flat state and input are not finite at t = 0 s."
             )
         # A law that is complete stays itself, so that a result asks of what was asked before.
-        return self if gain is self.gain else Tracking(self.reference, gain, self.reaction)
+        turns = model.heading is not None and not self.keeps_heading(model)
+        if gain is self.gain and turns is self.turns:
+            return self
+        return Tracking(self.reference, gain, self.reaction, turns)
 
     def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return (x_r, u_r) at time t."""
@@ -82,12 +86,13 @@ class Tracking(Law):
         if self.gain is None:
             raise LawError("`Tracking` has no gain yet; call `prepared(model, graph)` first.")
         state, u = self.target(model, view.t)
+        heading = self.heading(model, view.t, view.x) if self.turns else None
         # With several leaders each follows the reference an offset of its own away.
         error = model.difference(view.x, state + view.offset)
-        v = feedback(self.gain, model, view.x, error)
+        v = self.gain.feedback(model, view.x, error, heading)
         # Normalized inputs are added, and the trim once: it is in u already.
         if self.reaction is not None:
-            v = v + feedback(self.reaction, model, view.x, view.disagreement)
+            v = v + self.reaction.feedback(model, view.x, view.disagreement, heading)
         return u - model.physical(v, trim=False), memory
 
 

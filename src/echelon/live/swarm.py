@@ -9,7 +9,7 @@ import numpy as np
 
 from echelon.core.errors import SimulationError
 from echelon.core.numerics import precision
-from echelon.core.types import Array, Input, State
+from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
@@ -38,6 +38,11 @@ class Dimmed(Law):
     law: Law
     share: Any
     feedforward: Feedforward = eqx.field(static=True)
+    turning: bool = eqx.field(static=True)
+
+    def facing(self, heading: Scalar) -> Law:
+        """Return the law in the axes of a heading."""
+        return eqx.tree_at(lambda each: each.law, self, self.law.facing(heading))
 
     def init(self) -> Memory:
         """Return what the law begins with."""
@@ -120,7 +125,7 @@ class Swarm:
         law = loop.follower
         if panel.start.coupling is not None:
             law = eqx.tree_at(_inner, law, self._inner(panel.gain(panel.start)), is_leaf=_is_none)
-        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward)
+        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward, law.turning)
         self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.states, self.measured = problem.states, list(problem.meter.measured)

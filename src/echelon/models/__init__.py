@@ -1,5 +1,6 @@
 """Agents: the interface `ControlAffine` and the bundled members."""
 
+from echelon.models.heading import Heading
 from echelon.models.integrator import DoubleIntegrator, SingleIntegrator
 from echelon.models.linear import Linear
 from echelon.models.model import ControlAffine, Limits
@@ -14,6 +15,7 @@ from echelon.models.van_der_pol import VanDerPol
 __all__ = [
     "ControlAffine",
     "DoubleIntegrator",
+    "Heading",
     "Limits",
     "Linear",
     "Pendulum",

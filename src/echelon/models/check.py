@@ -9,6 +9,7 @@ import numpy as np
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.trace import check_function, in_short
+from echelon.models.heading import check_heading
 from echelon.models.linearization import AtTrim, at_trim
 from echelon.models.model import ControlAffine, Limits
 
@@ -42,6 +43,7 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
         x, u = _check_constants(model, name)
         _check_functions(model, name, x, u)
         _check_trim(model, name, u)
+        check_heading(model)
         _check_limit(model, name, u)
         return (*_low_precision(model, name), *_weak_actuators(model, name))
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
+from echelon.models.heading import Heading
 
 Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 Rows: TypeAlias = tuple[tuple[float, ...], ...]
@@ -156,6 +157,12 @@ class ControlAffine(eqx.Module):
 
     Where G is square and invertible, `limit` clips row by row unless it is replaced; else it must
     be.
+    """
+
+    heading: ClassVar[Heading | None] = None
+    """How the agent turns, if it is the same in every heading; None where it is not, or has none.
+
+    Gains of such a model turn with the heading that the leader follows.
     """
 
     chart: ClassVar[Mapping[str, tuple[float, float]]] = {}

@@ -14,6 +14,7 @@ import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
+from echelon.models.heading import Heading
 from echelon.models.model import (
     ControlAffine,
     FlatBound,
@@ -107,6 +108,7 @@ class Quadrotor(ControlAffine):
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
     chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the torque.
     flat_order = 4

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 
 from echelon.core.numerics import derivatives as derivatives_of
 from echelon.core.types import Input, InputMap, Output, Scalar, State
-from echelon.models.model import ControlAffine, FlatBound, FlatChains, check_positive
+from echelon.models.heading import Heading
+from echelon.models.model import ControlAffine, FlatBound, FlatChains, check_positive, wound
 from echelon.models.rigid_body import attitude_along, lift_along, thrust_axis
 
 _GROUPS = {
@@ -57,6 +58,7 @@ class QuadrotorEuler(ControlAffine):
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
     chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the input.
     flat_order = 4
@@ -89,6 +91,10 @@ class QuadrotorEuler(ControlAffine):
         """Return position and yaw."""
         return jnp.concatenate([x[:3], x[8:9]])
 
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y with the angles the shorter way round."""
+        return wound(x - y, 6, 7, 8)
+
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).
 
@@ -115,6 +121,7 @@ class QuadrotorThrust(ControlAffine):
     output_names = ("x", "y", "z", "yaw")
     position = ("x", "y", "z")
     chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
     flat_outputs = ("x", "y", "z", "yaw")
     # The path's second derivative sets the attitude, whose second derivative is the input.
     flat_order = 4
@@ -146,6 +153,10 @@ class QuadrotorThrust(ControlAffine):
     def output(self, x: State) -> Output:
         """Return position and yaw."""
         return jnp.concatenate([x[:3], x[8:9]])
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y with the angles the shorter way round."""
+        return wound(x - y, 6, 7, 8)
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, State
+from echelon.models.heading import Heading
 from echelon.models.model import ControlAffine, FlatChains, check_positive, diagonal, wound
 
 
@@ -29,6 +30,7 @@ class Unicycle(ControlAffine):
     input_units = ("m/s", "rad/s")
     position = ("x", "y")
     state_groups = {"position": ("x", "y")}
+    heading = Heading("heading", (("x", "y"),))
     flat_outputs = ("x", "y")
     flat_order = 2
     flat_chains = FlatChains((2, 2), (1, 0))
@@ -71,6 +73,7 @@ class UnicyclePoint(ControlAffine):
     input_units = ("m/s", "rad/s")
     position = ("x", "y")
     state_groups = {"position": ("x", "y")}
+    heading = Heading("heading", (("x", "y"),))
     flat_outputs = ("x", "y")
     flat_order = 2
 

@@ -15,7 +15,6 @@ from echelon.core.errors import LawError
 from echelon.core.numerics import rk4
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.gains.gain import Gain
-from echelon.laws.consensus import feedback
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.laws.tracking import tracking_gain
 from echelon.models.model import ControlAffine
@@ -144,5 +143,6 @@ class OptimalTracking(Law):
         state, u = self.target(model, view.t)
         assert self.gain is not None  # `prepared` completes it together with the plan
         error = model.difference(view.x, state + view.offset)
-        v = feedback(self.gain, model, view.x, error)
+        heading = None if model.heading is None else self.heading(model, view.t, view.x)
+        v = self.gain.feedback(model, view.x, error, heading)
         return u - model.physical(v, trim=False), memory

@@ -11,6 +11,7 @@ from echelon.engine.laws import Laws
 from echelon.promises.case import Case
 from echelon.promises.path import longest_step
 from echelon.promises.statement import Hypothesis, Statement
+from echelon.promises.turning import turning
 
 _LINEAR = Kind.LINEARIZATION
 _BENT = "the model bends at the trim, and has no modes there"
@@ -26,6 +27,7 @@ def _linear(case: Case) -> Iterator[Statement]:
     yield _coupled(case)
     yield _decaying(case)
     yield _along(case)
+    yield from turning(case)
     yield held(case)
     if case.parts.graph.schedule is not None:
         yield _taking_turns(case)

@@ -20,16 +20,17 @@ from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.laws.law import Law, LocalView, gain_of, without_certificates
+from echelon.models.heading import state_turn
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
-from echelon.promises.leaders import Leaders, own_paths
+from echelon.promises.leaders import Leaders
+from echelon.promises.route import MOMENTS, Route, Rows, route_of
 
-_MOMENTS, _STARTS = 192, 64
-"""States of the path and starts that are looked at, together one shape for the compiler."""
+_STARTS = 64
+"""Starts that are looked at, with the moments of the path one shape for the compiler."""
 _MODES = 8  # of the graph, the extreme ones among them
 _HARDEST = 8  # states with the fastest modes, which a longest step is sought with
 _TENFOLD = float(np.log(10.0))
-_SHORT = 1e-6  # s, over which a path's velocity is taken
 
 
 class Growth(NamedTuple):
@@ -139,6 +140,8 @@ class Frozen(NamedTuple):
         leader: the leader's own law there; None where it is not known.
         starts: the followers' law where agents start.
         blamed: what takes the law out of where it stabilizes, in words; empty where nothing does.
+        turns: the least and the largest rate of the heading along the path, rad/s, in whose axes
+            all slopes are; none where it does not turn, or the law does not.
     """
 
     times: Array
@@ -146,6 +149,7 @@ class Frozen(NamedTuple):
     leader: Slopes | None
     starts: Slopes
     blamed: str
+    turns: tuple[float, ...] = ()
 
     @property
     def travelled(self) -> tuple[Slopes, ...]:
@@ -181,36 +185,6 @@ def longest_step(loop: Loop, frozen: Frozen | None, settings: Settings) -> float
     return min(steps)
 
 
-class _Rows(NamedTuple):
-    """What K agents are asked with: times, their leader's states and inputs, their own states."""
-
-    times: Array
-    leaders: Array
-    inputs: Array
-    states: Array
-
-
-class _Path(NamedTuple):
-    """Moments (K,), the leader's states (K, n) then, its normalized inputs (K, m), and its trim."""
-
-    times: Array
-    states: Array
-    inputs: Array
-    trim: Array
-
-    @property
-    def rows(self) -> _Rows:
-        """What followers at the leader's own states are asked with."""
-        return _Rows(self.times, self.states, self.inputs, self.states)
-
-    def at_start(self, states: Array) -> _Rows:
-        """Return what followers in states (K, n) are asked with at the beginning."""
-        led = self.states[0] if len(self.times) else self.trim
-        sent = self.inputs[0] if len(self.times) else np.zeros(self.inputs.shape[1])
-        leaders, inputs = (np.tile(one, (len(states), 1)) for one in (led, sent))
-        return _Rows(np.zeros(len(states)), leaders, inputs, states)
-
-
 def frozen_of(
     parts: Parts, settings: Settings, loop: Loop, leaders: Leaders, states: Array
 ) -> Frozen | None:
@@ -221,15 +195,17 @@ def frozen_of(
     trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
     if not isinstance(parts.drive, Laws):
         return None
-    path = _path(parts, settings, leaders)
+    path = route_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
     few = starts[_few(starts)]
-    both = zip(path.rows, path.at_start(few), strict=True)
-    rows = _Rows._make(map(np.concatenate, both))
+    both = zip(path.rows, path.at_start(parts.model, few), strict=True)
+    rows = Rows._make(map(np.concatenate, both))
     count, all_ = len(path.times), _followers(parts, loop, rows)
     along, begun = (Slopes(*(x[part] for x in all_)) for part in (slice(count), slice(count, None)))
-    found = Frozen(path.times, along, _leader(parts.model, parts.drive.leader, along), begun, "")
+    turns = path.extreme_rates()
+    own = _leader(parts, path.own_headings(parts), along)
+    found = Frozen(path.times, along, own, begun, "", turns)
     if not count or not found.growth().lost:
         return found
     return found._replace(blamed=_blamed(parts, loop, path, found))
@@ -244,10 +220,11 @@ def frozen_at(
     """
     starts = states - parts.formation.offsets
     starts = starts[:, _few(starts[0])]
-    rows = _path(parts, settings, leaders).at_start(starts.reshape(-1, starts.shape[2]))
-    size = _MOMENTS + _STARTS
+    path = route_of(parts, settings, leaders)
+    rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
+    size = MOMENTS + _STARTS
     found = [
-        _followers(parts, loop, _Rows._make(part[k : k + size] for part in rows))
+        _followers(parts, loop, Rows._make(part[k : k + size] for part in rows))
         for k in range(0, len(rows.times), size)
     ]
     return Slopes._make(map(np.concatenate, zip(*found, strict=True)))
@@ -258,53 +235,22 @@ def _few(starts: Array) -> Array:
     return np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))
 
 
-# ---- where the leader goes ----------------------------------------------------------------------
-
-
-def _path(parts: Parts, settings: Settings, leaders: Leaders) -> _Path:
-    """Return where the leader goes: its reference, or by itself where its input rests."""
-    model, times = parts.model, np.linspace(0.0, settings.horizon, _MOMENTS)
-    trim, m = np.asarray(model.trim[0], float), len(model.input_names)
-    twice = jnp.asarray(np.concatenate([times, times + _SHORT]))
-    wanted = parts.drive.reference_states(model, twice)
-    if wanted is not None:
-        v = np.asarray(_inputs(model, wanted[:_MOMENTS], wanted[_MOMENTS:]))
-        states = np.asarray(wanted[:_MOMENTS])
-        known = np.isfinite(states).all(axis=1) & np.isfinite(v).all(axis=1)
-        return _Path(times[known], states[known], v[known], trim)
-    own = None
-    if leaders.rest and not (leaders.starts == trim).all():
-        own = own_paths(parts, settings, leaders.starts[:1])
-    if own is None:
-        return _Path(np.zeros(0), np.zeros((0, len(trim))), np.zeros((0, m)), trim)
-    frames = np.linspace(0, len(own) - 1, _MOMENTS).round().astype(int)
-    return _Path(times, own[frames, 0], np.zeros((_MOMENTS, m)), trim)
-
-
-@eqx.filter_jit
-def _inputs(model: ControlAffine, now: States, soon: States) -> jax.Array:
-    """Return the normalized inputs that take agents from states to others _SHORT later."""
-
-    def one(x: State, later: State) -> Input:
-        moved = model.difference(later, x) / _SHORT - model.normalized_drift(x)
-        return jnp.linalg.lstsq(model.normalized_input_map(x), moved)[0]
-
-    return jax.vmap(one)(now, soon)
-
-
 # ---- the laws there -----------------------------------------------------------------------------
 
 
-def _followers(parts: Parts, loop: Loop, rows: _Rows) -> Slopes:
+def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
     """Return the followers' law about each agent's state, in a few modes of the graph."""
     assert isinstance(parts.drive, Laws)
     count = len(rows.times)
-    more = _MOMENTS + _STARTS - count
+    more = MOMENTS + _STARTS - count
     # Rows of one number, so that every path and every swarm is compiled once.
     full = (np.concatenate([part, np.repeat(part[-1:], more, axis=0)]) for part in rows)
     law = without_certificates(parts.drive.follower)
-    found = _about(parts.model, law, *map(jnp.asarray, full))
+    found = _about(parts.model, law, *map(jnp.asarray, [*full][:4]))
     A, B, alone, felt = (np.asarray(part)[:count] for part in found)
+    if rows.rates.any():
+        # In axes that turn, delta turns the other way by itself.
+        A = A - rows.rates[:, None, None] * state_turn(parts.model).slope
     values = loop.closed.eigenvalues
     few = values[np.unique(np.linspace(0, len(values) - 1, _MODES).astype(int))]
     return Slopes(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
@@ -315,6 +261,8 @@ def _about(
     model: ControlAffine, law: Law, t: jax.Array, x: States, v: jax.Array, y: States
 ) -> tuple[jax.Array, ...]:
     """Return A, B, and what the law feeds back of the state and of the disagreement (K, m, n)."""
+    # Rows stand in the axes of the heading already.
+    law = law.facing(jnp.zeros((), x.dtype)) if law.turning else law
 
     def one(t: jax.Array, x: State, v: Input, y: State) -> tuple[jax.Array, ...]:
         silent, sent = law.feedforward is Feedforward.NONE, jnp.zeros_like(v)
@@ -334,26 +282,30 @@ def _about(
     return jax.vmap(one)(t, x, v, y)
 
 
-def _leader(model: ControlAffine, law: Law, along: Slopes) -> Slopes | None:
+def _leader(parts: Parts, headings: Array, along: Slopes) -> Slopes | None:
     """Return the leader's own law along its path; None where it has no gain."""
-    gain = gain_of(law)
+    assert isinstance(parts.drive, Laws)
+    model, gain = parts.model, gain_of(parts.drive.leader)
     if gain is None:
         return None
-    S = np.asarray(model.input_scale, float)
-    fed_back = gain.coupling * S @ gain.R_inverse @ S.T @ np.swapaxes(along.B, 1, 2) @ gain.P
+    S, P = np.asarray(model.input_scale, float), gain.P
+    if headings.any():
+        D = exponential(headings[:, None, None] * state_turn(model).slope)
+        P = D @ P @ np.swapaxes(D, 1, 2)
+    fed_back = gain.coupling * S @ gain.R_inverse @ S.T @ np.swapaxes(along.B, 1, 2) @ P
     return along._replace(gains=fed_back[:, None])
 
 
-def _blamed(parts: Parts, loop: Loop, path: _Path, found: Frozen) -> str:
+def _blamed(parts: Parts, loop: Loop, path: Route, found: Frozen) -> str:
     """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
     n, k = len(trim), int(np.flatnonzero(path.times == found.growth().when)[0])
     there = np.tile(path.states[k], (n, 1))
     np.fill_diagonal(there, trim)
-    back = _Rows(np.repeat(path.times[k], n), there, np.repeat(path.inputs[k : k + 1], n, 0), there)
-    slopes = _followers(parts, loop, back)
-    own = _leader(model, parts.drive.leader, slopes)
+    here = Rows(*(np.repeat(part[k : k + 1], n, axis=0) for part in path.rows))
+    slopes = _followers(parts, loop, here._replace(leaders=there, states=there))
+    own = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
     growth = slopes.growth() if own is None else np.maximum(slopes.growth(), own.growth())
     j = int(growth.argmin())
     return f"`{model.state_names[j]}` {path.states[k, j]:.3g} {model.state_units[j]}".rstrip()

@@ -34,6 +34,7 @@ from echelon.promises.region import region_of, slopes_beside, weaken
 from echelon.promises.statement import Cause, Hypothesis, Statement
 from echelon.promises.stopping import Stopping, condition_lines, drift_reason, stopping_of
 from echelon.promises.tube import Tube, tube_of
+from echelon.promises.turning import turns_in_words
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -53,6 +54,7 @@ class Promise:
         without: what acts on the agents that is left out, in words; empty without any.
         own: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         frozen: the laws away from the trim; None where they are not looked at.
+        turns: what the leader's heading may do, in words; empty where the law does not turn.
         tube: what T5 promises; None under other laws, or where it promises nothing.
         hold: the longest step that T5 allows, s; None under other laws.
     """
@@ -66,6 +68,7 @@ class Promise:
     without: str
     own: float | None
     frozen: Frozen | None
+    turns: str = ""
     tube: Tube | None = None
     hold: float | None = None
 
@@ -170,7 +173,7 @@ class Promise:
             return text + without if self.without else text
         if self.linear:
             text = "by linearization: followers that start near enough to their goals, with the "
-            text += f"leader near enough to the trim, converge to them{self.condition}"
+            text += f"leader near enough to the trim{self.turns}, converge to them{self.condition}"
             text += "; no region is proved" if region is None else ""
         else:
             text = "on a domain alone, with the slopes of all sides of the trim: the model bends "
@@ -334,6 +337,7 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         without=case.disturbed,
         own=None if leaders.rest else leaders.slowest,
         frozen=case.frozen,
+        turns=turns_in_words(case),
     )
 
 
@@ -346,5 +350,5 @@ def _anywhere(run: Stopping, case: Case) -> Promise:
     tube = None if any(line.reason for line in kept.values() if line.fails) else found.tube
     own = case.leaders.slowest
     return Promise(
-        case.loop, None, None, kept, "", "", case.disturbed, own, None, tube, run.longest_step
+        case.loop, None, None, kept, "", "", case.disturbed, own, None, "", tube, run.longest_step
     )

@@ -9,6 +9,8 @@ import dataclasses
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+
 from echelon.certificates.certificate import RegionCertificate
 from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import jacobians
@@ -17,6 +19,7 @@ from echelon.certificates.region import Pairs, contracting_region, drift_region,
 from echelon.core.errors import GainError
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.gains.gain import Gain
 from echelon.models.linearization import at_trim, linearize
@@ -143,6 +146,9 @@ def _withheld(
 
 def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tuple[str, str]:
     """Return why what is fed forward takes away what the metric could keep, and what would not."""
+    if _turns_away(parts, leaders):
+        text = f"the law turns with the leader's heading, and {found.theorem} is of axes that do "
+        return f"{text}not", "keep the leader's heading at the trim's"
     feedforward, theorem = parts.drive.feedforward, found.theorem
     # The parent of all is a leader where no agent is farther away, and what it sends is relayed.
     if feedforward is Feedforward.PARENT and parts.graph.depths().max() > 1:
@@ -158,6 +164,15 @@ def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tu
     if not leaders.agree:
         return f"{theorem} speaks of one leader, or of leaders that agree", "start them alike"
     return "", ""
+
+
+def _turns_away(parts: Parts, leaders: Leaders) -> bool:
+    """Tell whether the law may be another than in the trim's axes."""
+    if not (isinstance(parts.drive, Laws) and parts.drive.follower.turning):
+        return False
+    # A leader that rests at its trim keeps its heading.
+    trim = np.asarray(parts.model.trim[0], float)
+    return not (leaders.rest and (leaders.starts == trim).all())
 
 
 def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:

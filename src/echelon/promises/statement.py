@@ -20,6 +20,7 @@ class Hypothesis(Word):
     COUPLED = "coupling"
     DECAYS = "disagreement decays"
     ALONG = "law along the leader's path"
+    TURNING = "law turns with the heading"
     STEP = "step, input held"
     SWITCHING = "graphs that take turns"
     REGION = "region of the gain"

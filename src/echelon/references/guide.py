@@ -5,6 +5,7 @@ import abc
 import equinox as eqx
 
 from echelon.core.types import Input, Scalar, State
+from echelon.models.heading import heading_index
 from echelon.models.model import ControlAffine
 
 
@@ -14,6 +15,14 @@ class Guide(eqx.Module):
     @abc.abstractmethod
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the state (n,) and the input (m,) that follow it exactly at time t (s)."""
+
+    def heading(self, model: ControlAffine, t: Scalar) -> Scalar:
+        """Return the heading (rad) at time t of a model that states one."""
+        return self.follow(model, t)[0][heading_index(model)]
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell whether that heading may be another than the trim's at some time."""
+        return True
 
     @abc.abstractmethod
     def check(self) -> None:

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 
 from echelon.core.types import Scalar
-from echelon.references.reference import Reference, check_finite
+from echelon.references.reference import Reference, check_finite, yaw_at
 
 _Vector = tuple[float, ...]
 
 
-def _at(center: _Vector, across: jax.Array, along: jax.Array, yaw: float) -> jax.Array:
+def _at(center: _Vector, across: jax.Array, along: jax.Array, yaw: jax.Array) -> jax.Array:
     """Return the point (across, along, 0) from the center, with its yaw."""
     cx, cy, cz = center
     # Plain numbers would stack in a type of their own, and not in that of t.
@@ -23,7 +23,7 @@ class Lemniscate(Reference):
     center + (ax cos th / (1 + sin^2 th), ay sin th cos th / (1 + sin^2 th)), th = rate t + phase.
 
     The defaults are the fit of the drawn curve; center and amplitude in m, rate in rad/s, phase and
-    yaw in rad.
+    yaw in rad, yaw_rate in rad/s.
     """
 
     center: _Vector = (0.25, 0.25, 1.0)
@@ -32,6 +32,7 @@ class Lemniscate(Reference):
     rate: float = 0.646
     phase: float = 0.0
     yaw: float = 0.0
+    yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
         """Refuse what is not finite."""
@@ -42,13 +43,14 @@ class Lemniscate(Reference):
         """Return the point at time t."""
         s, c = jnp.sin(self.rate * t + self.phase), jnp.cos(self.rate * t + self.phase)
         ax, ay = self.amplitude
-        return _at(self.center, ax * c / (1.0 + s**2), ay * s * c / (1.0 + s**2), self.yaw)
+        return _at(self.center, ax * c / (1.0 + s**2), ay * s * c / (1.0 + s**2), yaw_at(self, t))
 
 
 class FigureEight(Reference):
     """center + (ax sin th, ay sin 2 th), th = rate t + phase.
 
-    Center and amplitude are in m, rate in rad/s, phase and yaw in rad.
+    Center and amplitude are in m, rate in rad/s, phase and yaw in rad, yaw_rate
+    in rad/s.
     """
 
     center: _Vector = (0.0, 0.0, 1.0)
@@ -57,6 +59,7 @@ class FigureEight(Reference):
     rate: float = 0.785398
     phase: float = 0.0
     yaw: float = 0.0
+    yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
         """Refuse what is not finite."""
@@ -67,13 +70,14 @@ class FigureEight(Reference):
         """Return the point at time t."""
         angle = self.rate * t + self.phase
         ax, ay = self.amplitude
-        return _at(self.center, ax * jnp.sin(angle), ay * jnp.sin(2.0 * angle), self.yaw)
+        return _at(self.center, ax * jnp.sin(angle), ay * jnp.sin(2.0 * angle), yaw_at(self, t))
 
 
 class Circle(Reference):
     """center + radius (cos th, sin th), th = rate t + phase.
 
-    Center and radius are in m, rate in rad/s, phase and yaw in rad.
+    Center and radius are in m, rate in rad/s, phase and yaw in rad, yaw_rate
+    in rad/s.
     """
 
     center: _Vector = (0.0, 0.0, 1.0)
@@ -81,6 +85,7 @@ class Circle(Reference):
     rate: float = 0.5
     phase: float = 0.0
     yaw: float = 0.0
+    yaw_rate: float = 0.0
 
     def __check_init__(self) -> None:
         """Refuse what is not finite."""
@@ -91,7 +96,10 @@ class Circle(Reference):
         """Return the point at time t."""
         angle = self.rate * t + self.phase
         return _at(
-            self.center, self.radius * jnp.cos(angle), self.radius * jnp.sin(angle), self.yaw
+            self.center,
+            self.radius * jnp.cos(angle),
+            self.radius * jnp.sin(angle),
+            yaw_at(self, t),
         )
 
 
@@ -102,4 +110,5 @@ def _check_periodic(reference: Lemniscate | FigureEight | Circle) -> None:
         rate=(reference.rate, None),
         phase=(reference.phase, None),
         yaw=(reference.yaw, None),
+        yaw_rate=(reference.yaw_rate, None),
     )

@@ -2,19 +2,25 @@
 
 import abc
 from collections.abc import Sequence
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import LawError, ReferenceError, check_kind, listing
+from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
+from echelon.core.kept import kept
 from echelon.core.numerics import derivatives, precision
 from echelon.core.trace import check_array, check_function, traced
 from echelon.core.types import Array, Input, Scalar, State
+from echelon.enclosure.hull import Box, value_hull
+from echelon.models.heading import heading_of, rest_heading
 from echelon.models.model import ControlAffine
 from echelon.references.guide import Guide
 
 COORDINATES = ("x", "y", "z", "yaw")
+_LONGEST = 10**9
+"""s; thirty years, for which no run goes on."""
 
 
 class Reference(Guide):
@@ -36,6 +42,16 @@ class Reference(Guide):
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
         """Return the state (n,) and the input (m,) by the model's flatness map."""
         return model.flat(self.derivatives(t, model.flat_order, model.flat_outputs))
+
+    def heading(self, model: ControlAffine, t: Scalar) -> Scalar:
+        """Return the heading (rad) at time t of a model that states one."""
+        place = _heading_place(model)
+        return super().heading(model, t) if place is None else self(t)[place]
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell it of a path whose heading is enclosed in rationals; of another it may."""
+        place = _heading_place(model)
+        return place is None or _turns(self, place, rest_heading(model))
 
     def check(self) -> None:
         """Check that (x, y, z, yaw) is returned."""
@@ -64,6 +80,27 @@ class Reference(Guide):
                 f"gives {listing(COORDINATES)}."
             )
         _check_map(model)
+
+
+def _heading_place(model: ControlAffine) -> int | None:
+    """Return which coordinate is the model's heading, so that no derivative is needed for it."""
+    name = heading_of(model).state
+    return COORDINATES.index(name) if name in COORDINATES and name in model.flat_outputs else None
+
+
+@kept
+def _turns(reference: Reference, place: int, rest: float) -> bool:
+    """Tell whether a coordinate may be another than `rest` at some time."""
+
+    def there(t: jax.Array, nothing: jax.Array) -> jax.Array:
+        return reference(t[0])[place].reshape(1, 1)
+
+    try:
+        with precision("float64"):
+            hull = value_hull(there, Box([0], [_LONGEST]), Box([0], [0]))
+    except GainError:
+        return True
+    return bool((hull.vertices != rest).any() or hull.error.any())
 
 
 def _check_map(model: ControlAffine) -> None:
@@ -133,6 +170,25 @@ def check_reference(reference: Guide) -> None:
     reference.check()
 
 
-def in_space(point: jax.Array, yaw: float) -> jax.Array:
-    """Return (x, y, z, yaw) from a point and a constant yaw."""
+class Yawing(Protocol):
+    """A path whose yaw (rad) grows at a constant rate (rad/s)."""
+
+    @property
+    def yaw(self) -> float:
+        """At time 0."""
+        ...
+
+    @property
+    def yaw_rate(self) -> float:
+        """Of its growth."""
+        ...
+
+
+def yaw_at(path: Yawing, t: Scalar) -> jax.Array:
+    """Return the yaw (rad) of a path at time t."""
+    return path.yaw + path.yaw_rate * t
+
+
+def in_space(point: jax.Array, yaw: float | jax.Array) -> jax.Array:
+    """Return (x, y, z, yaw) from a point and a yaw."""
     return jnp.append(point, jnp.asarray(yaw, point.dtype))

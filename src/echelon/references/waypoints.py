@@ -10,6 +10,8 @@ import numpy as np
 
 from echelon.core.errors import ReferenceError
 from echelon.core.types import Array, Scalar
+from echelon.models.heading import heading_of, rest_heading
+from echelon.models.model import ControlAffine
 from echelon.references.reference import Reference, check_finite, in_space, numbers_of
 
 
@@ -55,6 +57,10 @@ class Waypoints(Reference):
         for coefficient in jnp.asarray(self.coefficients, t.dtype)[:, piece]:
             value = value * s + coefficient
         return in_space(value, self.yaw)
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell whether the constant yaw is another than the trim's; a spline is not enclosed."""
+        return heading_of(model).state != "yaw" or self.yaw != rest_heading(model)
 
 
 def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Array, Array]:

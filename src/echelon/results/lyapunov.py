@@ -15,6 +15,7 @@ from echelon.core.types import Array
 from echelon.engine.drive import Drive
 from echelon.engine.motion import Motion
 from echelon.engine.result import Result
+from echelon.models.heading import state_turn
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.world.disturbance import disturbed, draw
@@ -72,9 +73,12 @@ def lyapunov(result: Result) -> Lyapunov | None:
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
         steps = jnp.asarray(np.rint(result.times / result.settings.dt).astype(np.int32))
-        fields = _fields(result.drive, _motion(result), x, u, steps)
-        f, xdot, following, f_after = (np.asarray(part) for part in fields)
-        y, later = result.states - offsets, following - offsets
+        fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
+        now, after = (
+            _seen(result.model, each, np.asarray(each.states) - offsets) for each in fields
+        )
+        y, f, xdot = now
+        later, f_after, _ = after
         difference = _difference(result.model)
         z, delta = _deviations(graph, y, difference)
         z_later, delta_later = _deviations(graph, later, difference)
@@ -132,26 +136,77 @@ def _motion(result: Result) -> Motion:
     return Motion.of(result.model, result.world, result.settings)
 
 
+class _Fields(NamedTuple):
+    """States (T, N, n), the drift under the drive and xdot there, and the headings (T,).
+
+    Beside the headings, in whose axes the metric stands, are their rates, rad/s; both are None
+    where it does not turn.
+    """
+
+    states: jax.Array
+    drift: jax.Array
+    xdot: jax.Array
+    headings: jax.Array | None
+    rates: jax.Array | None
+
+
 @eqx.filter_jit
 def _fields(
     drive: Drive,
+    model: ControlAffine,
     motion: Motion,
+    leader: int,
     x: jax.Array,
     u: jax.Array,
     steps: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Return the drift under the drive, xdot, the states a step later, and the drift there.
+) -> tuple[_Fields, _Fields]:
+    """Return the fields at states x (T, N, n) under inputs u (T, N, m) at steps (T,), and after it.
 
-    Each is (T, N, n), of states x (T, N, n) under inputs u (T, N, m) at steps (T,).
+    What moves is taken for the same a step later.
     """
 
     def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
         return disturbed(motion.plant, *draw(motion.wind, step, agent))(x, u)
 
     moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
-    drift = jax.vmap(jax.vmap(lambda x: drive.drift(motion.plant, x)))
-    later = jax.vmap(motion.advance)(x, u, steps)
-    return drift(x), moving(x, u, jnp.arange(x.shape[1]), steps), later, drift(later)
+    later, xdot = jax.vmap(motion.advance)(x, u, steps), moving(x, u, jnp.arange(x.shape[1]), steps)
+
+    def told(t: jax.Array, x: jax.Array) -> jax.Array | None:
+        return drive.heading(model, t, x)
+
+    def fields(x: jax.Array, steps: jax.Array) -> _Fields:
+        times, first = steps.astype(x.dtype) * motion.dt, x[:, leader]
+        if told(times[0], first[0]) is None:
+            drift = jax.vmap(jax.vmap(lambda x: drive.drift(motion.plant, x)))(x)
+            return _Fields(x, drift, xdot, None, None)
+        along = (jnp.ones_like(times), xdot[:, leader])
+        turn = jax.vmap(lambda *at: jax.jvp(told, at[:2], at[2:]))
+        headings, rates = turn(times, first, *along)
+        drift = jax.vmap(jax.vmap(lambda x, psi: drive.drift(motion.plant, x, psi), (0, None)))(
+            x, headings
+        )
+        return _Fields(x, drift, xdot, headings, rates)
+
+    return fields(x, steps), fields(later, steps + 1)
+
+
+def _seen(model: ControlAffine, fields: _Fields, y: Array) -> tuple[Array, Array, Array]:
+    """Return y, the drift and xdot, (T, N, n) each, in the axes in which the metric stands."""
+    f, xdot = np.asarray(fields.drift), np.asarray(fields.xdot)
+    if fields.headings is None or fields.rates is None:
+        return y, f, xdot
+    y, f, xdot = (
+        np.asarray(_turned_back(model, jnp.asarray(part), fields.headings)) for part in (y, f, xdot)
+    )
+    # What rests in the world turns the other way in axes that turn.
+    turning = np.asarray(fields.rates)[:, None, None] * (y @ state_turn(model).slope.T)
+    return y, f - turning, xdot - turning
+
+
+@eqx.filter_jit
+def _turned_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> jax.Array:
+    """Return values (T, N, n) in axes that are turned by angles (T,)."""
+    return jax.vmap(jax.vmap(state_turn(model), (0, None)))(values, -angles)
 
 
 def _disagreement(graph: Graph, values: Array, difference: _Difference) -> Array:

@@ -310,7 +310,8 @@ def _follower(
     spec = scenario.follower
     part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
     _check_keys(scenario, faults, "follower", part)
-    offers: dict[str, Any] = {"feedforward": spec.feedforward, "trim": spec.trim}
+    plain = ("feedforward", "trim", "frame")
+    offers: dict[str, Any] = {key: getattr(spec, key) for key in plain}
     offers |= _stopping(spec)
     if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
@@ -328,7 +329,7 @@ def _stopping(spec: LeaderSpec | FollowerSpec) -> dict[str, Any]:
 
 
 _STOPPING_KEYS = ("roots", "rate", "coupling", "speed", "observer", "hears")
-_LAW_KEYS = ("gain", "feedforward", "trim", *_STOPPING_KEYS)
+_LAW_KEYS = ("gain", "feedforward", "trim", "frame", *_STOPPING_KEYS)
 
 
 def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:

@@ -112,7 +112,7 @@ FOLLOWER_LAWS = {
     "consensus": Entry(
         "echelon.laws:Consensus",
         "u = u_ff - c R^-1 g(x)^T P (e + d)",
-        takes=("gain", "feedforward", "trim"),
+        takes=("gain", "feedforward", "trim", "frame"),
     ),
     "stopping-point": Entry(
         "echelon.laws:StoppingPoint",

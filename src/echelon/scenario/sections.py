@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Hears
+from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Frame, Hears
 from echelon.scenario import registry
 from echelon.scenario.values import (
     Agents,
@@ -293,6 +293,9 @@ class FollowerSpec(BaseModel, **STRICT):
     """What every follower is sent of the same step: `none`, nothing; `relay`, the leader's input;
     `relay-velocity`, the velocity that it makes; `parent`, the input of the neighbour nearer to the
     leader, on a tree."""
+    frame: Annotated[str, OneOf(map(str, Frame))] = str(Frame.HEADING)
+    """Axes of the gain, under `consensus`: `heading`, they turn with the heading that the leader
+    follows, where the model states one; `world`, they stand still, as the paper has it."""
     trim: bool = True
     """Whether the law starts from the trim input, such as a quadrotor's weight, or from zero, as
     the paper prints it."""

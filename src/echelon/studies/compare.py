@@ -237,7 +237,9 @@ def _consensus(
     gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
 ) -> DriveOf:
     """Return the drive under the consensus law with a gain, the scenario's leader kept."""
-    return lambda parts: parts.drive.with_follower(Consensus(gain(parts), feedforward, trim))
+    return lambda parts: parts.drive.with_follower(
+        Consensus(gain(parts), feedforward, trim, parts.drive.frame)
+    )
 
 
 class _Watch:

@@ -245,8 +245,9 @@ def _wish(method: str, missing: list[str], parts: Parts) -> str:
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
     """Return the parts under another gain, the feed-forward kept."""
-    law = Consensus(gain, parts.drive.feedforward, parts.drive.trimmed)
-    return parts.replace(drive=parts.drive.with_follower(law))
+    drive = parts.drive
+    law = Consensus(gain, drive.feedforward, drive.trimmed, drive.frame)
+    return parts.replace(drive=drive.with_follower(law))
 
 
 def _known(gain: Gain, parts: Parts, settings: Settings, found: Promise) -> Design:

@@ -49,6 +49,6 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
         gain = synthesize(parts.model, parts.graph, InnerLoop())
     except EchelonError:
         return
-    drive = parts.drive.with_follower(Consensus(gain, law.feedforward, law.trim))
+    drive = parts.drive.with_follower(Consensus(gain, law.feedforward, law.trim, law.frame))
     if promise(parts.replace(drive=drive), settings).promised:
         yield '"follower.gain={method: inner-loop}"'
