@@ -40,6 +40,9 @@ def opened(browser, address, width=1280, height=720, **options):
         page.goto(address)
         until(lambda: page.evaluate("!!window.echelon") or seen.faults)
         yield page
+    except AssertionError as fault:
+        fault.add_note(f"faults in the page: {seen.faults}")
+        raise
     finally:
         context.close()
     home = address.split("?")[0]

@@ -14,7 +14,7 @@ from test_figures import stored
 import echelon as ech
 from echelon.archive.export import table
 from echelon.core.errors import MissingExtraError
-from echelon.plots import video
+from echelon.plots import moving, video
 from echelon.plots.camera import camera_for
 from echelon.plots.space import space_of
 from echelon.results.recording import FORMAT, read_recording
@@ -152,7 +152,7 @@ def test_rotations_are_those_of_roll_pitch_and_yaw():
     for angles in np.random.default_rng(0).uniform(-3, 3, (5, 3)):
         roll, pitch, yaw = angles
         wanted = about(2, yaw) @ about(1, pitch) @ about(0, roll)
-        np.testing.assert_allclose(video.rotations(angles[None])[0], wanted, atol=1e-12)
+        np.testing.assert_allclose(moving.rotations(angles[None])[0], wanted, atol=1e-12)
 
 
 def test_without_ffmpeg_a_sentence_says_how_to_get_it(monkeypatch):

@@ -12,13 +12,15 @@ from browser import chromium, opened, until
 
 import echelon as ech
 from echelon.core.errors import SimulationError
+from echelon.engine import code
+from echelon.live import mover
 from echelon.live import server as served
-from echelon.live import swarm as stepped
 from echelon.live.knobs import Panel
 from echelon.live.promiser import badge_of, first_look
 from echelon.live.server import live, serve_live
 from echelon.live.session import Session
 from echelon.live.swarm import Swarm
+from echelon.results.lyapunov import lyapunov
 from echelon.scenario.build import build
 from echelon.scenario.scenario import scenario_from_mapping
 from echelon.scenario.yaml import dump_yaml, read_yaml
@@ -51,6 +53,15 @@ def swarm(panel):
     return Swarm(*panel.built, panel)
 
 
+@pytest.fixture(scope="module")
+def native(panel):
+    """The same loop by code for this machine."""
+    parts, settings = panel.built
+    made = Swarm(parts, settings._replace(engine="native"), panel)
+    assert (made.engine, Swarm(parts, settings, panel).engine) == ("native", "jax")
+    return made
+
+
 @pytest.fixture
 def session(panel, swarm):
     swarm.turn(panel.start)
@@ -69,9 +80,12 @@ def flown(swarm, pictures=10):
 # ---- the loop ---------------------------------------------------------------------------------
 
 
-def test_a_live_loop_is_the_loop_of_a_run(panel, swarm):
-    swarm.turn(panel.start)
-    np.testing.assert_allclose(flown(swarm), ech.run(panel.scenario).states[1:], atol=1e-12)
+def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
+    whole = ech.run(panel.scenario)
+    for each in (swarm, native):
+        each.turn(panel.start)
+        np.testing.assert_allclose(flown(each), whole.states[1:], atol=1e-12)
+    assert swarm.advance(still=True).lyapunov == pytest.approx(lyapunov(whole).value[-1], rel=1e-9)
 
 
 @pytest.mark.slow
@@ -83,7 +97,7 @@ def test_a_law_that_remembers_and_signals_is_live_too():
     # Pictures are 8 steps apart, stored frames 10.
     np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
     np.testing.assert_allclose(shown[9], wanted[8], atol=1e-9)
-    assert "coupling" not in found.ranges
+    assert found.start.coupling == pytest.approx(ech.run(own).drive.follower.strength(0.005))
 
 
 KNOBS = {
@@ -94,31 +108,58 @@ KNOBS = {
     "wind": {"wind": 1.5},
     "cut": {"cut": frozenset({3})},
     "method": {"method": "inner-loop", "coupling": 1.0},
+    "shape": {"shape": "wedge"},
 }
 
 
 @pytest.mark.parametrize("name", KNOBS)
-def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, name):
+def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, native, name):
     """The scenario that `standing` writes is run by the engine from the live loop's start."""
     knobs = panel.start._replace(**KNOBS[name])
     parts, settings = build(panel.standing(knobs))
     wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
-    swarm.turn(knobs)
-    np.testing.assert_allclose(flown(swarm), wanted.states[1:], atol=1e-11)
+    for each in (swarm, native):
+        each.turn(knobs)
+        np.testing.assert_allclose(flown(each), wanted.states[1:], atol=1e-11)
+    V = swarm.advance(still=True).lyapunov
+    assert V == pytest.approx(lyapunov(wanted).value[-1], rel=1e-9)
     assert np.abs(wanted.states[1:] - ech.run(panel.scenario).states[1:]).max() > 1e-3
 
 
-def test_no_knob_compiles_anything_again(panel, swarm, monkeypatch):
-    swarm.turn(panel.start)
+def test_no_knob_compiles_anything_again(panel, swarm, native, monkeypatch):
+    for each in (swarm, native):
+        each.turn(panel.start)
+        each.advance()
+        traced = []
+        monkeypatch.setattr(mover, "control", lambda *_: traced.append(1))
+        monkeypatch.setattr(code, "program", lambda *_: traced.append(1))
+        for change in KNOBS.values():
+            each.turn(panel.start._replace(**change))
+            each.advance()
+        each.kick(1, np.ones(4))
+        each.advance(still=True)
+        assert traced == []
+
+
+def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(session, swarm):
     swarm.advance()
-    traced = []
-    monkeypatch.setattr(stepped, "control", lambda *_: traced.append(1))
-    for change in KNOBS.values():
-        swarm.turn(panel.start._replace(**change))
-        swarm.advance()
-    swarm.kick(1, np.ones(4))
-    swarm.advance(still=True)
-    assert traced == []
+    places = np.asarray(swarm.now.states)
+    session.ask({"name": "size", "value": 2.0})
+    session.ask({"name": "law", "value": "passive"})
+    session.settle()
+    assert session.swarm is not swarm and session.knobs == session.panel.start._replace(size=2.0)
+    np.testing.assert_array_equal(session.swarm.now.states, places)
+    assert session.swarm.steps == swarm.steps and "coupling" not in session.panel.ranges
+    session.ask({"name": "reset"})
+    session.settle()
+    parts, settings = build(session.panel.standing(session.knobs))
+    wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+    shown = np.stack([session.swarm.advance().states for _ in range(10)])
+    np.testing.assert_allclose(shown, wanted.states[1:], atol=1e-11)
+    assert session.events[0] == {"at": 0.0, "law": "passive", "size": 2.0}
+    told = session.ask({"name": "law", "value": "agreement"})
+    assert told["fault"].startswith("follower: the law `agreement` is made for `SingleIntegrator`")
+    assert "there is no law `best` here" in session.ask({"name": "law", "value": "best"})["fault"]
 
 
 def test_another_method_brings_its_gain_and_its_coupling(session):
@@ -131,6 +172,9 @@ def test_another_method_brings_its_gain_and_its_coupling(session):
     assert session.knobs.coupling == pytest.approx(found.coupling, abs=1e-9)
     with pytest.raises(SimulationError, match="no method `best` here"):
         session.ask({"name": "method", "value": "best"})
+    session.ask({"name": "method", "value": "scenario"})
+    session.settle()
+    assert session.knobs == session.panel.start
 
 
 def test_the_error_is_the_distance_from_the_goal_of_the_turned_formation(panel, swarm):
@@ -158,6 +202,8 @@ def test_a_kick_moves_one_agent_and_all_ways_in_turn(session):
 
 def test_a_knob_is_clamped_and_nonsense_is_refused_in_a_sentence(session):
     assert session.ask({"name": "size", "value": 1e9}) == {"size": 3.0}
+    said = json.loads(session.words[-1][4:])["note"]
+    assert said == "`size` got 1e+09, and stands at 3, the end of its range."
     assert session.ask({"name": "wind", "value": -1e300}) == {"wind": -3.0}
     for told, sentence in {
         ("colour", 1.0): "there is no knob `colour`; this scenario has `coupling`",
@@ -178,16 +224,19 @@ def test_what_was_done_is_saved_and_repeats_to_the_bit(session, swarm):
         2: [("coupling", 2.5), ("cut", [3, 0])],
         4: [("kick", 1), ("wind", 0.7)],
         6: [("restore", [0, 3]), ("size", 1.5), ("turn", -20.0), ("feedforward", 0)],
+        7: [("law", "passive"), ("shape", "line")],
+        8: [("law", "consensus"), ("kick", 3)],
     }
     shown = []
     for k in range(9):
         for name, value in done.get(k, ()):
             session.ask({"name": name, "value": value})
         session.settle()
-        shown.append(swarm.advance().states)
+        shown.append(session.swarm.advance().states)
     text = session.ask({"name": "save"})["text"]
     again = scenario_from_mapping(read_yaml(text, "saved").data)
-    assert [event.at for event in again.live] == [0.08, 0.08, 0.16, 0.16, 0.24, 0.24, 0.24, 0.24]
+    ats = [0.08, 0.08, 0.16, 0.16, 0.24, 0.24, 0.24, 0.24, 0.28, 0.28, 0.32, 0.32]
+    assert [event.at for event in again.live] == ats
     panel = Panel(again, build(again))
     other = Session(again, panel, Swarm(*panel.built, panel))
     for states in shown:
@@ -266,7 +315,9 @@ def test_a_growing_mode_is_told_at_once(panel):
 @pytest.fixture(scope="module")
 def page():
     """A session that runs, and where its page is."""
-    session, html = live(scenario())
+    # A quick loop, since it is watched in real time.
+    follower = {"law": "consensus", "gain": {"method": "riccati", "R": [0.02, 0.02]}}
+    session, html = live(scenario(follower=follower))
     session.start()
     with serving(serve_live(session, html, 0)) as address:
         yield session, address
@@ -368,6 +419,22 @@ def test_a_page_that_is_closed_ends_nothing_and_nobody_watching_stops_the_clock(
     assert session.swarm.steps <= steps + 2 * session.swarm.count
     with opened(browser, address) as shown:
         until(lambda: shown.evaluate("echelon.pictures") > 3)
+
+
+@pytest.mark.parametrize(
+    ("event", "sentence"),
+    [
+        ({"cut": [0, 2]}, "`live` at 1 s: `[0, 2]` is no link of the graph."),
+        ({"law": "best"}, "`live` at 1 s: there is no law `best` here; there are `consensus`"),
+        ({"shape": "star"}, "`live` at 1 s: there is no shape `star` here; there are"),
+        ({"kick": {4: [1.0, 0, 0, 0]}}, "`live` at 1 s: `kick` got agent 4 with 4 numbers"),
+    ],
+)
+def test_what_a_scenario_cannot_do_live_is_told_before_it_begins(panel, swarm, event, sentence):
+    own = scenario(live=[{"at": 1.0, **event}])
+    with pytest.raises(SimulationError) as fault:
+        Session(own, panel, swarm)
+    assert str(fault.value).startswith(sentence)
 
 
 def test_what_is_too_large_to_be_live_is_refused_with_what_would_be(monkeypatch):

@@ -117,8 +117,8 @@ def test_a_run_that_goes_on_ends_with_the_bits_of_one_that_never_ended(settings,
     whole = ech.simulate(parts, settings)
     kept = []
 
-    def stop(done, steps):
-        if done > steps * (len(kept) % 7) / 9:
+    def stop(run):
+        if run.done > run.steps * (len(kept) % 7) / 9:
             raise KeyboardInterrupt
 
     for _ in range(20):

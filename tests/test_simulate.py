@@ -41,6 +41,7 @@ from echelon.models import (
 from echelon.network.formation import Formation
 from echelon.network.graph import Graph
 from echelon.references import Circle, Hover, Line
+from echelon.results.metrics import metrics
 
 QUAD = Quadrotor()
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
@@ -630,16 +631,34 @@ def test_progress_counts_the_steps():
         horizon=25.0,
         dt=0.1,
         store_every=2,
-        progress=lambda done, of: heard.append((done, of)),
+        progress=lambda run: heard.append((run.done, run.steps)),
     )
     done = [d for d, _ in heard]
     assert done == sorted(done) and done[-1] == 250 and {of for _, of in heard} == {250}
     assert 2 <= len(heard) <= 101
 
 
+def test_a_run_on_its_way_tells_the_states_and_the_numbers_that_the_whole_run_has():
+    heard = []
+
+    def look(run):
+        heard.append((run.time, run.states, run.result()))
+
+    whole = carts(horizon=3.0, progress=look)
+    assert len(heard) > 2
+    for time, states, result in heard[:-1]:
+        count = len(result.times)
+        assert count < len(whole.times) and result.message.startswith("The run goes on")
+        np.testing.assert_array_equal(result.states, whole.states[:count])
+        np.testing.assert_array_equal(states, whole.states[count - 1])
+        assert time >= result.times[-1] and result.sums.steps[0] == pytest.approx(time / 0.01)
+    last = metrics(heard[-1][2])
+    assert last == metrics(whole) and heard[-1][2].outcome is whole.outcome
+
+
 def test_an_interrupt_keeps_what_was_computed():
-    def stop(done, of):
-        if done >= 100:
+    def stop(run):
+        if run.done >= 100:
             raise KeyboardInterrupt
 
     whole = carts(horizon=3.0)

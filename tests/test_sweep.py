@@ -194,6 +194,9 @@ def test_a_sweep_is_each_of_its_runs():
     scenario = ech.load_scenario("van-der-pol", SHORT)
     found = ech.sweep(scenario, {"seed": range(3), "follower.gain.coupling": [1.0, 2.0]})
     assert found["formation_rmse"].dims == ("seed", "follower.gain.coupling")
+    # Of oscillators, whose states have no common unit.
+    assert "units" not in found["rmse"].attrs and "error_unit" not in found
+    assert found["promise_rate"].attrs["units"] == "1/s"
     for seed in (2,):
         for coupling in (1.0, 2.0):
             changes = [*SHORT, f"seed={seed}", f"follower.gain.coupling={coupling}"]
@@ -334,6 +337,7 @@ def test_figures_show_the_shares_that_the_batches_hold():
             "worst_settling_time": 3.0 if plan.run(k).place[0] else np.nan,
             "formation_rmse": 0.1 * (k + 1),
             "saturated": np.zeros(4),
+            "error_unit": "m" if k else "",
         }
         for k in range(12)
     ]
@@ -342,6 +346,8 @@ def test_figures_show_the_shares_that_the_batches_hold():
     assert data["formation_rmse"].values.ravel().tolist() == [row["formation_rmse"] for row in rows]
     found = sweep_figures(data)
     assert sorted(found) == ["errors", "region", "success"]
+    texts = [ax.get_xlabel() for ax in found["errors"].axes]
+    assert texts == ["formation RMSE (m)", "worst final error (m)", "settling time (s)"]
     shown = found["region"].axes[0].collections[0].get_array()
     assert shown.tolist() == [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0]]
     [left, _] = found["success"].axes

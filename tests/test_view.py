@@ -1,6 +1,7 @@
 """The page of a run, in a real browser: it shows what the data says, and asks for nothing else."""
 
 import dataclasses
+import itertools
 import json
 import struct
 import urllib.error
@@ -16,6 +17,7 @@ from echelon.core.errors import OutputError
 from echelon.plots.space import space_of
 from echelon.results.dataset import dataset
 from echelon.results.recording import recording
+from echelon.viewer.growing import Growing, serve_growing
 from echelon.viewer.pack import Group, pack
 from echelon.viewer.replay import frames_of, replay_data, replay_page
 from echelon.viewer.serve import Handler, serve, serving
@@ -196,6 +198,45 @@ def test_a_name_cannot_become_code(browser, run, tmp_path):
     with opened(browser, path.as_uri()) as page:
         assert page.locator("h1").inner_text() == name
         assert not page.evaluate("window.broken")
+
+
+# ---- a run that is being computed ----
+
+
+def parts_of(run, cuts):
+    """The stretches of a run between frames."""
+    names = ("times", "states", "inputs", "errors", "lyapunov")
+    for a, b in itertools.pairwise(cuts):
+        yield dataclasses.replace(run, **{name: getattr(run, name)[a:b] for name in names})
+
+
+def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_end(browser, run):
+    growing = Growing(run)
+    first, second, third = parts_of(run, (0, 90, 91, 301))
+    with serving(serve_growing(growing, 0)) as address, opened(browser, address) as page:
+        assert page.evaluate("echelon.run.growing") and page.evaluate("echelon.last") == 0
+        growing.add(first)
+        until(lambda: page.evaluate("echelon.last") == 89)
+        # Who looks at the newest frame goes on to.
+        assert page.evaluate("echelon.frame") == 89
+        assert f"Computed until {run.times[89]:.1f} of" in page.locator(".notes").inner_text()
+        growing.add(second)
+        until(lambda: page.evaluate("echelon.last") == 90)
+        seek(page, 40)
+        growing.add(third)
+        until(lambda: page.evaluate("echelon.last") == 300)
+        assert page.evaluate("echelon.frame") == 40
+        for frame in (0, 40, 89, 90, 91, 300):
+            seek(page, frame)
+            assert page.evaluate("echelon.run.moment.time") == pytest.approx(run.times[frame])
+            for agent in (0, 3):
+                place = run.states[frame, agent, :3]
+                assert page.evaluate(f"echelon.position({agent})") == pytest.approx(place, abs=6e-5)
+        seek(page, 120)
+        chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
+        assert f"V {run.lyapunov[120]:.3g}" in chart and "slope promised, −1 1/s" in chart
+        growing.finish(run)
+        until(lambda: page.evaluate("!echelon.run.growing && echelon.frame === 120"))
 
 
 # ---- other models -----------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from echelon.engine.simulate import Progress
     from echelon.scenario.build import Built
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -17,7 +16,9 @@ ScenarioArgument = Annotated[str, typer.Argument(help="A bundled scenario's name
 
 
 @contextlib.contextmanager
-def show_progress(quiet: bool, what: str = "steps") -> "Iterator[Progress | None]":
+def show_progress(
+    quiet: bool, what: str = "steps"
+) -> "Iterator[Callable[[int, int], None] | None]":
     """Show steps and time left on standard error while a run lasts, where someone watches."""
     if quiet or not sys.stderr.isatty():
         yield None

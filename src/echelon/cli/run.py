@@ -1,5 +1,6 @@
 """`echelon run`: simulate a scenario and keep what it shows."""
 
+import contextlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,8 +16,10 @@ from echelon.core.errors import Outcome, OutputError
 
 if TYPE_CHECKING:
     from echelon.archive.chunks import Chunks
+    from echelon.cli.watch import Watched
     from echelon.engine.record import Stretch
     from echelon.engine.result import Result
+    from echelon.engine.simulate import Underway
     from echelon.scenario.build import Built
     from echelon.scenario.scenario import Scenario
 
@@ -50,7 +53,7 @@ def run(
     ] = False,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
     view: Annotated[
-        bool, typer.Option("--view", help="Show it in the browser when it is done.")
+        bool, typer.Option("--view", help="Show it in the browser while it is computed.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -66,26 +69,22 @@ def run(
     else:
         job = _continue(resume)
     from echelon.archive.folder import writing
+    from echelon.cli.watch import watching
 
-    with writing(job.chunks.folder), STOP.hold():
-        result = _fly(job, as_json)
-        _show(result, as_json)
-        _write(job.chunks, result, figures, as_json)
-    if view and STOP.number is None and len(result.times):
-        _view(job.chunks.folder)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_undone(job.chunks))
+        watched = stack.enter_context(watching(job.scenario, job.built)) if view else None
+        stack.enter_context(writing(job.chunks.folder))
+        with STOP.hold():
+            result = _fly(job, watched, as_json)
+            _show(result, as_json)
+            _write(job.chunks, result, figures, as_json)
+        if watched is not None and STOP.number is None and len(result.times):
+            watched.show_all(job.chunks.folder)
     if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
         # Then the disk ended it, and its message says so.
         raise OutputError(f"{result.message[:-1]}, and {_again(job.chunks.folder)}.")
     raise typer.Exit(STOP.exit_code or result.outcome.exit_code)
-
-
-def _view(folder: Path) -> None:
-    """Show a run that is done, until Ctrl-C."""
-    from echelon.archive.open import open_run
-    from echelon.cli.view import show_page
-    from echelon.viewer.replay import replay_page
-
-    show_page(replay_page(open_run(folder)).encode(), None, browser=True)
 
 
 def _begin(
@@ -127,22 +126,27 @@ def _continue(folder: Path) -> _Job:
     return _Job(checked, build(checked), chunks, chunks.read())
 
 
-def _fly(job: _Job, quiet: bool) -> "Result":
+def _fly(job: _Job, watched: "Watched | None", quiet: bool) -> "Result":
     """Return the run, written while it lasts."""
     from echelon.engine.drive import Stopped
     from echelon.scenario import build
 
     def keep(stretch: "Stretch") -> None:
+        if watched is not None:
+            watched.add(stretch)
         try:
             job.chunks.write(stretch)
         except OSError as error:
             raise Stopped(f"its folder cannot be written: {error.strerror or error},") from error
 
+    if watched is not None:
+        for stretch in job.before:
+            watched.add(stretch)
     with _undone(job.chunks), show_progress(quiet) as show:
 
-        def progress(done: int, steps: int) -> None:
+        def progress(run: "Underway") -> None:
             if show is not None:
-                show(done, steps)
+                show(run.done, run.steps)
             STOP.check()
 
         return build.run(job.scenario, progress, job.built, keep, job.before)

@@ -80,16 +80,30 @@ def show_page(page: bytes, port: int | None, browser: bool) -> None:
 
 def keep_serving(server: "ThreadingHTTPServer", port: int | None, browser: bool) -> None:
     """Say where a page is, open a browser if there is one, and serve until Ctrl-C."""
-    from echelon.viewer.serve import PORT, open_browser, serving
+    from echelon.viewer.serve import serving
 
     with serving(server) as address, STOP.hold(said=""):
-        asked, got = PORT if port is None else port, server.server_address[1]
-        if asked not in (got, 0):
-            print(f"echelon: port {asked} is in use, so {got} is taken.", file=sys.stderr)
-        opened = browser and open_browser(address)
-        where = "" if opened or not browser else " in a browser; none could be opened from here"
-        print(f"echelon: {address} shows it{where}. Ctrl-C ends.", flush=True)
-        while STOP.number is None:
-            time.sleep(0.1)
-        # That is how a page is left, and no interruption.
-        STOP.number = None
+        show_address(server, address, port, browser)
+        wait()
+
+
+def show_address(
+    server: "ThreadingHTTPServer", address: str, port: int | None, browser: bool
+) -> None:
+    """Say where a page is, and open a browser if there is one."""
+    from echelon.viewer.serve import PORT, open_browser
+
+    asked, got = PORT if port is None else port, server.server_address[1]
+    if asked not in (got, 0):
+        print(f"echelon: port {asked} is in use, so {got} is taken.", file=sys.stderr)
+    opened = browser and open_browser(address)
+    where = "" if opened or not browser else " in a browser; none could be opened from here"
+    print(f"echelon: {address} shows it{where}. Ctrl-C ends.", file=sys.stderr, flush=True)
+
+
+def wait() -> None:
+    """Wait until Ctrl-C."""
+    while STOP.number is None:
+        time.sleep(0.1)
+    # That is how a page is left, and no interruption.
+    STOP.number = None

@@ -128,6 +128,7 @@ def _levels(graph: Graph) -> Array:
     return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
 
 
+@eqx.filter_jit
 def begin(loop: Loop, states: States) -> Moment:
     """Return the moment at which a run begins from states (N, n)."""
 

@@ -241,7 +241,7 @@ def _where(which: Array, new: Sums, old: Sums) -> Sums:
 
 def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | EchelonError:
     try:
-        return simulate(parts, settings, told)
+        return simulate(parts, settings, told and (lambda run: told(run.done, run.steps)))
     except EchelonError as error:
         return error
 

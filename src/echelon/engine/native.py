@@ -1,100 +1,30 @@
 """The closed loop stepped by code for this machine: agents in the lanes of vectors."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.engine.code import LANES, Kernels, follows
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.own import Own
-from echelon.engine.places import Formations, Places, Swarm
-from echelon.engine.scalars import Rows, body_of, memory_of, signals_of
+from echelon.engine.places import Formations, Places, Swarm, heard
+from echelon.engine.scalars import memory_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import SLOTS, Code, Plan, aligned, program
+from echelon.kernels import SLOTS, aligned
 from echelon.world.disturbance import draw
 
-_LANES = {64: 8, 32: 16}
-"""Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some tenths of a second."""
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-_KEPT = 8
-"""Kernels that are kept for other runs."""
-
-
-def follows(loop: Loop) -> bool:
-    """Tell whether the leaders of a loop follow a reference."""
-    return loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
-
-
-class _Kernel(NamedTuple):
-    """The code that steps some loops, the rows that it works on, and its plan."""
-
-    code: Code
-    rows: Rows
-    plan: Plan
-
-
-def _kernel(own: Own, bits: int, together: bool) -> _Kernel:
-    """Return the code that steps some loops, the rows that it works on, and its plan.
-
-    Raises:
-        Unsupported: a law or the model uses what has no scalar operations.
-    """
-    loop, rows, wanted = own.loop, Rows.of(own.loop, own.count), follows(own.loop)
-    n, alone = len(rows.state), len(loop.leaders) == 1
-    plan = Plan(
-        bits=bits,
-        lanes=_LANES[bits],
-        together=together,
-        rows=rows.total,
-        width=n + signals_of(loop),
-        first=body_of(own, bits, rows, True, wanted),
-        others=body_of(own, bits, rows, False, wanted),
-        tell=rows.tell.start,
-        told=len(rows.tell),
-        one_source=alone and loop.parents is None,
-        one_leader=alone,
-        weighted=bool((np.asarray(loop.exchange.weights) != 1.0).any()),
-        edges=loop.meter.measured,
-        table=n if wanted else 0,
-        dt=loop.motion.dt,
-    )
-    # Where JAX was told to keep what it compiles, so that one setting rules both.
-    cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    return _Kernel(Code(program(plan), Path(cache) if cache else None), rows, plan)
-
-
-@final
-class Kernels:
-    """Those that were made, so that loops alike but for their own numbers share one."""
-
-    def __init__(self) -> None:
-        """Begin with none."""
-        self._made: dict[Hashable, _Kernel] = {}
-
-    def of(self, own: Own, bits: int, together: bool) -> _Kernel:
-        """Return what steps some loops.
-
-        Raises:
-            Unsupported: a law or the model uses what has no scalar operations.
-        """
-        key = (own.signature, bits, together)
-        if key not in self._made:
-            # The oldest goes: a sweep over models has one after the other.
-            while len(self._made) >= _KEPT:
-                self._made.pop(next(iter(self._made)))
-            self._made[key] = _kernel(own, bits, together)
-        return self._made[key]
 
 
 def beyond(states: Array, bits: int) -> Array:
@@ -114,6 +44,8 @@ class NativeStepper(Stepper):
             caller looks.
         pool: threads that step formations; None for the caller's alone.
         kernels: those that were made before.
+        unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
+            weights of edges anyway; None where nothing is turned.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -127,20 +59,22 @@ class NativeStepper(Stepper):
         far: Stepper | None,
         pool: Executor | None = None,
         kernels: Kernels | None = None,
+        unlike: Loop | None = None,
     ) -> None:
         """Write and compile the step."""
         self.pool = pool
-        self.own = Own(loops)
+        self.own = Own(loops, unlike)
         self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
         self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
-        together, lanes = len(loops) > 1, _LANES[bits]
+        together, lanes = len(loops) > 1, LANES[bits]
         self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
-        self.code, self.rows, self.plan = (kernels or Kernels()).of(self.own, bits, together)
+        made = (kernels or Kernels()).of(self.own, bits, together, unlike is not None)
+        self.code, self.rows, self.plan = made
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
@@ -211,6 +145,14 @@ class NativeStepper(Stepper):
         self._held = None
         self._left = int(now.step) if self._left < 0 else self._left
         return self.far.advance(now, counts, reference)
+
+    def turn(self, loop: Loop) -> None:
+        """Go on in a loop of one formation that is like the one before, but for its numbers."""
+        self.loop, self.loops = loop, [loop]
+        self.own.values = self.own.of(loop)[None]
+        self.heavy[:] = heard(loop, self.places)[2]
+        # Offsets, numbers and the wind are written with a moment.
+        self._held = None
 
     def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()

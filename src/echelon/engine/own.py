@@ -1,4 +1,7 @@
-"""What differs between formations that are stepped together, beside their states and offsets."""
+"""What differs between formations that are stepped together, beside their states and offsets.
+
+Or between one formation now and later, where somebody turns its knobs.
+"""
 
 from collections.abc import Hashable, Sequence
 from typing import Any, final
@@ -34,27 +37,30 @@ class Own:
 
     Args:
         loops: of the formations, alike in their trees and in all that is no number.
+        unlike: another such loop, which none of them is: where it differs others may yet come.
 
     Attributes:
         loop: the first.
         values: (loops, k) the numbers that differ, in the order of the tree.
     """
 
-    def __init__(self, loops: Sequence[Loop]) -> None:
+    def __init__(self, loops: Sequence[Loop], unlike: Loop | None = None) -> None:
         """Find the numbers that differ."""
         self.loop = loops[0]
         # By identity: runs that differ in their starts alone share one loop.
         distinct = list({id(loop): loop for loop in loops}.values())
         places = {id(loop): k for k, loop in enumerate(distinct)}
-        flat = [jax.tree.leaves(bare(loop)) for loop in distinct]
+        others = [] if unlike is None else [unlike]
+        flat = [jax.tree.leaves(bare(loop)) for loop in [*distinct, *others]]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
-        found = [
-            np.stack([np.asarray(leaf, float)[mask] for leaf in leaves])
-            for leaves, mask in zip(zip(*flat, strict=True), self._masks, strict=True)
-            if mask.any()
-        ]
-        values = np.concatenate([np.zeros((len(distinct), 0)), *found], axis=1)
+        values = np.stack([self.of(loop) for loop in distinct])
         self.values = values[[places[id(loop)] for loop in loops]]
+
+    def of(self, loop: Loop) -> Array:
+        """Return the numbers (k,) of a loop that is like the others."""
+        pairs = zip(jax.tree.leaves(bare(loop)), self._masks, strict=True)
+        found = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
+        return np.concatenate([np.zeros(0), *found])
 
     @property
     def count(self) -> int:

@@ -1,6 +1,7 @@
 """The closed loop in time: parts in, one `Result` out, whatever drives the agents."""
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import TypeAlias, final
@@ -21,8 +22,41 @@ from echelon.engine.settings import Settings
 from echelon.engine.sums import on_host
 from echelon.engine.work import SolverStats
 
-Progress: TypeAlias = Callable[[int, int], None]
-"""Called between chunks with the steps done and the steps in all."""
+
+@final
+class Underway:
+    """A run on its way, as it is when it tells of itself.
+
+    Attributes:
+        done: steps that were taken.
+        steps: in all.
+    """
+
+    def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
+        """Note how far it has come."""
+        self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
+        self.done, self.steps = recorder.done, recorder.grid.steps
+
+    @property
+    def time(self) -> float:
+        """How far it has come, s."""
+        return self.done * self._prepared.problem.settings.dt
+
+    @property
+    def states(self) -> Array:
+        """The states (N, n) of the newest stored frame."""
+        return next(x.states[-1] for x in reversed(self._recorder.stretches) if len(x.states))
+
+    def result(self) -> Result:
+        """Return all that was computed so far, of which `metrics` takes its numbers."""
+        found = _result(self._prepared, self._recorder, self._stepper, Outcome.INTERRUPTED)
+        told = f"The run goes on, and this is all of it until t = {self.time:.6g} s."
+        under = found.outcome is Outcome.INTERRUPTED
+        return dataclasses.replace(found, message=told) if under else found
+
+
+Progress: TypeAlias = Callable[[Underway], None]
+"""Called between chunks with the run on its way."""
 Keep: TypeAlias = Callable[[Stretch], None]
 """Called with every stretch of a run while it lasts, each following the one before.
 
@@ -45,7 +79,8 @@ def simulate(
     Args:
         parts: agents, graph, formation, what drives them, starts and world.
         settings: horizon, step and the like.
-        progress: called a hundred times or more with (steps done, steps in all).
+        progress: called a hundred times or more with the run on its way: steps, states, and on
+            asking all that is known of it so far.
         keep: called with what was computed, every two seconds and at the end.
         before: all that an earlier run of the same parts and settings gave to `keep`; the run goes
             on from there, to the same bits.
@@ -148,7 +183,7 @@ class _Flight:
                     if time.perf_counter() - self.gave > _SECONDS:
                         self._give(keep)
                     if progress is not None:
-                        progress(self.recorder.done, self.recorder.grid.steps)
+                        progress(Underway(self.prepared, self.recorder, self.stepper))
             self._give(keep)
         except Stopped as reason:
             self.recorder.stop(f"The run was stopped, since {reason}")

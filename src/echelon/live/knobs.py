@@ -1,7 +1,7 @@
 """What a person may turn while a loop runs, and the scenario that says the same."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -11,7 +11,11 @@ from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.gains.gain import Gain
+from echelon.laws.stopping_point import StoppingPoint
+from echelon.live.choices import AS_GIVEN, shapes_of
 from echelon.models.linearization import linearize
+from echelon.network.graph import Graph
+from echelon.scenario import registry
 from echelon.scenario.build import Built, build
 from echelon.scenario.override import named_files
 from echelon.scenario.scenario import Scenario, scenario_from_mapping
@@ -37,13 +41,14 @@ class Knobs(NamedTuple):
     """How all knobs stand.
 
     Attributes:
-        coupling: c; None of a law without a gain.
+        coupling: c; None of a law without one.
         feedforward: 1 where followers are sent what the scenario says, 0 where nothing.
         size: of the formation, times the scenario's.
         turn: of it, degrees.
         wind: added to the first velocity's rate, or to the first position's.
         cut: places of the edges that are cut.
         method: of the gain; None for the scenario's own.
+        shape: of the formation; None for the scenario's own.
     """
 
     coupling: float | None
@@ -53,6 +58,7 @@ class Knobs(NamedTuple):
     wind: float = 0.0
     cut: frozenset[int] = frozenset()
     method: str | None = None
+    shape: str | None = None
 
 
 @final
@@ -69,22 +75,43 @@ class Panel:
         self.scenario, self.built, parts = scenario, built, built.parts
         self.parts, model = parts, parts.model
         gain = parts.drive.gain
-        self.start = Knobs(None if gain is None else gain.coupling)
+        self.start = Knobs(_coupling(built))
         self.ranges: dict[str, Range] = {}
         self.gains: dict[str | None, Gain | None] = {None: gain}
         self.methods = _METHODS if gain is not None else ()
-        if gain is not None:
-            self.ranges["coupling"] = Range(0.02 * gain.coupling, 8.0 * gain.coupling, True)
+        if self.start.coupling is not None:
+            c = self.start.coupling
+            self.ranges["coupling"] = Range(0.02 * c, 8.0 * c, True)
         if str(parts.drive.feedforward.name) != "NONE":
             self.ranges["feedforward"] = Range(0.0, 1.0)
         self.axes = list(model.position_indices())
-        if self.axes and parts.formation.offsets[:, self.axes].any():
+        self.shapes = shapes_of(parts)
+        if self.shapes or (self.axes and parts.formation.offsets[:, self.axes].any()):
             self.ranges["size"] = Range(0.3, 3.0, True)
             if len(self.axes) > 1:
                 self.ranges["turn"] = Range(-180.0, 180.0)
         self.windward = self._windward()
         if self.windward is not None:
             self.ranges["wind"] = Range(-3.0, 3.0)
+
+    @property
+    def law(self) -> str:
+        """The followers' law, by its name; `scenario` for one of a person's own."""
+        law = self.scenario.follower.law
+        return law if isinstance(law, str) else AS_GIVEN
+
+    @property
+    def laws(self) -> tuple[str, ...]:
+        """The laws that may be chosen, this one first."""
+        return tuple(dict.fromkeys((self.law, *registry.FOLLOWER_LAWS)))
+
+    def choices(self) -> dict[str, Any]:
+        """Return what may be chosen by name, as the page takes it: first what is chosen now."""
+        return {
+            "law": list(self.laws),
+            "method": [AS_GIVEN, *self.methods] if self.methods else [],
+            "shape": [AS_GIVEN, *self.shapes] if self.shapes else [],
+        }
 
     def _windward(self) -> int | None:
         """Return the state that the wind acts on; None of agents without a position."""
@@ -139,14 +166,23 @@ class Panel:
             SimulationError: there is no such method here.
             ScenarioError: it finds no gain for these agents.
         """
-        if name not in self.methods:
-            raise SimulationError(
-                f"there is no method `{name}` here; those that need no more are "
-                f"{listing(self.methods)}."
-            )
+        if name == AS_GIVEN:
+            return knobs._replace(method=None, coupling=self.start.coupling)
+        check_choice("method", name, self.methods)
         changed = knobs._replace(method=str(name))
         gain = self.gain(changed)
         return changed if gain is None else changed._replace(coupling=round(gain.coupling, 9))
+
+    def with_shape(self, knobs: Knobs, name: object) -> Knobs:
+        """Return the knobs with another shape of the formation.
+
+        Raises:
+            SimulationError: there is no such shape here.
+        """
+        if name == AS_GIVEN:
+            return knobs._replace(shape=None)
+        check_choice("shape", name, self.shapes)
+        return knobs._replace(shape=str(name))
 
     def gain(self, knobs: Knobs) -> Gain | None:
         """Return the gain of the method of the knobs; its coupling is another matter.
@@ -161,7 +197,8 @@ class Panel:
 
     def offsets(self, knobs: Knobs) -> Array:
         """Return the offsets (N, n) of the formation as it stands, about its first leader."""
-        offsets = np.array(self.parts.formation.offsets, np.float64)
+        chosen = None if knobs.shape is None else self.shapes[knobs.shape]
+        offsets = np.array(self.parts.formation.offsets if chosen is None else chosen, np.float64)
         middle = offsets[self.parts.graph.leaders[0], self.axes]
         places = knobs.size * (offsets[:, self.axes] - middle)
         if len(self.axes) > 1:
@@ -213,14 +250,15 @@ class Panel:
             data.setdefault("follower", {})["gain"] = {"method": knobs.method}
         # With another graph a method would choose another coupling.
         if knobs.coupling is not None and (knobs.cut or knobs.coupling != self.start.coupling):
-            data.setdefault("follower", {}).setdefault("gain", {})["coupling"] = knobs.coupling
-            if "file" in data["follower"]["gain"]:
-                data["follower"]["gain"] = self._given(knobs.coupling)
+            self._couple(data.setdefault("follower", {}), knobs.coupling)
         if not knobs.feedforward:
             data.setdefault("follower", {})["feedforward"] = "none"
         if knobs.cut:
-            data["graph"] = self._graph(knobs)
-        if (knobs.size, knobs.turn) != (1.0, 0.0):
+            graph = self.parts.graph
+            told = {"leaders": list(graph.leaders), "agents": graph.agents}
+            told |= {"directed": True} if graph.directed else {}
+            data["graph"] = {"edges": self._edges(knobs), **told}
+        if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
             offsets = self.offsets(knobs)
             rows = {i: offsets[i, self.axes].tolist() for i in np.flatnonzero(offsets.any(axis=1))}
             data["formation"] = {"offsets": rows}
@@ -229,6 +267,15 @@ class Panel:
             constant = data.setdefault("disturbance", {}).setdefault("constant", {})
             constant[name] = constant.get(name, 0.0) + knobs.wind
         return scenario_from_mapping(data, self.scenario.folder)
+
+    def _couple(self, follower: dict[str, Any], coupling: float) -> None:
+        """Write a coupling where the followers' law has it."""
+        if self.parts.drive.gain is None:
+            follower["coupling"] = coupling
+            return
+        follower.setdefault("gain", {})["coupling"] = coupling
+        if "file" in follower["gain"]:
+            follower["gain"] = self._given(coupling)
 
     def _data(self) -> dict[str, Any]:
         """Return the scenario's data, without what was done live."""
@@ -242,17 +289,21 @@ class Panel:
         P, R = gain.P.tolist(), gain.R.tolist()
         return {"method": "given", "P": P, "R": R, "coupling": coupling}
 
-    def _graph(self, knobs: Knobs) -> dict[str, Any]:
+    def graph(self, knobs: Knobs) -> Graph:
+        """Return the graph without what is cut.
+
+        Raises:
+            GraphError: it is in two parts.
+        """
+        graph = self.parts.graph
+        return Graph(self._edges(knobs), graph.leaders, graph.agents, graph.directed)
+
+    def _edges(self, knobs: Knobs) -> list[list[Any]]:
+        """Return the edges that are not cut, with their weights."""
         graph = self.parts.graph
         kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
-        edges = [
-            [*pair, weight]
-            for pair, weight in zip(
-                graph.edges[kept].tolist(), graph.weights[kept].tolist(), strict=True
-            )
-        ]
-        told = {"edges": edges, "leaders": list(graph.leaders), "agents": graph.agents}
-        return told | ({"directed": True} if graph.directed else {})
+        pairs = zip(graph.edges[kept].tolist(), graph.weights[kept].tolist(), strict=True)
+        return [[*pair, weight] for pair, weight in pairs]
 
     def saved(self, events: Sequence[Mapping[str, Any]]) -> str:
         """Return the YAML of the scenario with what was done live, which it repeats."""
@@ -264,3 +315,22 @@ class Panel:
                 place = place[key]
             place[path[-1]] = f"{(self.scenario.folder / file).resolve()}{rest}"
         return dump_yaml({**data, "live": [dict(event) for event in events]})
+
+
+def _coupling(built: Built) -> float | None:
+    """Return how strongly the followers agree; None of a law without such a number."""
+    drive, dt = built.parts.drive, built.settings.dt
+    if drive.gain is not None:
+        return drive.gain.coupling
+    law = getattr(drive, "follower", None)
+    return float(law.strength(dt)) if isinstance(law, StoppingPoint) else None
+
+
+def check_choice(what: str, name: object, allowed: Iterable[str]) -> None:
+    """Check that something may be chosen.
+
+    Raises:
+        SimulationError: it may not.
+    """
+    if name not in list(allowed):
+        raise SimulationError(f"there is no {what} `{name}` here; there are {listing(allowed)}.")

@@ -7,6 +7,7 @@ from typing import Any, final
 from echelon.core.errors import EchelonError
 from echelon.live.knobs import Knobs, Panel
 from echelon.promises.promise import Promise, promise
+from echelon.reports.causes import beyond
 from echelon.scenario.build import build
 from echelon.viewer.replay import promise_badge
 
@@ -19,22 +20,22 @@ class Promiser:
     """Finds what is promised in a thread of its own; of many questions only the last is answered.
 
     Args:
-        panel: of the scenario.
         answer: called with what the page is told.
     """
 
-    def __init__(self, panel: Panel, answer: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, answer: Callable[[dict[str, Any]], None]) -> None:
         """Start the thread, which waits for a question."""
-        self.panel, self.answer = panel, answer
-        self.asked: Knobs | None = None
+        self.answer = answer
+        self.asked: tuple[Panel, Knobs] | None = None
+        self.beyond = list[str]()
         self.woken, self.ended = threading.Condition(), False
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
 
-    def ask(self, knobs: Knobs) -> None:
-        """Ask what is promised of knobs."""
+    def ask(self, panel: Panel, knobs: Knobs) -> None:
+        """Ask what is promised of the knobs of a panel."""
         with self.woken:
-            self.asked = knobs
+            self.asked = panel, knobs
             self.woken.notify()
 
     def end(self) -> None:
@@ -51,13 +52,14 @@ class Promiser:
                 self.woken.wait_for(lambda: self.ended or self.asked is not None)
                 if self.ended:
                     return
-                knobs, self.asked = self.asked, None
-            assert knobs is not None
+                asked, self.asked = self.asked, None
+            assert asked is not None
             # At once what eigenvalues show, since a promise takes seconds to be found.
-            self.answer(first_look(self.panel, knobs))
-            found = badge_of(self.panel, knobs)
+            self.answer(first_look(*asked))
+            found = badge_of(*asked)
             # A knob that was turned meanwhile has made it an answer to no question.
             if self.asked is None and not self.ended:
+                self.beyond = found.get("beyond", [])
                 self.answer(found)
 
 
@@ -73,6 +75,8 @@ def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
     badge: dict[str, Any] = promise_badge(found.as_mapping())
     badge["causes"] = [each.sentence() for each in found.causes]
     badge["edge"] = found.edge
+    # Told where the formation flies apart all the same.
+    badge["beyond"] = [each.sentence() for each in beyond(0.0, found)]
     if found.promised and _near(found, knobs):
         badge |= {"state": "edge", "short": f"{badge['short']}, at its edge"}
     elif not found.promised and found.slowest is not None and found.slowest >= 0.0:

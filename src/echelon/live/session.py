@@ -9,9 +9,10 @@ from typing import Any, final
 
 import numpy as np
 
-from echelon.core.errors import SimulationError
+from echelon.core.errors import EchelonError, SimulationError
+from echelon.live.choices import under
 from echelon.live.header import drawn
-from echelon.live.knobs import Knobs, Panel
+from echelon.live.knobs import Knobs, Panel, check_choice
 from echelon.live.promiser import Promiser
 from echelon.live.swarm import Picture, Swarm
 from echelon.scenario.scenario import Scenario
@@ -42,7 +43,40 @@ class Session:
         self.future = sorted((_plain(each) for each in scenario.live), key=lambda e: e["at"])
         self.frame, self.number, self.words = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
-        self.promiser = Promiser(panel, self.say_promise)
+        # Laws that were chosen; what is saved is saved of the first.
+        self.first, self.loops = panel, {panel.law: (panel, swarm)}
+        self.origin = swarm.states
+        self._check()
+        self.promiser = Promiser(self.say_promise)
+
+    def _check(self) -> None:
+        """Check what the scenario does live, and compile the laws that it takes.
+
+        Raises:
+            SimulationError: something cannot be done, and when.
+        """
+        for event in self.future:
+            try:
+                self._check_event(event)
+            except EchelonError as error:
+                said = _without_place(error)
+                raise SimulationError(f"`live` at {event['at']:g} s: {said}") from error
+
+    def _check_event(self, event: Mapping[str, Any]) -> None:
+        panel = self.loops[self.prepare(str(event["law"]))][0] if "law" in event else self.panel
+        agents, n = self.swarm.states.shape
+        for name, value in event.items():
+            if name in ("cut", "restore"):
+                self._edge(value)
+            elif name in _CHOSEN:
+                _CHOSEN[name](panel, panel.start, value)
+            elif name == "kick":
+                for agent, by in value.items():
+                    if not 0 <= agent < agents or len(by) != n:
+                        raise SimulationError(
+                            f"`kick` got agent {agent} with {len(by)} numbers, and must be of "
+                            f"agents 0 to {agents - 1} with {n}."
+                        )
 
     # ---- the loop -------------------------------------------------------------------------------
 
@@ -81,18 +115,20 @@ class Session:
         with self.changed:
             todo, self.todo = self.todo, []
         for act in todo:
-            act()
+            try:
+                act()
+            except EchelonError as error:
+                # What could be done when it was asked, and no more, as under another law.
+                self.say({"note": _without_place(error)})
         now = self.swarm.steps * self.swarm.settings.dt
         while self.future and self.future[0]["at"] <= now + 1e-9:
             self.apply(self.future.pop(0))
 
     def show(self, picture: Picture) -> None:
         """Make a picture the latest one."""
-        if not picture.finite:
+        if picture.beyond.any():
             self.lost = True
-            who = int(np.argmax(~np.isfinite(picture.states).all(axis=1)))
-            note = f"The state of agent {who} stopped being finite at {picture.time:.2f} s; reset."
-            self.say({"note": note})
+            self.say({"note": _lost(picture), "causes": self.promiser.beyond})
             return
         frame = self._packed(picture)
         with self.changed:
@@ -107,7 +143,8 @@ class Session:
         ends = (loads.max(), loads.min()) if loads.size else (np.nan, np.nan)
         goals = (picture.states[swarm.nearest] - picture.offsets[swarm.nearest]) + picture.offsets
         parts = [
-            np.array([errors.max(), np.median(errors), *ends, self.factor, self.knobs.wind]),
+            np.array([errors.max(), np.median(errors), *ends, picture.lyapunov]),
+            np.array([self.factor, self.knobs.wind]),
             picture.states[:, list(space.axes)],
             goals[:, list(space.axes)],
             space.sign * picture.states[:, list(space.angles)],
@@ -143,7 +180,7 @@ class Session:
             self.watchers += 1
             seen, heard = -1, len(self.words)
         # A page that comes later hears how things stand.
-        self.promiser.ask(self.knobs)
+        self.promiser.ask(self.panel, self.knobs)
         self.say(self.standing())
         try:
             while not self.ended:
@@ -165,8 +202,8 @@ class Session:
         graph = self.swarm.parts.graph
         knobs = {name: getattr(self.knobs, name) for name in self.panel.ranges}
         cut = [graph.edges[k].tolist() for k in sorted(self.knobs.cut)]
-        knobs["method"] = self.knobs.method
-        return {"knobs": knobs, "cut": cut, "paused": self.paused}
+        chosen = {"law": self.panel.law, "method": self.knobs.method, "shape": self.knobs.shape}
+        return {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
 
     # ---- what is done ---------------------------------------------------------------------------
 
@@ -178,11 +215,16 @@ class Session:
         """
         name, value = told.get("name"), told.get("value")
         if name == "save":
-            return {"text": self.panel.saved(self.events)}
+            return {"text": self.first.saved(self.events)}
         if name in ("pause", "reset"):
             self._later(lambda: self._pause(bool(value)) if name == "pause" else self._reset())
             return {}
-        event = self._event(str(name), value)
+        try:
+            event = {name: self.prepare(str(value))} if name == "law" else None
+        except EchelonError as error:
+            # Asked well, and nothing that these agents can do.
+            return {"fault": _without_place(error)}
+        event = event or self._event(str(name), value)
         self._later(lambda: self.apply(event))
         return event
 
@@ -198,9 +240,15 @@ class Session:
             if type(value) is not int or not 0 <= value < self.swarm.parts.graph.agents:
                 raise SimulationError(f"`kick` got `{value}`, and must be the number of an agent.")
             return {"kick": {value: self._kick()}}
-        if name == "method":
-            return {name: self.panel.with_method(self.knobs, value).method}
-        return {name: getattr(self.panel.turned(self.knobs, name, value), name)}
+        if name in _CHOSEN:
+            _CHOSEN[name](self.panel, self.knobs, value)
+            return {name: value}
+        stands = getattr(self.panel.turned(self.knobs, name, value), name)
+        span = self.panel.ranges[name]
+        if not span.low <= value <= span.high:
+            text = f"`{name}` got {value:g}, and stands at {stands:g}, the end of its range."
+            self.say({"note": text})
+        return {name: stands}
 
     def _edge(self, pair: Any) -> int:
         graph = self.swarm.parts.graph
@@ -232,8 +280,10 @@ class Session:
             elif name in ("cut", "restore"):
                 cut = {self._edge(value)}
                 knobs = knobs._replace(cut=knobs.cut | cut if name == "cut" else knobs.cut - cut)
-            elif name == "method":
-                knobs = self.panel.with_method(knobs, value)
+            elif name == "law":
+                knobs = self._obey(str(value), knobs)
+            elif name in _CHOSEN:
+                knobs = _CHOSEN[name](self.panel, knobs, value)
             elif name != "at":
                 knobs = self.panel.turned(knobs, name, value)
         if knobs != self.knobs:
@@ -242,8 +292,39 @@ class Session:
     def _stand(self, knobs: Knobs) -> None:
         self.knobs = knobs
         self.swarm.turn(knobs)
-        self.promiser.ask(knobs)
+        self.promiser.ask(self.panel, knobs)
         self.say(self.standing())
+
+    def prepare(self, law: str) -> str:
+        """Compile the loop under another law, while this one goes on, and return the law.
+
+        Raises:
+            EchelonError: the law does not fit these agents, or there is none of that name.
+        """
+        if law in self.loops:
+            return law
+        check_choice("law", law, self.panel.laws)
+        self.say({"note": f"The law `{law}` is being compiled; the loop goes on meanwhile."})
+        try:
+            scenario, built = under(self.first.scenario, law)
+            panel = Panel(scenario, built)
+            self.loops[law] = panel, Swarm(*built, panel)
+            # Whatever is compiled only when it is first used.
+            self.loops[law][1].advance()
+        finally:
+            self.say({"note": ""})
+        return law
+
+    def _obey(self, law: str, knobs: Knobs) -> Knobs:
+        """Go on from here under another law, whose agents remember nothing of the one before."""
+        self.prepare(law)
+        before, self.swarm = self.swarm, self.loops[law][1]
+        self.panel = self.loops[law][0]
+        self.swarm.restart(np.asarray(before.now.states, float), before.steps)
+        self.say({"panel": self.panel.told(), "choices": self.panel.choices()})
+        kept = {name for name in self.panel.ranges if name not in ("coupling",)}
+        told = {name: getattr(knobs, name) for name in {"shape", "cut", *kept}}
+        return self.panel.start._replace(**told)
 
     def _pause(self, paused: bool) -> None:
         self.paused = paused
@@ -251,16 +332,24 @@ class Session:
 
     def _reset(self) -> None:
         """Begin again, with the knobs as they stand."""
-        self.swarm.restart()
+        self.swarm.restart(self.origin)
         self.lost, self.events, self.future = False, [], []
-        names = [name for name in ("method", *self.panel.ranges) if _stands(self, name)]
-        told = {name: getattr(self.knobs, name) for name in names}
+        names = [name for name in (*_CHOSEN, *self.panel.ranges) if _stands(self, name)]
+        told: dict[str, Any] = {} if self.panel is self.first else {"law": self.panel.law}
+        told |= {name: getattr(self.knobs, name) for name in names}
         self.events += [{"at": 0.0, **told}] if told else []
         graph = self.swarm.parts.graph
         for edge in sorted(self.knobs.cut):
             self.events.append({"at": 0.0, "cut": graph.edges[edge].tolist()})
         self.say({"reset": True, "note": ""})
         self.show(self.swarm.advance(still=True))
+
+
+_CHOSEN: dict[str, Callable[[Panel, Knobs, object], Knobs]] = {
+    "method": Panel.with_method,
+    "shape": Panel.with_shape,
+}
+"""What is chosen from a list, and how."""
 
 
 def _stands(session: Session, name: str) -> bool:
@@ -270,3 +359,17 @@ def _stands(session: Session, name: str) -> bool:
 def _plain(spec: Any) -> dict[str, Any]:
     """Return an event of a scenario as what was noted."""
     return {name: value for name, value in spec.model_dump().items() if value is not None}
+
+
+def _without_place(error: EchelonError) -> str:
+    """Return what was refused without the file's name, of which there is none here."""
+    return str(error).removeprefix("mapping: ")
+
+
+def _lost(picture: Picture) -> str:
+    """Return who was lost, and when, in words."""
+    who, when = int(np.argmax(picture.beyond)), f"at {picture.time:.2f} s"
+    if np.isfinite(picture.states[who]).all():
+        far = np.abs(picture.states[who]).max()
+        return f"Agent {who} has flown apart, to {far:.1e}, {when}; reset."
+    return f"The state of agent {who} stopped being finite {when}; reset."

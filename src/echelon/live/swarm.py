@@ -1,34 +1,34 @@
-"""The closed loop as it runs live: one compiled call a picture, and knobs that compile nothing."""
+"""The closed loop as it runs live, and knobs that compile nothing."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import SimulationError
+from echelon.core.errors import GraphError, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
-from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
+from echelon.engine.loop import Loop, Moment, assemble
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.live.knobs import Knobs, Panel
+from echelon.live.mover import mover_of
 from echelon.models.model import ControlAffine
 from echelon.network.exchange import Exchange
 from echelon.network.graph import Graph
+from echelon.results.lyapunov import potential
 from echelon.world.disturbance import Disturbance
 from echelon.world.world import World
 
 PICTURE = 0.04
 """Seconds of a picture."""
-_MANY = 200
-"""With more agents than this the loop is stepped in float32, which takes half the time."""
 
 
 @final
@@ -77,18 +77,19 @@ class Dimmed(Law):
 
 
 class Picture(NamedTuple):
-    """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n)."""
+    """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
+
+    `lyapunov` is V, NaN where there is none; `beyond` (N,) are those whose numbers are none, or
+    beyond what is computed.
+    """
 
     time: float
     states: Array
     inputs: Array
     errors: Array
     offsets: Array
-
-    @property
-    def finite(self) -> bool:
-        """Whether all numbers are."""
-        return bool(np.isfinite(self.states).all() and np.isfinite(self.inputs).all())
+    lyapunov: float
+    beyond: Array
 
 
 @final
@@ -116,35 +117,61 @@ class Swarm:
                 "run`, or leave the schedule out."
             )
         world = World(parts.world.plant, parts.world.disturbance or Disturbance())
-        self.many = parts.graph.agents > _MANY
-        self.kind: Any = "float32" if self.many else settings.precision
         prepared = prepare(parts.replace(world=world), settings)
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
-        loop = assemble(problem, drive.leader, drive.follower)
+        with precision("float64"):
+            loop = assemble(problem, drive.leader, drive.follower)
         law = loop.follower
-        if panel.start.coupling is not None:
-            law = eqx.tree_at(_inner, law, self._inner(panel.gain(panel.start)), is_leaf=_is_none)
+        gain = panel.gain(panel.start)
+        if gain is not None:
+            law = eqx.tree_at(lambda each: each.gain.inner, law, _inner(gain), is_leaf=_is_none)
+        elif panel.start.coupling is not None:
+            c = np.asarray(panel.start.coupling)
+            law = eqx.tree_at(lambda each: each.coupling, law, c, is_leaf=_is_none)
         dimmed = Dimmed(law, np.asarray(1.0), law.feedforward, law.turning)
         self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
+        self.potentials: dict[Any, Callable[[Array], Array]] = {}
         self.states, self.measured = problem.states, list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
         self.edge = _edges_of(loop.exchange, parts.graph)
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
+        self.potential = self._potential(panel.start)
+        self.mover = mover_of(self.loop, self._unlike(), self.states, settings)
         self.restart()
+
+    def _unlike(self) -> Loop:
+        """Return a loop that differs from this one in all that a knob turns, but for weights."""
+        other = [np.full(np.shape(leaf), np.nan) for leaf in self._turned(self.loop)]
+        return eqx.tree_at(self._turned, self.loop, tuple(other))
+
+    def _turned(self, loop: Loop) -> tuple[Any, ...]:
+        """Return the numbers of the followers' law that knobs turn."""
+        follower: Any = loop.follower
+        if self.panel.start.coupling is None:
+            return (follower.share,)
+        if self.panel.parts.drive.gain is None:
+            return follower.share, follower.law.coupling
+        own = follower.law.gain
+        return follower.share, own.coupling, own.P, own.R, own.R_inverse, own.inner
 
     @property
     def span(self) -> float:
         """Seconds from a picture to the next."""
         return self.count * self.settings.dt
 
-    def restart(self) -> None:
-        """Begin again, the knobs as they are."""
-        with precision(self.kind):
-            self.now: Moment = begin(self.loop, jnp.asarray(self.states))
+    def restart(self, states: Array | None = None, step: int = 0) -> None:
+        """Begin again, the knobs as they are; or go on from where others have come, (N, n)."""
+        begin = self.states if states is None else states
+        self.now: Moment = self.mover.begin(self.loop, begin, step)
+
+    @property
+    def engine(self) -> str:
+        """What computes the steps, `native` or `jax`."""
+        return self.mover.engine
 
     @property
     def steps(self) -> int:
@@ -153,58 +180,59 @@ class Swarm:
 
     def turn(self, knobs: Knobs) -> None:
         """Let the loop run with the knobs so."""
+        self.potential = self._potential(knobs)
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
         weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
-            lambda each: (each.offsets, each.exchange.weights, each.follower.share),
+            lambda each: (each.offsets, each.exchange.weights, each.motion.wind.constant),
             self.loop,
-            (self.offsets, weights, np.asarray(float(knobs.feedforward))),
+            (self.offsets, weights, self.panel.wind(knobs)),
         )
-        wind = self.panel.wind(knobs)
-        loop = eqx.tree_at(lambda each: each.motion.wind.constant, loop, wind)
-        if knobs.coupling is not None:
-            loop = self._with_gain(loop, knobs)
-        self.loop = loop
+        self.loop = eqx.tree_at(self._turned, loop, self._numbers(knobs))
 
-    def _with_gain(self, loop: Loop, knobs: Knobs) -> Loop:
-        """Return the loop with the gain of the knobs."""
+    def _numbers(self, knobs: Knobs) -> tuple[Any, ...]:
+        """Return what these are at the knobs."""
+        share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
+        if knobs.coupling is None:
+            return (share,)
+        c = np.asarray(knobs.coupling)
+        if gain is None:
+            return share, c
+        return share, c, gain.P, gain.R, gain.R_inverse, _inner(gain)
+
+    def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
+        """Return what tells V; None of a law without a P, or where a cut has parted the graph."""
         gain = self.panel.gain(knobs)
-        assert gain is not None
-
-        def places(each: Any) -> tuple[Any, ...]:
-            own = each.follower.law.gain
-            return own.P, own.R, own.R_inverse, own.inner, own.coupling
-
-        numbers = (gain.P, gain.R, gain.R_inverse, self._inner(gain), np.asarray(knobs.coupling))
-        return eqx.tree_at(places, loop, numbers)
-
-    @staticmethod
-    def _inner(gain: Gain | None) -> Array:
-        """Return the inner loop of a gain, zero without one, so that either compiles to one."""
-        assert gain is not None
-        if gain.inner is not None:
-            return gain.inner
-        return np.zeros((len(gain.R), len(gain.P)))
+        P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
+        # Of a law that turns, P stands in axes that turn too.
+        if P is None or self.loop.follower.turning or self.parts.graph.directed:
+            return None
+        if (knobs.cut, knobs.method) not in self.potentials:
+            try:
+                graph = self.panel.graph(knobs)
+                self.potentials[knobs.cut, knobs.method] = potential(self.parts.model, graph, P)
+            except GraphError:
+                return None
+        return self.potentials[knobs.cut, knobs.method]
 
     def kick(self, agent: int, by: Array) -> None:
         """Change the state of an agent by (n,), all at once."""
-        with precision(self.kind):
-            moved = self.now.states.at[agent].add(jnp.asarray(by, self.now.states.dtype))
-            self.now = self.now._replace(states=moved)
+        states = np.array(self.now.states)
+        states[agent] += by
+        self.now = self.now._replace(states=states)
 
     def advance(self, still: bool = False) -> Picture:
         """Go on to the next picture, or look at the present one, and return it."""
-        count = np.asarray(0 if still else self.count, np.int32)
-        with precision(self.kind):
-            self.now, inputs = _advance(self.loop, self.now, count)
-            states = np.asarray(self.now.states, np.float64)
+        self.now, states, inputs = self.mover.move(self.loop, self.now, 0 if still else self.count)
         y = states - self.offsets
         with np.errstate(over="ignore", invalid="ignore"):
             away = (y - y[self.nearest])[:, self.measured]
             errors = np.linalg.norm(away, axis=1)
+        known = np.isfinite(inputs).all(axis=1) & ~self.mover.beyond(states).any(axis=1)
         time = self.steps * self.settings.dt
-        return Picture(time, states, np.asarray(inputs, np.float64), errors, self.offsets)
+        V = float(self.potential(y[None])[0]) if known.all() and self.potential else np.nan
+        return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(known))
 
 
 def _edges_of(heard: Exchange, graph: Graph) -> Array:
@@ -215,20 +243,12 @@ def _edges_of(heard: Exchange, graph: Graph) -> Array:
     return np.array([places[p] if p in places else places[p[::-1]] for p in pairs])
 
 
-def _inner(law: Any) -> Any:
-    return law.gain.inner
+def _inner(gain: Gain) -> Array:
+    """Return the inner loop of a gain, zero without one, so that either compiles to one."""
+    if gain.inner is not None:
+        return gain.inner
+    return np.zeros((len(gain.R), len(gain.P)))
 
 
 def _is_none(node: object) -> bool:
     return node is None
-
-
-@eqx.filter_jit
-def _advance(loop: Loop, now: Moment, count: Array) -> tuple[Moment, jax.Array]:
-    """Take steps, and return the moment with the inputs (N, m) there."""
-
-    def one(_: jax.Array, now: Moment) -> Moment:
-        return step(loop, now, control(loop, now))
-
-    now = jax.lax.fori_loop(0, count, one, now)
-    return now, control(loop, now).inputs

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _NUMBERS = {
     "formation_rmse": "formation RMSE",
     "worst_final_error": "worst final error",
-    "worst_settling_time": "settling time (s)",
+    "worst_settling_time": "settling time",
 }
 
 
@@ -66,7 +66,7 @@ def _distributions(data: "xr.Dataset") -> "Figure":
     for ax, (name, text) in zip(axes, _NUMBERS.items(), strict=True):
         values = np.sort(data[name].values.ravel())
         values = values[np.isfinite(values)]
-        ax.set_xlabel(text)
+        ax.set_xlabel(draw.label(text, data[name].attrs.get("units", "")))
         ax.set_ylim(0.0, 1.02)
         if not values.size:
             continue

@@ -26,7 +26,7 @@ def causes(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
         lost = grows(result)
         if lost or not settled:
             yield from found.causes
-        yield from _beyond(result, found) if lost else ()
+        yield from beyond(float(result.saturated.max()), found) if lost else ()
         yield from () if lost or settled else _slow(result, found)
         yield from () if lost else _lag(result, numbers, found)
     yield from _offset(result, numbers, found)
@@ -34,11 +34,14 @@ def causes(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
     yield from _chatter(result, found)
 
 
-def _beyond(result: Result, found: Promise) -> Iterator[Cause]:
-    """Name what a promise leaves out, where there is one and the errors grow."""
+def beyond(limited: float, found: Promise) -> Iterator[Cause]:
+    """Name what a promise leaves out, where there is one and the errors grow.
+
+    A limit acted in this fraction of the steps of whom it acted on most.
+    """
     if not found.promised:
         return
-    limited, remedy = float(result.saturated.max()), "start nearer to the goals"
+    remedy = "start nearer to the goals"
     left = "the starts were not near enough to the goals"
     if found.without:
         left, remedy = found.without, "leave it out to see what it costs"

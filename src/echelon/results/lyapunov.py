@@ -1,7 +1,7 @@
 """The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and why it falls or rises."""
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -80,12 +80,13 @@ def lyapunov(result: Result) -> Lyapunov | None:
         y, f, xdot = now
         later, f_after, _ = after
         difference = _difference(result.model)
-        z, delta = _deviations(graph, y, difference)
-        z_later, delta_later = _deviations(graph, later, difference)
+        deviations = Deviations(graph, difference)
+        z, delta = deviations(y)
+        z_later, delta_later = deviations(later)
         value = 0.5 * _form(delta, P, z)
         return Lyapunov(
             value=value,
-            rate=_form(delta, P, _disagreement(graph, xdot, np.subtract)),
+            rate=_form(delta, P, Deviations(graph, np.subtract).disagreement(xdot)),
             drift=_drift(graph, P, y, f, difference),
             after=0.5 * _form(delta_later, P, z_later),
             drift_after=_drift(graph, P, later, f_after, difference),
@@ -109,12 +110,6 @@ def _difference(model: ControlAffine) -> _Difference:
 @eqx.filter_jit
 def _differences(model: ControlAffine, x: jax.Array, y: jax.Array) -> jax.Array:
     return jax.vmap(jax.vmap(model.difference))(x, y)
-
-
-def _deviations(graph: Graph, y: Array, difference: _Difference) -> tuple[Array, Array]:
-    """Return z and delta, (T, N_f, n) each, of states less their offsets (T, N, n)."""
-    z = _disagreement(graph, y, difference)
-    return z, _grounded_inverse(graph, z)
 
 
 def _drift(graph: Graph, P: Array, y: Array, f: Array, difference: _Difference) -> Array:
@@ -209,23 +204,52 @@ def _turned_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> 
     return jax.vmap(jax.vmap(state_turn(model), (0, None)))(values, -angles)
 
 
-def _disagreement(graph: Graph, values: Array, difference: _Difference) -> Array:
-    """Return the followers' z (T, N_f, n) of values (T, N, n)."""
-    frames, agents, n = values.shape
-    i, j = graph.edges.T
-    edge = np.arange(len(i))
-    signs = np.concatenate([graph.weights, -graph.weights])
-    places = (np.concatenate([i, j]), np.concatenate([edge, edge]))
-    gather = sp.csr_array(sp.coo_array((signs, places), shape=(agents, len(i))))
-    # Differences first, as in the closed loop: at consensus they vanish exactly.
-    differences = np.moveaxis(difference(values[:, i], values[:, j]), 1, 0).reshape(len(i), -1)
-    z = np.moveaxis((gather @ differences).reshape(agents, frames, n), 0, 1)
-    return z[:, list(graph.followers)]
+@final
+class Deviations:
+    """z and delta of a graph, its Laplacian factored once.
+
+    Args:
+        graph: who hears whom.
+        difference: of states (T, E, n).
+    """
+
+    def __init__(self, graph: Graph, difference: _Difference) -> None:
+        """Factor the followers' Laplacian."""
+        i, j = graph.edges.T
+        edge = np.arange(len(i))
+        signs = np.concatenate([graph.weights, -graph.weights])
+        places = (np.concatenate([i, j]), np.concatenate([edge, edge]))
+        self._gather = sp.csr_array(sp.coo_array((signs, places), shape=(graph.agents, len(i))))
+        self._graph, self._difference = graph, difference
+        self._solve = spla.splu(sp.csc_array(graph.grounded_laplacian())).solve
+
+    def __call__(self, y: Array) -> tuple[Array, Array]:
+        """Return z and delta, (T, N_f, n) each, of states less their offsets y (T, N, n)."""
+        z = self.disagreement(y)
+        frames, followers, n = z.shape
+        # delta with (L_g kron I) delta = z.
+        columns = np.moveaxis(z, 1, 0).reshape(followers, -1)
+        solved = self._solve(columns)
+        return z, np.moveaxis(solved.reshape(followers, frames, n), 0, 1)
+
+    def disagreement(self, values: Array) -> Array:
+        """Return the followers' z (T, N_f, n) of values (T, N, n)."""
+        frames, agents, n = values.shape
+        i, j = self._graph.edges.T
+        # Differences first, as in the closed loop: at consensus they vanish exactly.
+        apart = self._difference(values[:, i], values[:, j])
+        differences = np.moveaxis(apart, 1, 0).reshape(len(i), -1)
+        z = np.moveaxis((self._gather @ differences).reshape(agents, frames, n), 0, 1)
+        return z[:, list(self._graph.followers)]
 
 
-def _grounded_inverse(graph: Graph, z: Array) -> Array:
-    """Return delta with (L_g kron I) delta = z, for z (T, N_f, n)."""
-    frames, followers, n = z.shape
-    columns = np.moveaxis(z, 1, 0).reshape(followers, -1)
-    solved = spla.splu(sp.csc_array(graph.grounded_laplacian())).solve(columns)
-    return np.moveaxis(solved.reshape(followers, frames, n), 0, 1)
+def potential(model: ControlAffine, graph: Graph, P: Array) -> Callable[[Array], Array]:
+    """Return V (T,) as a function of states less their offsets (T, N, n), in float64."""
+    deviations = Deviations(graph, _difference(model))
+
+    def value(y: Array) -> Array:
+        with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
+            z, delta = deviations(y)
+            return 0.5 * _form(delta, P, z)
+
+    return value

@@ -370,12 +370,17 @@ class LiveSpec(BaseModel, **STRICT):
 
     at: Annotated[NotNegative, Unit("s")]
     """When, s."""
+    law: str | None = None
+    """The followers' law from then on; its agents remember nothing of the one before."""
     coupling: Annotated[Positive | None, Unit("1")] = None
     """The coupling from then on."""
     feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
     """1 where followers are sent what `follower.feedforward` says, 0 where nothing."""
     method: str | None = None
-    """The method of the followers' gain, with the coupling that it chooses."""
+    """The method of the followers' gain, with the coupling that it chooses; `scenario` for the
+    scenario's own."""
+    shape: str | None = None
+    """Shape of the formation, by a name of `formation`; `scenario` for the scenario's own."""
     size: Annotated[Positive | None, Unit("1")] = None
     """Size of the formation, times that of `formation`."""
     turn: Annotated[float | None, Unit("deg")] = None

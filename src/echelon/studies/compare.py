@@ -16,7 +16,7 @@ from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
-from echelon.engine.simulate import simulate
+from echelon.engine.simulate import Underway, simulate
 from echelon.engine.work import SolverStats
 from echelon.gains.fixed import FixedGain
 from echelon.gains.gain import Gain, Method, synthesize
@@ -249,8 +249,8 @@ class _Watch:
         self.ticks: list[tuple[float, int, int]] = []
         self.check = check
 
-    def __call__(self, done: int, total: int) -> None:
-        self.ticks.append((time.perf_counter(), done, total))
+    def __call__(self, run: Underway) -> None:
+        self.ticks.append((time.perf_counter(), run.done, run.steps))
         self.check()
 
     @property

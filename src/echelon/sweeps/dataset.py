@@ -10,7 +10,7 @@ from echelon.core.provenance import versions
 from echelon.core.types import Array
 from echelon.scenario.yaml import inline_yaml
 from echelon.sweeps.axes import Axis
-from echelon.sweeps.numbers import MISSING, NUMBERS, OF_AGENT, OUTCOMES, REFUSED, WORDS
+from echelon.sweeps.numbers import MISSING, NUMBERS, OF_AGENT, OUTCOMES, REFUSED, UNIT, WORDS
 from echelon.sweeps.plan import Sweep
 
 if TYPE_CHECKING:
@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 _Z = 1.96
 """Of a normal distribution, within which 95 % lie."""
-_SECONDS = ("settling_time", "worst_settling_time")
+_UNITS = {"settling_time": "s", "worst_settling_time": "s", "promise_rate": "1/s"}
+_ERRORS = (
+    *("rmse", "steady_rmse", "final_error", "leader_rmse", "leader_steady_rmse"),
+    *("formation_rmse", "formation_steady_rmse", "worst_final_error"),
+)
 _WHAT = {
     "outcome": "how the run ended",
     "promised": "whether anything was promised, before the run",
@@ -30,7 +34,7 @@ _WHAT = {
     "worst_settling_time": "when the last follower's error came below 1 cm for good",
     "saturated": "fraction of steps in which a limit changed the input",
     "saturation_fraction": "the same, of all agents",
-    "promise_rate": "rate at which errors are promised to shrink, 1/s",
+    "promise_rate": "rate at which errors are promised to shrink",
     "promise_against": "what stands against any promise",
     "certified_radius": "r of the certified set: sum_i delta_i'P delta_i <= r^2",
     "start_size": "r on which the run starts",
@@ -57,11 +61,19 @@ def dataset_of(plan: Sweep, batches: "Sequence[Batch]") -> "xr.Dataset":
             whole[(rows, slice(part.shape[1])) if inner else rows] = part
         dims = (*keys, "agent") if inner else keys
         variables[name] = (dims, _arranged(plan, whole), _attributes(name))
+    _measure(variables)
     coordinates = {axis.key: _values(axis) for axis in plan.axes} | {"agent": np.arange(agents)}
     told = {f"version_{name}": text for name, text in versions().items()}
     told |= {"scenario": plan.scenario.name, "scenario_text": plan.scenario.text}
     told["over"] = "\n".join(axis.text for axis in plan.axes)
     return xr.Dataset(variables, coordinates, told)
+
+
+def _measure(variables: dict[str, Any]) -> None:
+    """Give errors their unit in the place of the column that says it, where all runs have one."""
+    found = {str(unit) for unit in variables.pop(UNIT)[1].ravel() if unit}
+    for name in _ERRORS if found == {"m"} else ():
+        variables[name][2]["units"] = "m"
 
 
 _CODES = ("outcome", "promised")
@@ -90,8 +102,8 @@ def _values(axis: Axis) -> Array:
 
 def _attributes(name: str) -> dict[str, Any]:
     found: dict[str, Any] = {"long_name": _WHAT[name]} if name in _WHAT else {}
-    if name in _SECONDS:
-        found["units"] = "s"
+    if name in _UNITS:
+        found["units"] = _UNITS[name]
     if name == "outcome":
         codes = {MISSING: "missing", REFUSED: "refused"}
         codes |= {k: each.name.lower() for each, k in OUTCOMES.items()}

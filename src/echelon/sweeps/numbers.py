@@ -29,7 +29,8 @@ NUMBERS = (
     "certified_radius",
     "start_size",
 )
-WORDS = ("message", "promise_kind", "promise_theorem", "promise_against", "engine")
+UNIT = "error_unit"
+WORDS = ("message", "promise_kind", "promise_theorem", "promise_against", "engine", UNIT)
 Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
 
@@ -57,6 +58,7 @@ def numbers_of(result: Result, promise: Promise) -> dict[str, Any]:
         "leader_steady_rmse": _number(found.leader.steady_rmse),
         "saturation_fraction": found.saturation_fraction,
         "engine": result.engine,
+        UNIT: result.unit,
         **_promised(promise),
     }
 

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.plots.style import FLOOR
 from echelon.results.metrics import SETTLED
 from echelon.results.recording import Recording
 from echelon.viewer.pack import Group
@@ -12,7 +13,6 @@ from echelon.viewer.pack import Group
 NAMED = 6
 """With more followers than this, curves are of the worst and the median."""
 _POINTS = 1200
-_FLOOR = 1e-17
 
 
 class Charts(NamedTuple):
@@ -30,11 +30,13 @@ class _Sheet:
         self.keep = _frames(run)
         self.columns: list[Array] = []
 
-    def line(self, name: str | None, values: Array, colour: int | str, log: bool) -> dict[str, Any]:
+    def line(
+        self, name: str | None, values: Array, colour: int | str, log: bool, floor: float = FLOOR
+    ) -> dict[str, Any]:
         shown = np.asarray(values, np.float64)[self.keep]
         if log:
             # A logarithm has no 0, and below rounding there is nothing to see.
-            shown = np.log10(np.where(shown > _FLOOR, shown, np.nan))
+            shown = np.log10(np.where(shown > floor, shown, np.nan))
         self.columns.append(np.where(np.isfinite(shown), shown, np.nan))
         return {"name": name, "colour": colour, "series": len(self.columns) - 1}
 
@@ -89,7 +91,8 @@ def _slope(run: Recording, begin: float, times: float) -> list[dict[str, Any]]:
 def _lyapunov(run: Recording, sheet: _Sheet) -> list[dict[str, Any]]:
     if run.lyapunov is None:
         return []
-    lines = [sheet.line("V", run.lyapunov, 0, True)]
+    # V is a square, and so is what is its rounding.
+    lines = [sheet.line("V", run.lyapunov, 0, True, FLOOR**2)]
     lines += _slope(run, float(run.lyapunov[0]), 2.0)
     return [_chart("Lyapunov function V", "", True, lines, [])]
 

@@ -20,6 +20,7 @@ _SCRIPTS = (
     "chart.js",
     "controls.js",
     "live.js",
+    "growing.js",
     "replay.js",
 )
 

@@ -35,7 +35,7 @@ class Live {
     this.makeCharts();
     this.views = new ViewControls(this.view, () => this.charts, () => this.show());
     this.views.onlink = (edge) => this.ask(this.view.alive[edge] ? "cut" : "restore", run.edges[edge]);
-    this.makeKnobs();
+    this.makeKnobs(run.knobs, run.choices);
     this.makeFooter();
     this.chosenAgent = run.agents > 1 ? [...Array(run.agents).keys()].find((i) => !run.leaders.includes(i)) : 0;
     this.listen();
@@ -47,6 +47,7 @@ class Live {
     const { run } = this, line = (name, colour) => ({ name, colour, values: [] });
     const told = [{ title: "formation error", unit: run.unit, log: true, lines: [line("worst", 1), line("median", 0)], marks: [{ value: 0.01, name: run.unit ? "1 cm" : "0.01" }] }];
     if (run.limited) told.push({ title: run.loads ? "motors" : "inputs", unit: "% of the limit", log: false, lines: [line("largest", 1), line("smallest", 0)], marks: [{ value: 100, name: "limit", below: true }, { value: 0, name: "limit" }] });
+    if (run.lyapunov) told.splice(1, 0, { title: "Lyapunov function V", unit: "", log: true, lines: [line("V", 0)], marks: [] });
     this.charts = told.map((each) => new Chart($("#side"), { ...each, times: [] }));
   }
 
@@ -59,8 +60,8 @@ class Live {
 
   fill(time, numbers) {
     const { run, moment } = this, { agents, axes, turns, loads } = run;
-    const before = moment.position.slice(), [worst, median, most, least, factor, wind] = numbers;
-    let at = 6;
+    const before = moment.position.slice(), [worst, median, most, least, lyapunov, factor, wind] = numbers;
+    let at = 7;
     at = this.places(numbers, at, axes, moment.position, time);
     at = this.places(numbers, at, axes, moment.goal, time);
     for (let i = 0; i < agents; i++, at += turns)
@@ -70,8 +71,11 @@ class Live {
     if (this.pictures++ && time > moment.time) this.view.trail.push(before, moment.position, time);
     else this.view.trail.forget();
     moment.time = time;
-    this.numbers = { worst, median, factor, wind };
-    this.chart(time, [[worst, median].map(Math.log10), [100 * most, 100 * least]]);
+    this.numbers = { worst, median, lyapunov, factor, wind };
+    // A logarithm has no 0, and below rounding there is nothing to see.
+    const log = (value, floor = 1e-17) => (value > floor ? Math.log10(value) : NaN);
+    // V is of the second order in errors.
+    this.chart(time, [[log(worst), log(median)], ...(run.lyapunov ? [[log(lyapunov, 1e-34)]] : []), [100 * most, 100 * least]]);
     this.clock.innerHTML = `<b>${time.toFixed(1)}</b> s${factor < 0.95 ? ` \u00b7 ${factor.toFixed(2)} \u00d7 real time` : ""}`;
     this.show();
   }
@@ -109,7 +113,9 @@ class Live {
   hear(told) {
     if (told.promise) this.tellPromise(told.promise);
     if (told.note !== undefined) this.note = told.note;
-    if (told.reset) this.view.trail.forget();
+    if (told.causes) this.causes = told.causes;
+    if (told.reset) (this.view.trail.forget(), (this.causes = []));
+    if (told.panel) this.makeKnobs(told.panel, told.choices);
     if (told.knobs) this.stand(told);
     this.tellNotes();
   }
@@ -127,9 +133,10 @@ class Live {
   }
 
   stand(told) {
-    for (const [name, value] of Object.entries(told.knobs)) this.knobs[name]?.set(value);
+    for (const [name, value] of Object.entries({ ...told.knobs, ...told.chosen })) this.knobs[name]?.set(value);
     const cut = new Set(told.cut.map(([i, j]) => `${i} ${j}`));
     this.run.edges.forEach(([i, j], edge) => this.view.setLink(edge, !cut.has(`${i} ${j}`)));
+    this.chosen = told.chosen;
     this.paused = told.paused;
     this.pauseButton.replaceChildren(icon(this.paused ? "play" : "pause"));
   }
@@ -149,14 +156,23 @@ class Live {
     }
   }
 
-  makeKnobs() {
+  // Knobs and choices of the law that runs.
+  makeKnobs(knobs, choices) {
     this.knobs = {};
-    for (const told of this.run.knobs) {
-      const knob = told.name === "feedforward" ? new Switch(told, (value) => this.ask(told.name, value)) : new Knob(told, (value) => this.ask(told.name, value));
+    this.panel.replaceChildren();
+    for (const told of knobs) {
+      const turned = (value) => this.ask(told.name, value);
+      const knob = told.name === "feedforward" ? new Switch(told, turned) : new Knob(told, turned);
       this.knobs[told.name] = knob;
       this.panel.append(knob.element);
     }
-    if (this.run.methods.length) this.panel.append(this.makeMethods());
+    const words = { law: "law", method: "gain method", shape: "shape" };
+    const rows = Object.entries(choices).filter(([, names]) => names.length > 1);
+    this.panel.append(make("div", { class: "choices" }, ...rows.map(([name, names]) => this.makeChoice(name, words[name], names))));
+    this.makeButtons();
+  }
+
+  makeButtons() {
     const button = (words, title, act) => {
       const made = make("button", { title }, words);
       made.addEventListener("click", act);
@@ -169,12 +185,18 @@ class Live {
     this.panel.append(make("p", { class: "hint" }, "click a link to cut or restore it, an agent to choose it"));
   }
 
-  makeMethods() {
-    const select = make("select", { "aria-label": "gain method" }, make("option", { value: "" }, "as in the scenario"));
-    for (const name of this.run.methods) select.append(make("option", { value: name }, name));
-    select.addEventListener("change", () => select.value && this.ask("method", select.value));
-    this.knobs.method = { set: (value) => (select.value = value ?? "") };
-    return make("label", { class: "knob" }, make("span", {}, "gain method"), select);
+  // A list to choose from, of which one stands for what the scenario says.
+  makeChoice(name, words, names) {
+    const select = make("select", { "aria-label": words });
+    for (const each of names) select.append(make("option", { value: each }, each === "scenario" ? "the scenario's" : each));
+    const set = (value) => (select.value = value ?? "scenario");
+    // What is refused leaves the choice as it was.
+    select.addEventListener("change", async () => {
+      const told = await this.ask(name, select.value);
+      if (told.fault) set(this.chosen?.[name]);
+    });
+    this.knobs[name] = { set };
+    return make("label", { class: "choice" }, make("span", {}, words), select);
   }
 
   async save() {

@@ -9,11 +9,35 @@ class Player {
     document.body.classList.toggle("flat", run.space.kind !== "space");
     dress(run);
     this.view = new View($("#scene"), run);
-    this.charts = readCharts(run).map((told) => new Chart($("#side"), told, (time) => this.seek(run.frameOf(time))));
+    this.makeCharts(run.growing ? run.charts : readCharts(run));
     this.views = new ViewControls(this.view, () => this.charts, () => this.seek(this.frame));
     this.makeFooter();
     this.listen();
     this.seek(0);
+  }
+
+  makeCharts(told) {
+    this.charts = told.map((each) => new Chart($("#side"), each, (time) => this.seek(this.run.frameOf(time))));
+  }
+
+  // A run that is being computed has more frames.
+  grow(newest) {
+    const { run } = this;
+    if (!this.charts.length) this.makeCharts(run.charts);
+    this.scrub.max = run.frames - 1;
+    this.tell(`Computed until ${run.reached.toFixed(1)} of ${run.horizon} s.`);
+    this.seek(newest ? run.frames - 1 : this.frame);
+    for (const chart of this.charts) chart.draw();
+  }
+
+  tell(words) {
+    $(".notes").textContent = words;
+  }
+
+  // The whole run takes the place of what came of it, at the same time.
+  reload() {
+    sessionStorage.setItem("echelon", JSON.stringify([this.run.title, this.run.at(this.frame).time]));
+    location.reload();
   }
 
   makeFooter() {
@@ -99,8 +123,10 @@ export async function start(data) {
   const length = new DataView(data).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
   if (header.stream) return startLive(header);
-  const run = new Replay(header, new Uint8Array(data, 4 + length));
+  const run = header.growing ? new Growing(header) : new Replay(header, new Uint8Array(data, 4 + length));
   const player = new Player(run);
+  if (header.growing) player.tell("The first stretch is being computed."), feed(run, player);
+  else goOn(player);
   // What the tests ask the page for.
   globalThis.echelon = {
     run, player,
@@ -114,4 +140,16 @@ export async function start(data) {
     get links() { return run.edges.filter((_, k) => player.view.alive[k]); },
     whereOnScreen: (agent) => player.view.projectAgent(agent),
   };
+}
+
+// A page that was loaded anew goes on where it was.
+function goOn(player) {
+  let before = null;
+  try {
+    before = JSON.parse(sessionStorage.getItem("echelon"));
+    sessionStorage.removeItem("echelon");
+  } catch {
+    // A file may be allowed no storage.
+  }
+  if (before && before[0] === player.run.title) player.seek(player.run.frameOf(before[1]));
 }

@@ -1,0 +1,72 @@
+"""`echelon run --view`: a run in the browser while it is computed."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from echelon.cli.view import show_address, wait
+from echelon.core.errors import OutputError
+
+if TYPE_CHECKING:
+    from echelon.engine.record import Stretch
+    from echelon.scenario.build import Built
+    from echelon.scenario.scenario import Scenario
+
+
+@final
+class Watched:
+    """A run that pages are fed with; what they cannot show ends nothing.
+
+    Args:
+        scenario: of the run.
+        built: what it builds.
+    """
+
+    def __init__(self, scenario: "Scenario", built: "Built") -> None:
+        """Foresee it."""
+        from echelon.engine.prepare import prepare
+        from echelon.promises.promise import promise
+        from echelon.results.foreseen import foreseen
+        from echelon.results.lyapunov import potential
+        from echelon.viewer.growing import Growing
+
+        prepared = prepare(*built)
+        parts, settings = prepared.parts, prepared.problem.settings
+        told = promise(parts, settings).as_mapping()
+        self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, told)
+        P = parts.drive.metric(parts.model)
+        # Of a law that turns, P stands in axes that turn too, and V is told at the end.
+        turns = getattr(getattr(parts.drive, "follower", None), "turning", False)
+        shown = None if turns else P
+        self.potential = shown if shown is None else potential(parts.model, parts.graph, shown)
+        self.page = Growing(self.run)
+
+    def add(self, stretch: "Stretch") -> None:
+        """Show a stretch that was computed."""
+        from echelon.results.foreseen import so_far
+
+        # What was lost has no place, and a page says so at the end.
+        if stretch.finite:
+            with contextlib.suppress(OutputError):
+                self.page.add(so_far(self.run, stretch, self.potential))
+
+    def show_all(self, folder: Path) -> None:
+        """Show the run that is done, until Ctrl-C."""
+        from echelon.archive.open import open_run
+
+        self.page.finish(open_run(folder))
+        wait()
+
+
+@contextlib.contextmanager
+def watching(scenario: "Scenario", built: "Built") -> Iterator[Watched]:
+    """Serve the page of a run that begins, and open a browser."""
+    from echelon.viewer.growing import serve_growing
+    from echelon.viewer.serve import serving
+
+    watched = Watched(scenario, built)
+    server = serve_growing(watched.page, None)
+    with serving(server) as address:
+        show_address(server, address, None, browser=True)
+        yield watched
