@@ -217,9 +217,10 @@ GRAPHS = {
         lambda: synthesize(CART, [(0, 1)], Riccati()),
         "`graph` is a `list`, and must be a `Graph`.",
     ),
-    "directed networkx graph": (
-        lambda: Graph.from_networkx(nx.DiGraph([(0, 1)])),
-        "the networkx graph is directed, and must be undirected.",
+    "directed networkx graph that nobody leads": (
+        lambda: Graph.from_networkx(nx.DiGraph([(1, 0), (1, 2)])),
+        "the graph leaves agents behind: agents 1, 2 have no path to a leader (leader 0) along its "
+        "arrows; an edge [i, j] lets j hear i, so add one, or turn one round.",
     ),
     "networkx graph with names": (
         lambda: Graph.from_networkx(nx.Graph([("a", "b")])),

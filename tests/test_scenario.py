@@ -111,6 +111,10 @@ def test_defaults():
         "plant": None,
         "graph": {
             "edges": None,
+            "weights": None,
+            "directed": False,
+            "schedule": (),
+            "period": None,
             "name": "path",
             "agents": 4,
             "rows": None,

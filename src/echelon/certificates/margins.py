@@ -1,8 +1,9 @@
 """How far a stable linear loop is from losing what it promises.
 
 The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes
-A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda. All that is said here is of
-these matrices (kind: linearization), with the same delay or scale for every agent.
+A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda; those of a directed graph
+may be complex, and one of a pair stands for both, whose modes mirror each other. All that is said
+here is of these matrices (kind: linearization), with the same delay or scale for every agent.
 """
 
 import itertools
@@ -38,8 +39,8 @@ class ClosedLoop(NamedTuple):
 
     @property
     def strengths(self) -> Array:
-        """The distinct c lambda, ascending."""
-        return self.coupling * np.unique(np.asarray(self.eigenvalues, dtype=np.float64))
+        """The distinct c lambda, ascending by their real parts."""
+        return self.coupling * np.unique(np.asarray(self.eigenvalues))
 
 
 class GainMargin(NamedTuple):
@@ -54,7 +55,7 @@ class DelayMargin(NamedTuple):
 
     delay: float
     frequency: float
-    eigenvalue: float
+    eigenvalue: complex
 
 
 class InputScaling(NamedTuple):
@@ -62,7 +63,7 @@ class InputScaling(NamedTuple):
 
     abscissa: float
     scales: tuple[float, ...]
-    eigenvalue: float
+    eigenvalue: complex
 
 
 class StringGain(NamedTuple):
@@ -117,14 +118,23 @@ def gain_margin(loop: ClosedLoop) -> GainMargin:
     """
     modes(loop)
     G, strengths = loop.B @ loop.K, loop.strengths
-    edges = _crossings(loop.A, G, _FAR * strengths[-1])
+    real = np.real(strengths[np.imag(strengths) == 0.0])
+    edges = _crossings(loop.A, G, _FAR * real[-1]) if len(real) else real
+    found = [_ends(loop.A, G, float(k), edges) for k in real]
+    for k in strengths[np.imag(strengths) != 0.0]:
+        found.append(_ends(loop.A, k * G, 1.0, _crossings(loop.A, k * G, _FAR)))
+    low, high = max(each[0] for each in found), min(each[1] for each in found)
+    return GainMargin(low if low > 1.0 / _FAR else 0.0, high if high < 0.999 * _FAR else np.inf)
+
+
+def _ends(A: Array, G: Array, k: float, edges: Array) -> tuple[float, float]:
+    """Return the factors about 1 between which A - factor k G decays, by the k of its edges."""
 
     def decays(k: float) -> bool:
-        return bool(np.linalg.eigvals(loop.A - k * G).real.max() < 0.0)
+        return bool(np.linalg.eigvals(A - k * G).real.max() < 0.0)
 
-    low = max(float(_edge(decays, k, edges[edges < k][::-1], 0.0) / k) for k in strengths)
-    high = min(float(_edge(decays, k, edges[edges > k], _FAR * k) / k) for k in strengths)
-    return GainMargin(low if low > 1.0 / _FAR else 0.0, high if high < 0.999 * _FAR else np.inf)
+    low = _edge(decays, k, edges[edges < k][::-1], 0.0)
+    return float(low / k), float(_edge(decays, k, edges[edges > k], _FAR * k) / k)
 
 
 def decays_between(loop: ClosedLoop) -> bool:
@@ -150,8 +160,9 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     """Return the largest delay tau of all z, u = -c R^-1 B'P z(t - tau), that every mode survives.
 
     A root of det(s I - A + c lambda B K e^{-s tau}) reaches the axis at s = i w only where an
-    eigenvalue mu of K (i w I - A)^-1 B has size 1 / (c lambda), and first at the delay that turns
-    c lambda mu into -1. The sizes are swept over frequency once and crossed for each lambda.
+    eigenvalue mu of K (i w I - A)^-1 B has size 1 / |c lambda|, and first at the delay that turns
+    c lambda mu into -1. The sizes are swept over frequency once and crossed for each lambda; of a
+    pair of complex ones both are looked at, so that w > 0 suffices.
 
     Raises:
         GainError: a mode does not decay without delay.
@@ -172,16 +183,18 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     columns = enumerate(np.abs(loci(grid)).T)
     peaks = [_peaks(lambda w, i=i: size(w, i), grid, column) for i, column in columns]
     grid = np.union1d(grid, np.concatenate(peaks))
-    sizes, best = np.abs(loci(grid)), DelayMargin(np.inf, 0.0, float(strengths[0] / loop.coupling))
+    sizes, best = np.abs(loci(grid)), DelayMargin(np.inf, 0.0, strengths[0] / loop.coupling)
     for k in strengths:
-        for at, i in np.argwhere(np.diff(sizes > 1.0 / k, axis=0)):
+        for at, i in np.argwhere(np.diff(sizes > 1.0 / abs(k), axis=0)):
             ends, sharp = (grid[at], grid[at + 1]), 1e-13 * grid[at]
-            w = scipy.optimize.root_scalar(size, (i, 1.0 / k), "brentq", ends, xtol=sharp).root
+            edge = (i, 1.0 / abs(k))
+            w = scipy.optimize.root_scalar(size, edge, "brentq", ends, xtol=sharp).root
             mu = loci(np.array([w]))[0]
             # Loci that cross together share the size and differ in phase: the first one counts.
-            phases = np.angle(-mu[np.abs(np.abs(mu) * k - 1.0) < 1e-6]) % (2.0 * np.pi)
-            delay, eigenvalue = float(phases.min() / w), float(k / loop.coupling)
-            best = min(best, DelayMargin(delay, float(w), eigenvalue))
+            mu = mu[np.abs(np.abs(mu * k) - 1.0) < 1e-6]
+            phases = np.angle(-np.outer([k, np.conj(k)], mu)) % (2.0 * np.pi)
+            found = DelayMargin(float(phases.min() / w), float(w), k / loop.coupling)
+            best = min(best, found, key=lambda each: each.delay)
     return best
 
 
@@ -209,7 +222,8 @@ def input_scaling(
         closed = plant - loop.coupling * values[:, None, None] * (B * np.array(scales) @ K)
         abscissas = np.linalg.eigvals(closed).real.max(1)
         at = int(abscissas.argmax())
-        worst = max(worst, InputScaling(float(abscissas[at]), scales, float(values[at])))
+        found = InputScaling(float(abscissas[at]), scales, values[at])
+        worst = max(worst, found, key=lambda each: each.abscissa)
     return worst
 
 
@@ -272,9 +286,21 @@ def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -
 
 
 def _crossings(A: Array, G: Array, top: float) -> Array:
-    """Return the k in (0, top) at which two eigenvalues of A - k G may add to zero, ascending."""
+    """Return the k in (0, top) at which two eigenvalues of A - k G may add to zero, ascending.
+
+    Of a complex G, at which one of them and the conjugate of another do.
+    """
+    if np.iscomplexobj(G):
+        one = np.eye(len(A))
+        fixed, moved = (np.kron(M, one) + np.kron(one, M.conj()) for M in (A, G))
+        return _positive(fixed.astype(complex), moved, top)
     basis, (i, j) = symmetric_basis(len(A)), np.triu_indices(len(A))
     fixed, moved = (((M @ basis) + (M @ basis).swapaxes(1, 2))[:, i, j].T for M in (A, G))
+    return _positive(fixed, moved, top)
+
+
+def _positive(fixed: Array, moved: Array, top: float) -> Array:
+    """Return the k in (0, top) at which fixed - k moved is singular, ascending."""
     # As pairs, since G has few inputs' rank and most of the quotients are infinite.
     over, under = np.asarray(scipy.linalg.eigvals(fixed, moved, homogeneous_eigvals=True))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -95,6 +95,8 @@ def contracting_region(
     """
     domain, found, A, W = pairs
     strength, constant = 2.0 * coupling * spectrum.proved, W is None
+    if not strength > 0.0:
+        return None
     # P A + A'P - strength P W P is affine in a pair, so the corners of the pairs' hull suffice.
     # With A - strength W P / 2 the drift's formula gives P A + A'P - strength P W P.
     rate = rate_of(P, A, B, R, strength) if W is None else rate_of(P, A - 0.5 * strength * W @ P)
@@ -114,7 +116,7 @@ def contracting_region(
         theorem=Theorem.T1 if constant else Theorem.T2,
         domain=domain,
         # Where g varies the promise is of small errors, and none of a set.
-        radius=radius(domain, P) if constant else None,
+        radius=radius(domain, P, spectrum.skew) if constant else None,
         strength=strength,
         hull=found.matrices,
         error=found.error,
@@ -129,13 +131,16 @@ def drift_region(
     P: Array,
     coupling: float,
     spectrum: Spectrum,
-) -> RegionCertificate:
+) -> RegionCertificate | None:
     """Return what a metric (n, n) promises that the drift expands at none of its Jacobians.
 
-    It is the same for every coupling.
+    It is the same for every coupling; None where the graph lets no sum of squares stay.
     """
-    reach = radius(domain, P)
-    if reach is not None and not has_constant_input_map(model, domain):
+    varies = not has_constant_input_map(model, domain)
+    if not spectrum.proved > 0.0 or (varies and not spectrum.symmetric):
+        return None
+    reach = radius(domain, P, spectrum.skew)
+    if reach is not None and varies:
         # Then S = sum delta_i'P delta_i may rise, V = delta'(L kron P) delta may not, and
         # lambda_min S <= V <= lambda_max S.
         reach *= float(np.sqrt(spectrum.proved / spectrum.high))
@@ -152,11 +157,16 @@ def drift_region(
     )
 
 
-def radius(domain: Domain, P: Array) -> float | None:
-    """Return r with {delta'P delta <= r^2} inside the domain: r^2 = min_j margin_j^2 / W_jj."""
+def radius(domain: Domain, P: Array, skew: float = 1.0) -> float | None:
+    """Return r with {delta'P delta <= r^2} inside the domain: r^2 = min_j margin_j^2 / W_jj.
+
+    What falls on a directed graph is a sum with weights, which one agent's share may exceed by
+    their skew.
+    """
     # delta_j reaches r sqrt(W_jj) on {delta'P delta <= r^2}, by Cauchy and Schwarz in the metric P.
     margins, W = domain.margins(), np.linalg.inv(P)
     bounded = np.isfinite(margins)
     if not bounded.any():
         return None
-    return float(np.sqrt((margins[bounded] ** 2 / np.diag(W)[bounded]).min()))
+    inside = (margins[bounded] ** 2 / np.diag(W)[bounded]).min()
+    return float(np.sqrt(inside / skew))

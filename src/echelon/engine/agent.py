@@ -71,7 +71,8 @@ class Agent:
         heard = self._loop.exchange
         mine = np.asarray(heard.receivers) == agent
         self.neighbours = tuple(np.asarray(heard.senders)[mine].tolist())
-        self._weights = np.asarray(heard.weights)[mine]
+        self._weights = np.atleast_2d(np.asarray(heard.weights))[:, mine]
+        self._schedule = graph.schedule
         self._source = self._source_in(parts)
         self._memory: Memory | None = None
 
@@ -104,7 +105,10 @@ class Agent:
         Raises:
             SimulationError: one is missing, or the state has another shape.
         """
-        missing = [j for j in self.neighbours if j not in messages]
+        weights = self._weights[0 if self._schedule is None else self._schedule.row(t)]
+        now = [j for j, weight in zip(self.neighbours, weights, strict=True) if weight > 0.0]
+        weights = weights[weights > 0.0]
+        missing = [j for j in now if j not in messages]
         told = (
             None if self._source is None else messages.get(self._source, Message(np.zeros(0))).told
         )
@@ -117,11 +121,10 @@ class Agent:
             )
         with precision("float64"):
             given = self._given(self._state(x))
-            heard = jnp.asarray(np.array([messages[j].signal for j in self.neighbours]))
+            heard = jnp.asarray(np.array([messages[j].signal for j in now]))
             sent = (
                 jnp.zeros(len(self._loop.model.input_names)) if told is None else jnp.asarray(told)
             )
-            weights = jnp.asarray(self._weights)
             u, memory, signal, tells = _step(
                 self._loop, self.leads, jnp.asarray(float(t)), given, heard, weights, sent
             )

@@ -42,6 +42,23 @@ class Loop(eqx.Module):
     parents: Array | None
     levels: Array | None
     order: Array
+    switches: "Switches | None"
+
+    def stretch(self, step: int) -> tuple[int, int]:
+        """Return which row of the weights holds at a step, and for how many steps from it on."""
+        last = np.iinfo(np.int64).max
+        if self.switches is None:
+            return 0, last
+        steps, rows = self.switches
+        place = int(np.searchsorted(steps, step, side="right"))
+        return int(rows[place - 1]), int(np.append(steps, last)[place]) - step
+
+
+class Switches(NamedTuple):
+    """From which steps on (K,), ascending from 0, which rows (K,) of the weights hold."""
+
+    steps: Array
+    rows: Array
 
 
 class _Acted(NamedTuple):
@@ -89,7 +106,14 @@ def assemble(problem: Problem, leader: Law, follower: Law) -> Loop:
         levels=_levels(graph) if by_depth else None,
         # Leaders act first, and this puts what all did back into the agents' own order.
         order=np.argsort(np.concatenate([leaders, followers])),
+        switches=_switches(problem),
     )
+
+
+def _switches(problem: Problem) -> Switches | None:
+    """Return when the graph of a problem switches; None where it does not."""
+    schedule, settings = problem.graph.schedule, problem.settings
+    return None if schedule is None else Switches(*schedule.switches(settings.dt, settings.horizon))
 
 
 def _levels(graph: Graph) -> Array:
@@ -164,12 +188,15 @@ def control(loop: Loop, now: Moment) -> Control:
 
 def _disagreement(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array:
     """Return z of what neighbours hear of each other, (N, n) of states or (N, s) of signals."""
-    said = signals(loop, now, offsets)
+    said, exchange = signals(loop, now, offsets), loop.exchange
+    if loop.switches is not None:
+        steps, rows = map(jnp.asarray, loop.switches)
+        exchange = exchange.during(rows[jnp.searchsorted(steps, now.step, side="right") - 1])
     # What was sent is what is: this network neither delays nor loses.
     if said is not None:
-        return loop.exchange(said, said)
+        return exchange(said, said)
     y = now.states - offsets
-    return loop.exchange(y, y, jax.vmap(loop.model.difference))
+    return exchange(y, y, jax.vmap(loop.model.difference))
 
 
 @eqx.filter_jit

@@ -96,7 +96,7 @@ class NativeStepper(Stepper):
         shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
         self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
         self.found = places.find(plan.width, plan.rows, self.dtype)
-        self.edges = self.found.edges
+        self.edges, self.heavy = self.found.edges, self.found.weights
 
     def _read(self, rows: range) -> Array:
         """Return rows of all agents, (N, rows)."""
@@ -157,7 +157,7 @@ class NativeStepper(Stepper):
         """Go on in a loop of one formation that is like the one before, but for its numbers."""
         self.loop, self.loops = loop, [loop]
         self.own.values = self.own.of(loop)[None]
-        self.found.weights[:] = heard(loop, self.places)[2]
+        self.heavy[:] = heard(loop, self.places)[2]
         # Offsets, numbers and the wind are written with a moment.
         self._held = None
 
@@ -192,16 +192,22 @@ class NativeStepper(Stepper):
         return found
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps under one draw of the wind after the other."""
+        """Take steps under one draw of the wind, and one stretch of the graph, after the other."""
         wind = self.loop.motion.wind
         while steps:
-            count = min(steps, _STEPS)
+            count = min(steps, _STEPS, self._switch(step))
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
                 count = min(count, hold - step % hold)
             self._call(step, count, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
+
+    def _switch(self, step: int) -> int:
+        """Take the weights that hold at a step, and return for how many steps they do."""
+        row, count = self.loop.stretch(step)
+        self.found = self.found._replace(weights=self.heavy[row])
+        return count
 
     def _draw(self, number: int, hold: int) -> None:
         """Write what wind and noise are during a hold."""

@@ -19,7 +19,8 @@ class Found(NamedTuple):
     Attributes:
         neighbour_starts: (blocks + 1,) the first slot of each block.
         neighbours: (slots, lanes) what each hears, the k-th neighbour of each of a block.
-        weights: (slots, lanes) of these edges.
+        weights: (rows, slots, lanes) of these edges, a row for each stretch between switches of the
+            graph; a kernel is called with one of them.
         sources: (positions,) where each finds what it is told.
         leaders: (positions,) where each finds its leader.
         edges: rows of the edges, for the sums of how far distances are off: the differences of the
@@ -127,7 +128,9 @@ def _nearby(loop: Loop) -> Array:
     if agents < _LARGE:
         return own
     i, j = np.asarray(exchange.receivers), np.asarray(exchange.senders)
-    links = sp.csr_array((np.ones(len(i), np.int8), (i, j)), shape=(agents, agents))
+    # Both ways, as the order wants a symmetric pattern, and directed edges have none.
+    both = np.concatenate([i, j]), np.concatenate([j, i])
+    links = sp.csr_array((np.ones(2 * len(i), np.int8), both), shape=(agents, agents))
     order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
     rank = np.empty(agents, int)
     rank[order] = own
@@ -235,7 +238,7 @@ class Formations(Places):
         """Return where agents find each other in a group: what they show stands row by row."""
         loop, lanes, of, far = self.loop, self.lanes, self.alone.of, width * self.lanes
         starts, positions, weights = self.alone.heard
-        heavy = aligned((len(weights), lanes), dtype)
+        heavy = aligned((*weights.shape[:2], lanes), dtype)
         heavy[:] = weights
         ends = of[np.asarray(loop.meter.edges)] * far
         return Found(
@@ -277,12 +280,13 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     """Return whom each agent hears, slot by slot: the k-th neighbour of each of a block.
 
     Returns:
-        The first slot of each block (blocks + 1,), and of all slots the positions and weights
-        (slots, lanes).
+        The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
+        and weights (rows, slots, lanes).
     """
     exchange, agents = loop.exchange, places.agents.reshape(-1, places.lanes)
     order = np.argsort(np.asarray(exchange.receivers), kind="stable")
-    senders, weights = (np.asarray(a)[order] for a in (exchange.senders, exchange.weights))
+    senders = np.asarray(exchange.senders)[order]
+    weights = np.atleast_2d(np.asarray(exchange.weights))[:, order]
     ends = np.searchsorted(np.asarray(exchange.receivers)[order], np.arange(len(loop.offsets) + 1))
     degrees = np.diff(ends)
     slots = degrees[agents].max(axis=1)
@@ -294,7 +298,7 @@ def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
     own = np.arange(agents.size).reshape(agents.shape)[block]
     # Who has fewer neighbours hears itself, from which it differs by nothing.
     positions = np.where(there, places.of[senders[edge]], own)
-    return first, positions, np.where(there, weights[edge], 0.0)
+    return first, positions, np.where(there, weights[:, edge], 0.0)
 
 
 def edge_blocks(loop: Loop, places: "Swarm", dtype: np.dtype, far: int) -> tuple[Array, Array]:

@@ -48,10 +48,26 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
             "leaders": list(graph.leaders),
             "edges": _edges(graph),
             # Stored beside the edges: the checker compares them, and of a large graph it is all.
-            "spectrum": graph.spectrum().eigenvalues.tolist(),
+            "directed": graph.directed,
+            "switches": graph.schedule is not None,
+            "spectrum": _reals(graph.spectrum().eigenvalues),
+            "sums": _sums(graph),
         },
         "certificate": _certificate_as_mapping(gain.certificate),
     }
+
+
+def _reals(values: Array) -> list[Any]:
+    """Return numbers as JSON has them; complex ones as pairs."""
+    if not np.iscomplexobj(values):
+        return values.tolist()
+    return [[float(x.real), float(x.imag)] for x in values]
+
+
+def _sums(graph: Graph) -> list[float] | None:
+    """Return the weights of followers in the sum that falls; None where all are 1."""
+    sums = graph.spectrum().sums
+    return None if sums is None else sums.tolist()
 
 
 def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
@@ -285,7 +301,11 @@ def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine
 def _check_graph(path: PathLike, stored: Mapping[str, Any], graph: Graph) -> None:
     """Check that the spectrum is the one that the coupling was chosen for."""
     values, spectrum = stored["spectrum"], graph.spectrum()
-    ends = {"lambda_min": (values[0], spectrum.low), "lambda_max": (values[-1], spectrum.high)}
+    sizes = [abs(complex(*x)) if isinstance(x, list) else float(x) for x in values]
+    low = values[0][0] if isinstance(values[0], list) else float(values[0])
+    # Of graphs that take turns it is no eigenvalue.
+    low = spectrum.low if spectrum.weakest is not None else low
+    ends = {"lambda_min": (low, spectrum.low), "lambda_max": (max(sizes), spectrum.high)}
     # The ends bound every mode, so a coupling fits all networks that share them.
     for what, (theirs, ours) in ends.items():
         if not abs(theirs - ours) <= _SAME * ours:

@@ -22,6 +22,7 @@ from echelon.models.heading import heading_index, input_turn, state_turn, turned
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
+from echelon.network.reach import lost_at_times
 from echelon.network.spectrum import Spectrum
 
 Region: TypeAlias = Callable[[float, Spectrum], RegionCertificate | None]
@@ -173,7 +174,12 @@ class Method(eqx.Module):
         # Before the certificate, which solves with R, and takes eigenvalues of what P makes.
         check_definite("P", P)
         check_definite("R", R)
-        # L_g >= lambda_min I, so 2 c lambda_min >= rho is enough for every mode (theory, T1).
+        if not spectrum.low > 0.0:
+            raise GainError(
+                "the graph switches, and at some time no sum of errors' squares is held by it; use "
+                "the law `stopping-point`, or graphs that reach everybody and are undirected."
+            )
+        # Re lambda >= lambda_min, so 2 c lambda_min >= rho is enough for every mode (theory, T7).
         edge = None if rho is None else rho / (2.0 * spectrum.low)
         # A coupling of zero was refused above, and an edge of zero means that any coupling does.
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
@@ -255,6 +261,12 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
         raise GainError(f"`{type(method).__name__}` has no `name`, and every gain method must.")
     # JAX would differentiate in float32, which no test of stabilizability at 1e-9 survives.
     check_kind("graph", graph, Graph, GraphError)
+    lost = lost_at_times(graph)
+    if lost:
+        raise GainError(
+            f"a gain needs a graph that reaches everybody at all times, and {lost}; add an edge "
+            "there, or use the law `stopping-point`, which waits for it."
+        )
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph.spectrum())

@@ -15,10 +15,11 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
     A, B = linearize(model).with_inner(gain.inner)
     depth, parents = graph.depths(), graph.parents()
     i, j = graph.edges.T
+    heard = "heard one way" if graph.directed else "with the parent's input fed forward"
     # An edge belongs to its end that is farther out; one between leaders lands on a leader, and
     # leaders are left out below.
     weight = np.ones(graph.agents)
-    weight[np.where(depth[i] > depth[j], i, j)] = graph.weights
+    weight[j if graph.directed else np.where(depth[i] > depth[j], i, j)] = graph.weights
     used = np.unique(weight[list(graph.followers)])
     try:
         # Links of one weight are alike, and each gain is a sweep over frequencies.
@@ -28,7 +29,7 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
         ]
     except GainError:
         return (
-            f"with the parent's input fed forward, coupling {gain.coupling:.4g} times an edge's "
+            f"{heard}, coupling {gain.coupling:.4g} times an edge's "
             f"weight, {used[0]:.4g}, is too weak: a mode of the formation does not decay.",
         )
     growth = np.ones(graph.agents)
@@ -38,7 +39,7 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
             growth[agent] = growth[parents[agent]] * gains[np.searchsorted(used, weight[agent])]
     worst = int(growth.argmax())
     return (
-        "with the parent's input fed forward, each agent of a branch amplifies a push by up to "
+        f"{heard}, each agent of a branch amplifies a push by up to "
         f"||T|| = {max(gains):.3g}, and the {depth[worst]} agents up from agent {worst} by up to "
         f"{growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
     )

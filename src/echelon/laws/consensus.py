@@ -111,8 +111,10 @@ class Consensus(Law):
         return self if turning is self.turning else dataclasses.replace(self, turning=turning)
 
     def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
-        """Tell by how much a branch amplifies, where the parent's input is fed forward."""
-        if self.feedforward is not Feedforward.PARENT:
+        """Tell by how much a branch amplifies, fed its parent's input or heard one way."""
+        alone = graph.directed and graph.schedule is None
+        alone = alone and len(graph.edges) == len(graph.followers)
+        if self.feedforward is not Feedforward.PARENT and not alone:
             return ()
         return string_growth(self.gain, model, graph)
 

@@ -40,7 +40,8 @@ class Reach(eqx.Module):
     """What the graph asks of the coupling.
 
     Attributes:
-        slowest: the smallest eigenvalue of the followers' Laplacian.
+        slowest: the smallest eigenvalue of the followers' Laplacian; of a graph that switches, of
+            the mean over a period, or of the last one.
         heaviest: d_max, the largest sum of weights that one follower hears.
     """
 
@@ -49,13 +50,27 @@ class Reach(eqx.Module):
 
     @classmethod
     def of(cls, graph: Graph, leaderward: bool) -> "Reach":
-        """Return it of a graph."""
-        heard = graph.exchange(leaderward)
-        sums = np.zeros(graph.agents)
-        np.add.at(sums, heard.receivers, heard.weights)
-        own = sums[list(graph.followers)]
-        # Heard one way the Laplacian is triangular, and its eigenvalues are on its diagonal.
-        slowest = float(own.min()) if leaderward else graph.spectrum().low
+        """Return it of a graph.
+
+        Raises:
+            LawError: heard leaderward, the leader does not reach somebody after the last switch.
+        """
+        whole, schedule = graph.stretches(leaderward), graph.schedule
+        own = np.stack([L.diagonal() for L in whole])
+        if schedule is None:
+            # Heard one way the Laplacian is triangular, and its eigenvalues are on its diagonal.
+            slowest = float(own.min()) if leaderward else graph.spectrum().low
+            return cls(slowest, float(own.max()))
+        share = np.eye(len(own))[-1]
+        if schedule.period is not None:
+            share = np.diff(schedule.starts, append=schedule.period) / schedule.period
+        mean = sum(part * L.toarray() for part, L in zip(share, whole, strict=True))
+        slowest = float(np.linalg.eigvals(np.asarray(mean)).real.min())
+        if not slowest > 0.0:
+            raise LawError(
+                f"the leader does not reach everybody from {schedule.starts[-1]:g} s on where "
+                "neighbours nearer to it alone are heard; set `hears: all`, or add edges there."
+            )
         return cls(slowest, float(own.max()))
 
 

@@ -224,10 +224,11 @@ class Panel:
         kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
         i, j = graph.edges[kept].T
         heavy, count = graph.weights[kept], graph.agents
-        A = sp.coo_array((heavy, (i, j)), shape=(count, count)).toarray()
-        L = np.diag((A + A.T).sum(axis=1)) - A - A.T
+        A = sp.coo_array((heavy, (j, i)), shape=(count, count)).toarray()
+        A = A if graph.directed else A + A.T
         rows = list(graph.followers)
-        values = np.linalg.eigvalsh(L[np.ix_(rows, rows)])
+        L = (np.diag(A.sum(axis=1)) - A)[np.ix_(rows, rows)]
+        values = np.linalg.eigvals(L) if graph.directed else np.linalg.eigvalsh(L)
         with precision("float64"):
             A, B = linearize(self.parts.model).with_inner(gain.inner)
         K = gain.R_inverse @ B.T @ gain.P
@@ -255,6 +256,7 @@ class Panel:
         if knobs.cut:
             graph = self.parts.graph
             told = {"leaders": list(graph.leaders), "agents": graph.agents}
+            told |= {"directed": True} if graph.directed else {}
             data["graph"] = {"edges": self._edges(knobs), **told}
         if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
             offsets = self.offsets(knobs)
@@ -294,7 +296,7 @@ class Panel:
             GraphError: it is in two parts.
         """
         graph = self.parts.graph
-        return Graph.from_edges(self._edges(knobs), graph.leaders, graph.agents)
+        return Graph(self._edges(knobs), graph.leaders, graph.agents, graph.directed)
 
     def _edges(self, knobs: Knobs) -> list[list[Any]]:
         """Return the edges that are not cut, with their weights."""

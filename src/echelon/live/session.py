@@ -251,9 +251,10 @@ class Session:
         return {name: stands}
 
     def _edge(self, pair: Any) -> int:
-        edges = self.swarm.parts.graph.edges.tolist()
-        for place, edge in enumerate(edges):
-            if isinstance(pair, list | tuple) and sorted(edge) == sorted(pair):
+        graph = self.swarm.parts.graph
+        for place, edge in enumerate(graph.edges.tolist()):
+            turned = [] if graph.directed else edge[::-1]
+            if isinstance(pair, list | tuple) and list(pair) in (edge, turned):
                 return place
         # As a file writes it, which a checked scenario holds as a tuple.
         told = list(pair) if isinstance(pair, tuple) else pair

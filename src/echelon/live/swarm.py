@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import GraphError
+from echelon.core.errors import GraphError, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
@@ -106,7 +106,16 @@ class Swarm:
     """
 
     def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
-        """Prepare what the steps need."""
+        """Prepare what the steps need.
+
+        Raises:
+            SimulationError: the graph switches at times of its own.
+        """
+        if parts.graph.schedule is not None:
+            raise SimulationError(
+                "the graph has a `schedule`, and a live run has links cut by hand; use `echelon "
+                "run`, or leave the schedule out."
+            )
         world = World(parts.world.plant, parts.world.disturbance or Disturbance())
         prepared = prepare(parts.replace(world=world), settings)
         problem, drive = prepared.problem, prepared.parts.drive
@@ -174,7 +183,7 @@ class Swarm:
         self.potential = self._potential(knobs)
         self.offsets = self.panel.offsets(knobs)
         weights = self.weights.copy()
-        weights[np.isin(self.edge, list(knobs.cut))] = 0.0
+        weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
         loop = eqx.tree_at(
             lambda each: (each.offsets, each.exchange.weights, each.motion.wind.constant),
             self.loop,
@@ -197,7 +206,7 @@ class Swarm:
         gain = self.panel.gain(knobs)
         P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
         # Of a law that turns, P stands in axes that turn too.
-        if P is None or self.loop.follower.turning:
+        if P is None or self.loop.follower.turning or self.parts.graph.directed:
             return None
         if (knobs.cut, knobs.method) not in self.potentials:
             try:
@@ -228,9 +237,10 @@ class Swarm:
 
 def _edges_of(heard: Exchange, graph: Graph) -> Array:
     """Return which edge each of the ways goes along on which agents hear each other."""
-    places = {tuple(sorted(pair)): k for k, pair in enumerate(graph.edges.tolist())}
-    pairs = zip(np.asarray(heard.receivers).tolist(), np.asarray(heard.senders).tolist())
-    return np.array([places[i, j] if i < j else places[j, i] for i, j in pairs])
+    places = {tuple(pair): k for k, pair in enumerate(graph.edges.tolist())}
+    # A directed edge (i, j) is heard by j, and an undirected one stands once.
+    pairs = zip(np.asarray(heard.senders).tolist(), np.asarray(heard.receivers).tolist())
+    return np.array([places[p] if p in places else places[p[::-1]] for p in pairs])
 
 
 def _inner(gain: Gain) -> Array:

@@ -12,6 +12,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
 from echelon.core.types import Array
 
@@ -138,3 +139,21 @@ def _solve(matrix: Grounded, right: list[Fraction]) -> list[Fraction]:
 
 def _decimals(values: list[Fraction]) -> Array:
     return np.array([Decimal(x.numerator) / Decimal(x.denominator) for x in values], object)
+
+
+def held_sum(L: sp.csr_array, x: Array, w: Array) -> float:
+    """Return a float s >= 0 that W L + L'W >= 2 s W holds with, W = diag(w), whatever is rounded.
+
+    Off the diagonal the symmetric matrix on the left has no positive entry, so what takes a
+    positive x (n,) to nothing negative has no negative eigenvalue. L (n, n) is the grounded
+    Laplacian of a directed graph, w (n,) is positive.
+    """
+    # Diagonals of L are sums of weights, rounded once an edge; they count as they are stored, which
+    # the relative margin below makes up for.
+    own, back = L @ x, L.T @ (w * x)
+    size = abs(L) @ x
+    sizes = w * size + abs(L.T) @ (w * x)
+    degree = float(max(np.diff(L.indptr).max(), np.diff(L.tocsc().indptr).max(), 1))
+    lost = 4.0 * (degree + 4.0) * _UNIT * sizes + _LEAST
+    least = (w * own + back - lost) / (2.0 * w * x) * (1.0 - 16.0 * _UNIT)
+    return max(0.0, float(least.min()))

@@ -57,11 +57,13 @@ def count_agents(pairs: Array, agents: int | None) -> int:
     return agents
 
 
-def check_edges(pairs: Array, weights: Array, agents: int) -> tuple[Array, Array]:
-    """Return the edges with the smaller agent first, and their weights."""
-    edges = np.sort(pairs, axis=1)
+def check_edges(
+    pairs: Array, weights: Array, agents: int, directed: bool = False
+) -> tuple[Array, Array]:
+    """Return the edges, undirected ones with the smaller agent first, and their weights."""
+    edges = pairs if directed else np.sort(pairs, axis=1)
     # The first fault alone is reported, here and below.
-    for i, j in pairs[edges[:, 0] < 0][:1]:
+    for i, j in pairs[edges.min(axis=1, initial=0) < 0][:1]:
         raise GraphError(
             f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
         )
@@ -78,6 +80,23 @@ def check_edges(pairs: Array, weights: Array, agents: int) -> tuple[Array, Array
             f"the weight of edge [{i}, {j}] is {weight:g}, and must be positive and finite."
         )
     return edges, weights
+
+
+def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> list[list[float]]:
+    """Return edges (i, j) with weights that stand in a list of their own.
+
+    Raises:
+        GraphError: there are not as many, or an edge has one already.
+    """
+    edges, weights = [list(edge) for edge in edges], list(weights)
+    if len(edges) != len(weights):
+        raise GraphError(f"there are {len(edges)} edges and {len(weights)} weights of them.")
+    for edge in edges:
+        if len(edge) != 2:
+            raise GraphError(
+                f"an edge is {edge}, and must be [i, j] where weights stand in a list of their own."
+            )
+    return [[*edge, float(weight)] for edge, weight in zip(edges, weights, strict=True)]
 
 
 def _repeated(edges: Array, agents: int) -> Array:

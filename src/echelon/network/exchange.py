@@ -18,11 +18,19 @@ class Exchange(eqx.Module):
 
     The agents' own values and the values that they sent are separate arguments, since on a real
     network the second may be old or lost.
+
+    Attributes:
+        receivers, senders: (K,) who hears whom.
+        weights: (K,); of a graph that switches (S, K), a row for each stretch of time.
     """
 
     receivers: Array
     senders: Array
-    weights: Array
+    weights: Array | jax.Array
+
+    def during(self, row: jax.Array | int) -> "Exchange":
+        """Return the computation during one of the stretches."""
+        return Exchange(self.receivers, self.senders, jnp.asarray(self.weights)[row])
 
     def __call__(self, own: States, sent: States, difference: Difference = operator.sub) -> States:
         """Return z (N, n), z_i = sum_j A_ij (own_i - sent_j).

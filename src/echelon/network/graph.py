@@ -1,6 +1,6 @@
 """The communication graph (paper, Definition 2).
 
-It is undirected, weighted or not, with one or more leaders.
+It is undirected or directed, weighted or not, with one or more leaders, and may switch in time.
 """
 
 from collections.abc import Iterable, Sequence
@@ -9,49 +9,62 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
-import scipy.sparse.linalg as spla
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array, States
-from echelon.network.bound import Grounded, least_eigenvalue_bound
+from echelon.network.bound import Grounded
 from echelon.network.edges import (
     check_edges,
     check_leaders,
     check_size,
     count_agents,
-    name_agents,
+    give_weights,
     split_weights,
 )
+from echelon.network.eigenvalues import (
+    directed_spectrum,
+    switching_spectrum,
+    symmetric_spectrum,
+)
 from echelon.network.exchange import Exchange
-from echelon.network.reach import advising
+from echelon.network.radius import advising
+from echelon.network.reach import check_reached
 from echelon.network.spectrum import Spectrum
+from echelon.network.switching import Schedule, Stretch, unite
+from echelon.network.tree import ordered_outward, parents_of
 
 if TYPE_CHECKING:
     import networkx as nx
 
-# Below this many followers the dense eigenvalue routine is both faster and exact to rounding.
-_DENSE = 400
-_RESOLVED = 1e-6
-_LEFT_OUT = 1e-6
-_ITERATIONS = 30
-_ROUNDED = 1.0 - 1e-9
-"""A bound this near to an eigenvalue takes nothing from it."""
-
 
 @final
 class Graph:
-    """An immutable undirected graph on agents 0 .. N-1, some of which are leaders.
+    """An immutable graph on agents 0 .. N-1, some of which are leaders.
+
+    An edge of an undirected graph is heard both ways. A directed one (i, j) is an arrow along which
+    i tells j: **j hears i**, as in Moreau (2005) and in Ren and Beard (2008), so that arrows lead
+    from the leaders to all others, and A_ji is its weight.
+
+    Args:
+        edges: (i, j) or (i, j, weight).
+        leaders: those who lead.
+        agents: how many there are; the largest number named, plus one, when left out.
+        directed: whether edges are heard one way.
+        weights: of the edges, where these hold none.
 
     Attributes:
-        edges: (E, 2) integers, each edge once with the smaller agent first, in the order given.
-        weights: (E,) positive weights A_ij.
+        edges: (E, 2) integers, each edge once in the order given, undirected ones with the smaller
+            agent first.
+        weights: (E,) positive weights A_ij; of one that switches, the largest.
         agents: the number N of agents, leaders included.
         leaders: sorted agent numbers.
         followers: all other agents, sorted.
+        directed: whether edges are heard one way.
+        schedule: when which weights hold; None where they never change.
 
     Raises:
         GraphError: an edge is a self-loop, repeated or out of range; a weight is not positive and
-            finite; there is no leader or nothing but leaders; the graph is disconnected.
+            finite; there is no leader or nothing but leaders; no leader reaches an agent.
     """
 
     def __init__(
@@ -59,16 +72,30 @@ class Graph:
         edges: Iterable[Sequence[float]],
         leaders: Iterable[int] = (0,),
         agents: int | None = None,
+        directed: bool = False,
+        weights: Sequence[float] | None = None,
     ) -> None:
-        """Check and keep the graph; an edge is (i, j) or (i, j, weight)."""
-        pairs, weights = split_weights(edges)
-        self.agents = count_agents(pairs, agents)
-        self.edges, self.weights = check_edges(pairs, weights, self.agents)
+        """Check and keep the graph."""
+        edges = edges if weights is None else give_weights(edges, weights)
+        pairs, heavy = split_weights(edges)
+        self.directed = bool(directed)
+        count = count_agents(pairs, agents)
+        self._keep(*check_edges(pairs, heavy, count, self.directed), count, leaders, None)
+
+    def _keep(
+        self,
+        edges: Array,
+        weights: Array,
+        agents: int,
+        leaders: Iterable[int],
+        schedule: Schedule | None,
+    ) -> None:
+        self.edges, self.weights, self.agents, self.schedule = edges, weights, agents, schedule
         self.leaders = check_leaders(leaders, self.agents)
         self.followers = tuple(np.setdiff1d(np.arange(self.agents), self.leaders).tolist())
         if not self.followers:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
-        self._check_connected()
+        check_reached(self)
         self._spectrum: Spectrum | None = None
         # Runs share a graph, and its spectrum is kept: what cannot change cannot go stale.
         for array in (self.edges, self.weights):
@@ -80,60 +107,83 @@ class Graph:
         edges: Iterable[Sequence[float]],
         leaders: Iterable[int] = (0,),
         agents: int | None = None,
+        directed: bool = False,
+        weights: Sequence[float] | None = None,
     ) -> "Graph":
-        """Return the graph of the given edges.
+        """Return the graph of the given edges, as the class itself."""
+        return cls(edges, leaders, agents, directed, weights)
 
-        `agents` is the largest number named, plus one, when left out.
+    @classmethod
+    def switching(
+        cls,
+        stretches: Sequence[Stretch],
+        leaders: Iterable[int] = (0,),
+        agents: int | None = None,
+        directed: bool = False,
+        period: float | None = None,
+    ) -> "Graph":
+        """Return a graph that switches.
+
+        Args:
+            stretches: (time in s, the edges from then on), the first at 0.
+            leaders: those who lead.
+            agents: how many there are.
+            directed: whether edges are heard one way.
+            period: s, after which all begins again; the last edges stay for ever when left out.
+
+        Raises:
+            GraphError: a stretch has a false edge, the times do not ascend, or no leader reaches an
+                agent along the edges of a whole period, or along the last ones.
         """
-        return cls(edges, leaders, agents)
+        graph = cls.__new__(cls)
+        graph.directed = bool(directed)
+        pairs, heavy, count, schedule = unite(stretches, agents, period, graph.directed)
+        graph._keep(pairs, heavy, count, leaders, schedule)
+        return graph
 
     @classmethod
     def from_networkx(cls, graph: "nx.Graph[Any]", leaders: Iterable[int] = (0,)) -> "Graph":
-        """Return the graph of an undirected networkx graph whose nodes are 0 .. N-1.
+        """Return the graph of a networkx graph whose nodes are 0 .. N-1, directed where it is.
 
         The edge attribute `weight` is read, and is 1 where it is missing.
 
         Raises:
-            GraphError: the graph is directed or its nodes are not 0 .. N-1.
+            GraphError: its nodes are not 0 .. N-1.
         """
-        if graph.is_directed():
-            raise GraphError("the networkx graph is directed, and must be undirected.")
         if set(graph.nodes) != set(range(len(graph))):
-            raise GraphError(
-                "the nodes of the networkx graph must be the whole numbers from 0 on, "
-                "without a gap."
-            )
+            text = "the nodes of the networkx graph must be the whole numbers from 0 on"
+            raise GraphError(f"{text}, without a gap.")
         edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
-        return cls(edges, leaders, len(graph))
+        return cls(edges, leaders, len(graph), graph.is_directed())
 
     def with_leaders(self, more: Iterable[int]) -> "Graph":
         """Return the same graph with more leaders."""
-        return Graph(self._triples(), [*self.leaders, *more], self.agents)
+        return Graph(self._triples(), [*self.leaders, *more], self.agents, self.directed)
 
     def with_edges(self, more: Iterable[Sequence[float]]) -> "Graph":
         """Return the same graph with more edges."""
-        return Graph([*self._triples(), *more], self.leaders, self.agents)
+        return Graph([*self._triples(), *more], self.leaders, self.agents, self.directed)
 
     def _triples(self) -> list[list[float]]:
         return np.column_stack([self.edges, self.weights]).tolist()
 
     @classmethod
-    def path(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
-        """Return the line 0 - 1 - ... - (agents - 1)."""
+    def path(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
+        """Return the line 0 - 1 - ... - (agents - 1); a directed one leads away from 0."""
         check_size(agents, 2, "path")
-        return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents)
+        return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents, directed)
 
     @classmethod
-    def ring(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+    def ring(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the closed line."""
         check_size(agents, 3, "ring")
-        return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents)
+        return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents, directed)
 
     @classmethod
-    def star(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
+    def star(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the star with agent 0 in the middle."""
         check_size(agents, 2, "star")
-        return cls([(0, i) for i in range(1, agents)], leaders, agents)
+        return cls([(0, i) for i in range(1, agents)], leaders, agents, directed)
 
     @classmethod
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
@@ -174,22 +224,53 @@ class Graph:
             return cls(np.stack(np.divmod(number, agents), axis=1), leaders, agents)
 
     def adjacency(self) -> sp.csr_array:
-        """Return the symmetric adjacency matrix (N, N), sparse."""
-        both = self.exchange()
-        entries = (both.weights, (both.receivers, both.senders))
+        """Return the adjacency matrix (N, N), sparse: A_ij weighs what i hears of j.
+
+        It is symmetric for undirected graphs; of one that switches it has the largest weights.
+        """
+        return self._weighing(self.weights)
+
+    def _weighing(self, weights: Array) -> sp.csr_array:
+        (receivers, senders), place = self._ways()
+        entries = (weights[place], (receivers, senders))
         return sp.csr_array(sp.coo_array(entries, shape=(self.agents, self.agents)))
+
+    def told(self, weights: Array | None = None) -> sp.csr_array:
+        """Return (N, N), sparse: entry ij where i tells j, its weight; of some weights (E,)."""
+        A = self._weighing(self.weights if weights is None else weights)
+        A.eliminate_zeros()
+        return sp.csr_array(A.T) if self.directed else A
 
     def laplacian(self) -> sp.csr_array:
         """Return the Laplacian (N, N), sparse; its rows sum to zero."""
-        return sp.csr_array(csgraph.laplacian(self.adjacency()))
+        return self._laplacian(self.adjacency())
+
+    def _laplacian(self, A: sp.csr_array) -> sp.csr_array:
+        return sp.csr_array(csgraph.laplacian(A, use_out_degree=self.directed))
 
     def grounded_laplacian(self) -> sp.csr_array:
         """Return the follower block of the Laplacian, sparse and positive definite.
 
-        It is the paper's L of Lemma 1.
+        It is the paper's L of Lemma 1; of a directed graph it is not symmetric.
         """
-        rows = np.asarray(self.followers)
-        return sp.csr_array(self.laplacian()[rows][:, rows])
+        return self._grounding(self.weights)
+
+    def _grounding(self, weights: Array, leaderward: bool = False) -> sp.csr_array:
+        A, rows = self._weighing(weights), np.asarray(self.followers)
+        if leaderward:
+            depth, A = self.depths(), sp.coo_array(A)
+            A.data = np.where(depth[A.col] < depth[A.row], A.data, 0.0)
+            A = sp.csr_array(A)
+            return sp.csr_array(sp.diags_array(A.sum(axis=1)) - A)[rows][:, rows]
+        return sp.csr_array(self._laplacian(A)[rows][:, rows])
+
+    def stretches(self, leaderward: bool = False) -> tuple[sp.csr_array, ...]:
+        """Return the grounded Laplacian of each stretch of time, one where nothing switches.
+
+        Leaderward, of hearing those alone that are nearer to a leader.
+        """
+        rows = self.weights[None] if self.schedule is None else self.schedule.weights
+        return tuple(self._grounding(row, leaderward) for row in rows)
 
     def inverse_grounded(self) -> Array:
         """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
@@ -199,32 +280,20 @@ class Graph:
     def spectrum(self) -> Spectrum:
         """Return the eigenvalues of the grounded Laplacian; computed once.
 
-        All of them up to 400 followers, beyond that the smallest and the largest.
+        All of them, or beyond 400 followers of an undirected graph the smallest and the largest; of
+        one that switches, those of all stretches.
 
         Raises:
-            GraphError: the weights are too far apart for the smallest to be known.
+            GraphError: the weights are too far apart for the smallest to be known, or too many
+                followers of a directed graph hear each other in circles.
         """
         if self._spectrum is None:
-            L, count = self.grounded_laplacian(), len(self.followers)
-            if count <= _DENSE:
-                dense = L.toarray()
-                eigenvalues, vector = np.linalg.eigvalsh(dense), np.linalg.eigh(dense)[1][:, 0]
+            if self.schedule is not None:
+                self._spectrum = switching_spectrum(self.stretches())
+            elif self.directed:
+                self._spectrum = directed_spectrum(self.grounded_laplacian(), self.weights)
             else:
-                eigenvalues, vector = _extremes(L)
-            low, high = float(eigenvalues[0]), float(eigenvalues[-1])
-            # Floats know it to the rounding of the largest.
-            known = low if low > _RESOLVED * high else np.inf
-            proved = least_eigenvalue_bound(self._grounded(), _spread(L, vector), known)
-            if not proved > 0.0:
-                raise GraphError(
-                    f"the weights of the graph lie between {self.weights.min():.3g} and "
-                    f"{self.weights.max():.3g}, too far apart to tell its smallest eigenvalue "
-                    "from 0; bring them nearer to each other."
-                )
-            # Where rounding may have raised it, the eigenvalue is no better known than its bound.
-            eigenvalues[0] = min(eigenvalues[0], proved / _ROUNDED)
-            eigenvalues.setflags(write=False)
-            self._spectrum = Spectrum(eigenvalues, count, proved)
+                self._spectrum = symmetric_spectrum(self.grounded_laplacian(), self._grounded())
         return self._spectrum
 
     def _grounded(self) -> Grounded:
@@ -247,17 +316,17 @@ class Graph:
         return Spectrum(weights, len(weights), float(weights[0]))
 
     def neighbours(self, agent: int) -> tuple[int, ...]:
-        """Return the agents linked to `agent`, sorted."""
+        """Return the agents that `agent` hears, sorted."""
         if not 0 <= agent < self.agents:
             raise GraphError(
                 f"agent {agent} is not in this graph, whose agents are 0 to {self.agents - 1}."
             )
-        i, j = self.edges.T
-        return tuple(sorted(np.concatenate([j[i == agent], i[j == agent]]).tolist()))
+        (receivers, senders), _ = self._ways()
+        return tuple(sorted(senders[receivers == agent].tolist()))
 
     def nearest_leader(self) -> tuple[int, ...]:
         """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
-        hops = csgraph.dijkstra(self.adjacency(), indices=self.leaders, unweighted=True)
+        hops = csgraph.dijkstra(self.told(), indices=self.leaders, unweighted=True)
         # `argmin` takes the first of equals, and leaders are sorted.
         return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
 
@@ -267,133 +336,67 @@ class Graph:
         It is the order in which agents can plan when each needs the plans of those before it. Among
         the equally far the lower number comes first; a leader has no earlier neighbours.
         """
-        # Stable, which leaves the equally far in the order of their numbers.
-        order = np.argsort(self.depths(), kind="stable").tolist()
-        known = {agent: order[:place] for place, agent in enumerate(order)}
-        return tuple(
-            (i, () if i in self.leaders else tuple(j for j in self.neighbours(i) if j in known[i]))
-            for i in order
-        )
+        return ordered_outward(self)
 
     def depths(self) -> Array:
         """Return (N,) how many edges away each agent's nearest leader is."""
         among = {"indices": self.leaders, "unweighted": True, "min_only": True}
-        return csgraph.dijkstra(self.adjacency(), **among).astype(int)
+        return csgraph.dijkstra(self.told(), **among).astype(int)
 
     def parents(self) -> tuple[int, ...]:
         """Return each agent's only neighbour that is nearer to a leader; leaders are their own.
 
         Raises:
-            GraphError: the graph is no tree (edges between leaders aside).
+            GraphError: the graph is no tree (edges between leaders aside), lets an agent hear more
+                than one where it is directed, or switches.
         """
-        depth, parents = self.depths(), np.arange(self.agents)
-        i, j = self.edges[depth[self.edges].max(axis=1) > 0].T
-        child, parent = np.where(depth[i] > depth[j], (i, j), (j, i))
-        # An edge between two that are equally far gives both of them one more way.
-        counted = np.concatenate([child, parent[depth[i] == depth[j]]])
-        several = np.flatnonzero(np.bincount(counted, minlength=self.agents) > 1)
-        if len(several):
-            raise GraphError(
-                f"the graph is no tree: {name_agents(several)} more than one way to a leader, "
-                "and so no one parent; the feed-forward `relay` needs none."
-            )
-        parents[child] = parent
-        return tuple(parents.tolist())
+        return parents_of(self)
+
+    def _ways(self) -> tuple[tuple[Array, Array], Array]:
+        """Return who hears whom, receivers and senders, and along which edge, (K,) each."""
+        (i, j), edge = self.edges.T, np.arange(len(self.edges))
+        if self.directed:
+            return (j, i), edge
+        return (np.concatenate([i, j]), np.concatenate([j, i])), np.concatenate([edge, edge])
 
     def exchange(self, leaderward: bool = False) -> "Exchange":
-        """Return the computation of the disagreement; leaderward, of those nearer a leader."""
-        (i, j), w = self.edges.T, self.weights
-        heard = np.concatenate([i, j]), np.concatenate([j, i]), np.concatenate([w, w])
-        if leaderward:
-            nearer = self.depths()[heard[1]] < self.depths()[heard[0]]
-            heard = tuple(part[nearer] for part in heard)
-        return Exchange(*heard)
+        """Return the computation of the disagreement; leaderward, of those nearer a leader.
 
-    def disagreement(self, y: States) -> States:
-        """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n)."""
-        return self.exchange()(y, y)
+        Of a graph that switches its weights are (S, K), a row for each stretch.
+        """
+        (receivers, senders), place = self._ways()
+        if leaderward:
+            depth = self.depths()
+            nearer = depth[senders] < depth[receivers]
+            receivers, senders, place = receivers[nearer], senders[nearer], place[nearer]
+        rows = self.weights if self.schedule is None else self.schedule.weights
+        return Exchange(receivers, senders, rows[..., place])
+
+    def disagreement(self, y: States, t: float = 0.0) -> States:
+        """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n), at a time (s)."""
+        heard = self.exchange()
+        return (heard if self.schedule is None else heard.during(self.schedule.row(t)))(y, y)
 
     def __eq__(self, other: object) -> bool:
         """Tell whether two graphs have the same agents, leaders and edges in the same order."""
         return (
             isinstance(other, Graph)
-            and (self.agents, self.leaders) == (other.agents, other.leaders)
+            and self._known == other._known
             and np.array_equal(self.edges, other.edges)
             and np.array_equal(self.weights, other.weights)
         )
 
     def __hash__(self) -> int:
         """Hash what `__eq__` compares."""
-        return hash((self.agents, self.leaders, self.edges.tobytes(), self.weights.tobytes()))
+        return hash((self._known, self.edges.tobytes(), self.weights.tobytes()))
+
+    @property
+    def _known(self) -> tuple[object, ...]:
+        told = self.schedule
+        when = None if told is None else (*(x.tobytes() for x in told[:2]), told.period)
+        return self.agents, self.leaders, self.directed, when
 
     def __repr__(self) -> str:
         """Say the size."""
-        return f"Graph({self.agents} agents, {len(self.edges)} edges, leaders {list(self.leaders)})"
-
-    def _check_connected(self) -> None:
-        count, label = csgraph.connected_components(self.adjacency(), directed=False)
-        if count == 1:
-            return
-        reached = np.isin(label, label[list(self.leaders)])
-        lost = np.flatnonzero(~reached)
-        if len(lost):
-            raise GraphError(
-                f"the graph is disconnected: {name_agents(lost)} no path to a leader "
-                f"({_name_leaders(self)})."
-            )
-        # Each piece has a leader of its own, and would be a formation of its own.
-        apart = np.flatnonzero(label != label[0])
-        raise GraphError(f"the graph is disconnected: {name_agents(apart)} no path to agent 0.")
-
-
-def factor_inverse(L: sp.csr_array) -> spla.LinearOperator:
-    """Return x -> L^-1 x for a sparse positive definite matrix, which is factored here, once."""
-    # An ordering and a pivoting that keep L's symmetry leave a factor many times sparser.
-    symmetric = {"SymmetricMode": True}
-    factor = spla.splu(sp.csc_array(L), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
-    return spla.LinearOperator(L.shape, factor.solve, dtype=np.float64)  # pyright: ignore
-
-
-def _extremes(L: sp.csr_array) -> tuple[Array, Array]:
-    """Return the ends of the spectrum of a sparse positive definite matrix, and the low vector."""
-    # About 0 the smallest is far from the others, relative to itself; Lanczos on L finds it last.
-    inverse = factor_inverse(L)
-    smallest, vectors = spla.eigsh(L, k=1, sigma=0.0, OPinv=inverse)
-    # The same about a bound of the largest, the sum of two neighbours' degrees (Anderson, Morley):
-    # of a line the largest lie so close together that Lanczos on L hardly parts them.
-    entries, degrees = sp.coo_array(L), L.diagonal()
-    bound = 1.000001 * float((degrees[entries.row] + degrees[entries.col]).max())
-    above = factor_inverse(sp.csr_array(bound * sp.eye_array(len(degrees)) - L))
-    away = spla.LinearOperator(L.shape, lambda x: -above.matvec(x), dtype=np.float64)  # pyright: ignore
-    largest = spla.eigsh(L, k=1, sigma=bound, OPinv=away, return_eigenvectors=False)
-    return np.concatenate([smallest, largest]), vectors[:, 0]
-
-
-def _spread(L: sp.csr_array, vector: Array) -> Array:
-    """Return an eigenvector with entries on all pieces of a network that its leaders cut apart.
-
-    On a piece that it leaves out, inverse iteration finds the piece's own.
-    """
-    _, piece = csgraph.connected_components(L, directed=False)
-    size = np.zeros(piece.max() + 1)
-    np.maximum.at(size, piece, np.abs(vector))
-    if (size > _LEFT_OUT).all():
-        return vector
-    inverse, other = factor_inverse(L), np.ones(len(vector))
-    for _ in range(_ITERATIONS):
-        other = inverse.matvec(other)
-        largest = np.zeros_like(size)
-        np.maximum.at(largest, piece, other)
-        other = other / largest[piece]
-    return np.where(size[piece] > _LEFT_OUT, vector, other)
-
-
-def _name_leaders(graph: Graph) -> str:
-    kind = "leader" if len(graph.leaders) == 1 else "leaders"
-    return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"
-
-
-def shares(graph: Graph, agent: int, earlier: tuple[int, ...]) -> Array:
-    """Return what part each neighbour has in an agent's targets, by the edges' weights."""
-    weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
-    return weights / weights.sum()
+        edges = f"{len(self.edges)} {'directed ' * self.directed}edges"
+        return f"Graph({self.agents} agents, {edges}, leaders {list(self.leaders)})"

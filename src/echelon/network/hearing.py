@@ -25,15 +25,16 @@ def who_hears_whom(graph: Graph) -> str:
         told = _by_leader(graph, near, hops)
     else:
         told = _in_all(graph, near, hops)
-    deaf = [leader for leader in graph.leaders if set(graph.neighbours(leader)) <= {*graph.leaders}]
-    unheard = [f"nobody hears {_numbered('leader', deaf)}"] if deaf else []
+    heard = graph.told()
+    alone = [k for k in graph.leaders if {*heard[[k]].indices.tolist()} <= {*graph.leaders}]
+    unheard = [f"nobody hears {_numbered('leader', alone)}"] if alone else []
     return "; ".join([*told, *unheard])
 
 
 def _ways(graph: Graph) -> tuple[Array, Array, Array]:
     """Return for each agent its nearest leader, its neighbour on the way there, and the links."""
     asked = {"indices": graph.leaders, "unweighted": True, "return_predecessors": True}
-    links, before = map(np.atleast_2d, csgraph.dijkstra(graph.adjacency(), **asked))
+    links, before = map(np.atleast_2d, csgraph.dijkstra(graph.told(), **asked))
     # The first of equals, as everywhere that the nearest leader counts.
     row = np.argmin(links, axis=0)
     agents = np.arange(graph.agents)

@@ -1,38 +1,80 @@
-"""How far agents at given places must hear so that all of them are connected."""
+"""Whom the leaders reach, along the edges of a graph at a time or of a whole window of it."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial.distance import pdist, squareform
+import scipy.sparse.csgraph as csgraph
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
+from echelon.network.edges import name_agents
 
-_MOST = 2000
-"""Places of which all distances are taken, 32 MB of them."""
-
-
-@contextmanager
-def advising(places: Array, radius: float) -> Iterator[None]:
-    """Add to the error of agents at places (N, 2) that `radius` does not connect what would."""
-    try:
-        yield
-    except GraphError as error:
-        raise GraphError(f"{str(error)[:-1]}{_advice(places, radius)}.") from error
+if TYPE_CHECKING:
+    from echelon.network.graph import Graph
 
 
-def _advice(places: Array, radius: float) -> str:
-    """Return what would connect places, as a clause.
+def check_reached(graph: "Graph") -> None:
+    """Check that a leader reaches everybody: along all edges, or those that count in the end.
 
-    It is empty where they are connected, or too many to measure. The longest edge of the shortest
-    spanning tree is the least radius that connects.
+    Raises:
+        GraphError: it does not.
     """
-    if len(places) > _MOST:
+    lost = lost_along(graph, graph.weights)
+    if len(lost):
+        raise GraphError(_cut_off(graph, lost))
+    schedule = graph.schedule
+    if schedule is not None and schedule.period is None:
+        lost = lost_along(graph, schedule.weights[-1])
+        if len(lost):
+            raise GraphError(
+                f"the graph leaves agents behind: {name_agents(lost)} no path to a leader "
+                f"({_name_leaders(graph)}) from {schedule.starts[-1]:g} s on, after the last "
+                "switch; add edges there, or give a `period` after which the schedule begins again."
+            )
+    count, label = csgraph.connected_components(graph.adjacency(), directed=False)
+    if count > 1:
+        # Each piece has a leader of its own, and would be a formation of its own.
+        apart = np.flatnonzero(label != label[0])
+        raise GraphError(f"the graph is disconnected: {name_agents(apart)} no path to agent 0.")
+
+
+def _cut_off(graph: "Graph", lost: Array) -> str:
+    """Return the sentence on agents that no leader ever reaches."""
+    who = f"{name_agents(lost)} no path to a leader ({_name_leaders(graph)})"
+    if graph.schedule is not None and graph.schedule.period is not None:
+        return (
+            f"the graph leaves agents behind: {who} in a window of {graph.schedule.period:g} s, "
+            "along all edges of the schedule together; add an edge to it."
+        )
+    if graph.directed:
+        return (
+            f"the graph leaves agents behind: {who} along its arrows; an edge "
+            "[i, j] lets j hear i, so add one, or turn one round."
+        )
+    return f"the graph is disconnected: {who}."
+
+
+def lost_along(graph: "Graph", weights: Array) -> Array:
+    """Return the agents that no leader reaches along the edges that have a weight (E,)."""
+    told = graph.told(weights)
+    if not graph.directed:
+        _, label = csgraph.connected_components(told, directed=False)
+        return np.flatnonzero(~np.isin(label, label[list(graph.leaders)]))
+    among = {"indices": graph.leaders, "unweighted": True, "min_only": True}
+    return np.flatnonzero(np.isinf(csgraph.dijkstra(told, **among)))
+
+
+def lost_at_times(graph: "Graph") -> str:
+    """Return whom leaders do not reach at some time, and when; empty where they always do."""
+    if graph.schedule is None:
         return ""
-    least = minimum_spanning_tree(squareform(pdist(places))).max()
-    if least <= radius:
-        return ""
-    shown = np.ceil(least * 1000.0) / 1000.0
-    return f"; a `radius` of {shown:g} connects these places, and another `seed` draws others"
+    for span, weights in zip(graph.schedule.spans(), graph.schedule.weights, strict=True):
+        lost = lost_along(graph, weights)
+        if len(lost):
+            return f"{name_agents(lost)} no path to a leader {span}"
+    return ""
+
+
+def _name_leaders(graph: "Graph") -> str:
+    kind = "leader" if len(graph.leaders) == 1 else "leaders"
+    return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"

@@ -14,7 +14,8 @@ import scipy.sparse.linalg as spla
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
-from echelon.network.graph import Graph, factor_inverse
+from echelon.network.eigenvalues import factor_inverse
+from echelon.network.graph import Graph
 
 _DENSE = 400
 _ROUNDS = 30
@@ -30,13 +31,14 @@ def recommend_leaders(graph: Graph, count: int = 1) -> tuple[int, ...]:
     an even choice is tried, ordered by how much the slowest mode moves them.
 
     Raises:
-        GraphError: `count` is negative, or leaves no follower.
+        GraphError: `count` is negative, or leaves no follower; the graph is directed or switches.
     """
     if not 0 <= count < len(graph.followers):
         raise GraphError(
             f"{count} more leaders are requested, and from 0 to {len(graph.followers) - 1} of the "
             f"{len(graph.followers)} followers can become one."
         )
+    _check_mutual(graph)
     chosen = list[int]()
     for _ in range(count):
         chosen.append(_best_leader(graph.with_leaders(chosen)))
@@ -49,17 +51,27 @@ def recommend_edges(graph: Graph, count: int = 1) -> tuple[tuple[int, int], ...]
     Of many pairs those are tried that promise most in first order, (v_i - v_j)^2, 300 at most.
 
     Raises:
-        GraphError: `count` is negative, or there are not so many pairs.
+        GraphError: `count` is negative, or there are not so many pairs; the graph is directed or
+            switches.
     """
     free = graph.agents * (graph.agents - 1) // 2 - len(graph.edges)
     if not 0 <= count <= free:
         raise GraphError(
             f"{count} more edges are requested, and from 0 to {free} pairs are not linked yet."
         )
+    _check_mutual(graph)
     chosen = list[tuple[int, int]]()
     for _ in range(count):
         chosen.append(_best_edge(graph.with_edges(chosen)))
     return tuple(chosen)
+
+
+def _check_mutual(graph: Graph) -> None:
+    # What is ranked by is of a symmetric matrix: a mode's energy, and its change of rank one.
+    if graph.directed or graph.schedule is not None:
+        raise GraphError(
+            "leaders and edges are recommended for undirected graphs that do not switch."
+        )
 
 
 def _best_leader(graph: Graph) -> int:

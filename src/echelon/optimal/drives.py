@@ -15,7 +15,8 @@ from echelon.engine.host import HostStepper
 from echelon.engine.settings import Settings
 from echelon.engine.work import SolverStats, solver_stats
 from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph, shares
+from echelon.network.graph import Graph
+from echelon.network.tree import shares
 from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.optimal.objectives import TrackingOptions, grid

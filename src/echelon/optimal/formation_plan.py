@@ -10,7 +10,8 @@ from echelon.core.errors import PlanError
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.network.formation import Formation
-from echelon.network.graph import Graph, shares
+from echelon.network.graph import Graph
+from echelon.network.tree import shares
 from echelon.optimal.objectives import Grid, TrackingOptions, coarse, spacing, tracking
 from echelon.optimal.problem import OptimalControl
 from echelon.optimal.solver import Solver, Trajectory

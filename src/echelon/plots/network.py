@@ -26,7 +26,11 @@ def poles(found: Modes) -> "Figure":
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    values, (real, imaginary) = found.eigenvalues, (np.real(found.poles), np.imag(found.poles))
+    # Of complex ones the real part, which couplings are chosen by.
+    values, (real, imaginary) = (
+        np.real(found.eigenvalues),
+        (np.real(found.poles), np.imag(found.poles)),
+    )
     width = draw.page().width
     figure = Figure((width, 0.6 * width), layout="constrained")
     ax = figure.add_subplot()
@@ -89,7 +93,8 @@ def _label_bar(bar: Any, values: Array) -> None:
 def network(run: Recording) -> "Figure":
     """Return who hears whom: agents where the formation puts them, or around a circle.
 
-    An arrow goes from a leader to who hears it; a line without one is heard both ways.
+    An arrow goes to who hears: in directed graphs, and from leaders; a line without one is heard
+    both ways.
     """
     from matplotlib.figure import Figure
 
@@ -135,11 +140,11 @@ def _links(ax: Any, run: Recording, places: Array, small: float) -> None:
     pairs = places[run.edges]
     ax.add_collection(LineCollection(list(pairs), linewidths=wide, colors="0.55", zorder=1))
     leads = {*run.leaders}
-    if run.mutual or run.agents > _NUMBERED:
+    if run.agents > _NUMBERED or (run.mutual and not run.directed):
         return
     for (i, j), line in zip(run.edges, wide, strict=True):
-        first, second = (i, j) if i in leads else (j, i)
-        if first in leads and second not in leads:
+        first, second = (i, j) if i in leads or run.directed else (j, i)
+        if run.directed or (first in leads and second not in leads):
             arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0}
             ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
 

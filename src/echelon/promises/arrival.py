@@ -49,7 +49,8 @@ def arrival_of(
     """
     told = law.feedforward is Feedforward.PARENT
     apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
-    if not position or apart > _SLACK or told and len(graph.followers) > _FEW:
+    known = graph.schedule is None and position
+    if not known or apart > _SLACK or told and len(graph.followers) > _FEW:
         return None
     loop, followers = law.ready, list(graph.followers)
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]
@@ -106,11 +107,8 @@ def _along_links(
 
 def _weights(graph: Graph, leaderward: bool) -> Array:
     """Return w = L_g^-1 1 of the followers, all positive."""
-    heard, n = graph.exchange(leaderward), graph.agents
-    adjacency = sp.coo_array((heard.weights, (heard.receivers, heard.senders)), shape=(n, n))
-    rows = list(graph.followers)
-    whole = sp.csr_array(sp.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency)
-    return spla.splu(sp.csc_array(whole[rows][:, rows])).solve(np.ones(len(rows)))
+    [L] = graph.stretches(leaderward)
+    return spla.splu(sp.csc_array(L)).solve(np.ones(len(graph.followers)))
 
 
 def _falling(start: float, c: float, heaviest: float, speed: float, times: Array) -> Array:

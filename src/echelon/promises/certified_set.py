@@ -70,7 +70,8 @@ def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> C
     if radii[j] == 0.0:
         text = f"the leader alone reaches {away[j]:.3g} in `{name}`, and the domain {wide:.3g}"
         return CertifiedSet(0.0, kind, text, "widen the domain, or slow the reference")
-    shrink = 1.0
+    # On a directed graph a sum with weights falls, which one agent's share may exceed so much.
+    shrink = 1.0 / np.sqrt(parts.graph.spectrum().skew)
     if region.theorem is Theorem.A5 and not _constant(parts, region):
         shrink = np.sqrt(parts.graph.spectrum().proved / parts.graph.spectrum().high)
     text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from echelon.certificates.certificate import Certificate, certify
-from echelon.certificates.lmi import falls
+from echelon.certificates.lmi import falls, rate_of
 from echelon.certificates.margins import ClosedLoop, slowest_between
 from echelon.core.linear import held_radius, longest_step
 from echelon.core.types import Array
@@ -17,6 +17,7 @@ from echelon.engine.settings import Settings
 from echelon.gains.gain import Gain
 from echelon.models.linearization import Linearization, linearize
 from echelon.models.model import ControlAffine
+from echelon.network.eigenvalues import in_order
 from echelon.network.graph import Graph
 from echelon.network.spectrum import Spectrum
 
@@ -40,6 +41,9 @@ class Loop(NamedTuple):
         every: whether the modes of all eigenvalues of the graph decay, not only of those.
         slowest: real part of the slowest mode, 1/s; of a large graph, of the modes looked at.
         certificate: of the linearization.
+        common: the rate, 1/s, at which the sum of all delta_i'P delta_i falls near the trim on
+            every one of the graphs that take turns (T8), below 0 where it may rise; None where the
+            graph does not switch.
     """
 
     linear: Linearization
@@ -50,6 +54,7 @@ class Loop(NamedTuple):
     every: bool
     slowest: float
     certificate: Certificate
+    common: float | None = None
 
     @property
     def gains(self) -> Array:
@@ -114,7 +119,19 @@ def loop_of(parts: Parts) -> Loop:
     if certificate.modes < modes.spectrum.total:
         slowest = max(slowest, slowest_between(closed))
     inner = np.zeros((m, n)) if inner is None else inner
-    return Loop(linear, inner, closed, where, modes.symmetric, slowest < 0.0, slowest, certificate)
+    common = None
+    if parts.graph.schedule is not None and gain is not None:
+        common = _common(parts, gain, linear)
+    every = slowest < 0.0
+    return Loop(linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common)
+
+
+def _common(parts: Parts, gain: Gain, linear: Linearization) -> float:
+    """Return at what rate one P serves all graphs that take turns."""
+    weakest = parts.graph.spectrum().proved
+    if not weakest > 0.0 or all_alike(parts.drive, parts.model):
+        return -np.inf
+    return rate_of(gain.P, linear.A[None], linear.B, gain.R, 2.0 * gain.coupling * weakest)
 
 
 def modes_of(parts: Parts) -> Modes:
@@ -122,19 +139,32 @@ def modes_of(parts: Parts) -> Modes:
 
     Where the leaders obey the followers' law, nobody is grounded: the disagreement obeys the
     Laplacian of all agents, whose eigenvalues but 0 lie above the least of the grounded one and,
-    by Anderson and Morley, below the largest sum of two neighbours' degrees.
+    by Anderson and Morley, below the largest sum of two neighbours' degrees. On a directed graph
+    neither is known, and all are computed.
     """
     graph = parts.graph
     if parts.drive.feedforward is Feedforward.PARENT:
         return Modes(graph.parent_spectrum(), False, "edges' weights")
     if not all_alike(parts.drive, parts.model):
-        return Modes(graph.spectrum(), True)
+        return Modes(graph.spectrum(), not graph.directed and graph.schedule is None)
+    if graph.directed:
+        return Modes(_of_all(graph), False)
     if graph.agents <= _DENSE:
         whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
         return Modes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
     degrees = graph.laplacian().diagonal()
     ends = np.array([graph.spectrum().low, degrees[graph.edges].sum(axis=1).max()])
     return Modes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
+
+
+def _of_all(graph: Graph) -> Spectrum:
+    """Return the eigenvalues of the Laplacian of all agents of a directed graph, but for one 0.
+
+    The disagreement between agents has a mode for each of them; another 0 is one that never ends.
+    """
+    values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
+    values = in_order(np.delete(values, np.abs(values).argmin()))
+    return Spectrum(values, len(values), 0.0)
 
 
 def all_alike(drive: Drive, model: ControlAffine) -> bool:
@@ -152,7 +182,7 @@ def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
     gain's own; it is looked at again with this A and B.
     """
     claim = gain.certificate
-    if claim.edge is None:
+    if claim.edge is None or not low > 0.0:
         return None
     rho = 2.0 * claim.edge * claim.lambda_min
     closed = linear.A - 0.5 * rho * linear.B @ gain.R_inverse @ linear.B.T @ gain.P
@@ -166,7 +196,11 @@ def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:
 
 def _representatives(modes: Modes) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
-    (values, total, _), _, what = modes
+    (values, total, *_), _, what = modes
+    if np.iscomplexobj(values):
+        # The modes of a conjugate pair mirror each other.
+        values = values[np.imag(values) >= 0.0]
+        total = len(values)
     if len(values) < total:
         between = np.geomspace(values[0], values[-1], SHOWN)
         return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"

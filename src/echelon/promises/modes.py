@@ -29,6 +29,8 @@ def _linear(case: Case) -> Iterator[Statement]:
     yield _along(case)
     yield from turning(case)
     yield held(case)
+    if case.parts.graph.schedule is not None:
+        yield _taking_turns(case)
 
 
 # ---- where the model bends ----------------------------------------------------------------------
@@ -119,6 +121,28 @@ def _decaying(case: Case) -> Statement:
         reason = "the disagreement does not decay"
     verdict, shown = Verdict.of(loop.every), f"{loop.slowest:.3g} 1/s"
     return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)
+
+
+def _taking_turns(case: Case) -> Statement:
+    """Whether the disagreement decays however graphs take turns.
+
+    Stable modes of each do not say so; one sum of squares that falls on all of them does, whenever
+    they switch (theory page, T8).
+    """
+    name, loop = Hypothesis.SWITCHING, case.loop
+    edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
+    if not case.governed:
+        text = "no theorem is known of this law on graphs that take turns"
+        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, "use `consensus`", text)
+    # At the edge the sum may only stay; what feels nothing then decays by detectability.
+    if common is not None and edge is not None and c >= edge and common > -np.inf:
+        text, rate = "whenever they do: sum_i delta_i'P delta_i rises on none", max(0.0, common)
+        return Statement(name, Verdict.HOLDS, _LINEAR, rate, f"{rate:.3g} 1/s", text)
+    text = "no one P is known to serve all the graphs that take turns"
+    remedy = "use the law `stopping-point`"
+    if edge is not None and not c >= edge:
+        remedy = f"raise `coupling` to {edge:.4g} or more, or {remedy}"
+    return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
 
 
 def _along(case: Case) -> Statement:

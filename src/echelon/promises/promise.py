@@ -113,6 +113,8 @@ class Promise:
         if not self.promised:
             return None
         ground = self._ground
+        if ground is None and self.loop.common is not None:
+            return max(0.0, self.loop.common)
         return -self.loop.slowest if ground is None else ground.rate
 
     @property

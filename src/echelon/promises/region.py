@@ -59,6 +59,9 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
         found = _computed(parts, gain, gain.certificate.region)
     except GainError as error:
         return Region(None, None, _lost(str(error).rstrip("."), "make the gain again"))
+    if found is None and not _strength(parts, gain) > 0.0:
+        text = "on this graph no sum of squares is known that falls whatever the slopes are"
+        return Region(None, None, _lost(text, "let agents hear each other both ways"))
     if found is None:
         strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
         text = f"P contracts at no rate on the domain {strength}"
@@ -191,5 +194,7 @@ def _line(parts: Parts, found: RegionCertificate) -> Statement:
     theorem, kind = found.theorem, found.kind
     text = f"{theorem}: {theorem.value} {found.domain.in_words(parts.model)}"
     text += f"; no more than {kind}, since {found.why}" if found.why else ""
-    shown = f"{found.rate:.3g} 1/s"
+    shown, skew = f"{found.rate:.3g} 1/s", parts.graph.spectrum().skew
+    if skew > 1.0:
+        text += f"; their squares weighted as T7 has it, {skew:.3g} to 1 at most"
     return Statement(_NAME, Verdict.of(True), kind, found.rate, shown, text)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
 from echelon.certificates.responses import Chain
 from echelon.core.linear import held_radius
@@ -19,6 +20,7 @@ from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.chains import flat_output, flatten
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 from echelon.promises.statement import Hypothesis, Statement
 
 _PROOF = Kind.PROOF
@@ -59,10 +61,29 @@ class Stopping(NamedTuple):
     @property
     def rate(self) -> float:
         """The slowest mode of the formation, 1/s, as a positive number."""
-        assert self.law.reach is not None
-        agreement = self.coupling * self.law.reach.slowest
+        agreement = self.agreement
         moves = max(self.law.ready.chains.degrees) > 1
         return min(self.law.slowest_root, agreement) if moves else agreement
+
+    @property
+    def agreement(self) -> float:
+        """The slowest disagreement of stopping points near rest, 1/s, as a positive number.
+
+        Of a graph that switches again and again, what errors fall by in a period (Floquet), and of
+        one that switches for a while, that of the graph which stays.
+        """
+        schedule, c = self.parts.graph.schedule, self.coupling
+        if schedule is None:
+            assert self.law.reach is not None
+            return c * self.law.reach.slowest
+        whole = self.parts.graph.stretches(self.law.leaderward)
+        if schedule.period is None:
+            return c * float(np.linalg.eigvals(whole[-1].toarray()).real.min())
+        flow = np.eye(len(self.parts.graph.followers))
+        spans = np.diff(schedule.starts, append=schedule.period)
+        for span, L in zip(spans, whole, strict=True):
+            flow = scipy.linalg.expm(-c * span * L.toarray()) @ flow
+        return -float(np.log(np.abs(np.linalg.eigvals(flow)).max())) / schedule.period
 
     def chain(self, output: int) -> Chain:
         """Return the chain of an output.
@@ -150,12 +171,27 @@ def condition_lines(run: Stopping) -> Iterator[Statement]:
     shown = f"c {c:.4g}, edge 0"
     yield Statement(Hypothesis.COUPLED, Verdict.HOLDS, _PROOF, c, shown, "any coupling will do")
     text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
+    if run.parts.graph.schedule is not None:
+        text = "the slower of the slowest root and of what is left after a period, or in the end"
     shown = f"{-run.rate:.3g} 1/s"
     yield Statement(Hypothesis.DECAYS, Verdict.HOLDS, _PROOF, -run.rate, shown, text)
     text = "the law is linear in flat coordinates wherever it goes"
     yield Statement(Hypothesis.ALONG, Verdict.NOT_NEEDED, _PROOF, text=text)
     yield _step_line(run)
+    if run.parts.graph.schedule is not None:
+        yield _switching_line(run)
     yield Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, _PROOF, text="there is no gain")
+
+
+def _switching_line(run: Stopping) -> Statement:
+    """Say along which edges the leader reaches everybody: checked when the graph was made."""
+    schedule = run.parts.graph.schedule
+    assert schedule is not None
+    text = f"the leader reaches everybody along the edges from {schedule.starts[-1]:g} s on"
+    if schedule.period is not None:
+        text = f"the leader reaches everybody along the edges of any {schedule.period:g} s together"
+    text += ", and zeta' is told in spite of edges that are not there"
+    return Statement(Hypothesis.SWITCHING, Verdict.HOLDS, _PROOF, run.rate, "", text)
 
 
 def _moves_others(run: Stopping) -> str:
@@ -188,19 +224,37 @@ def _step_line(run: Stopping) -> Statement:
 
 def _radius(run: Stopping) -> float:
     """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
-    assert run.law.reach is not None
-    loop, found = run.law.ready, 0.0
+    loop, found, ends = run.law.ready, 0.0, _strengths(run)
     for k, degree in enumerate(loop.chains.degrees):
         A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
         stop = loop.stiffness[k] * loop.weights[:degree, k]
         inner = np.append(0.0, stop[:-1])
-        # By Gershgorin none is larger than 2 d_max; heard one way none than d_max.
-        most = (1.0 if run.law.leaderward else 2.0) * run.law.reach.heaviest
-        ends = np.array([run.law.reach.slowest, most])
         gains = inner + run.coupling * ends[:, None] * stop
         dt, how = run.settings.dt, run.settings.integrator
         found = max(found, held_radius(A, B, gains[:, None], dt, how))
     return found
+
+
+def _strengths(run: Stopping) -> Array:
+    """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
+    graph, reach = run.parts.graph, run.law.reach
+    assert reach is not None
+    if run.law.leaderward or graph.directed or graph.schedule is not None:
+        return agreement_modes(graph, run.law)
+    # By Gershgorin none is larger than 2 d_max.
+    return np.array([reach.slowest, 2.0 * reach.heaviest])
+
+
+def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
+    """Return eigenvalues lambda by which stopping points agree, zeta~' = -c lambda zeta~, (K,).
+
+    Of graphs that take turns, those of each but for 0, of who is not reached for a while.
+    """
+    values = graph.spectrum().eigenvalues
+    if law.leaderward:
+        # Triangular in the order of how far agents are from the leader.
+        values = np.unique([L.diagonal() for L in graph.stretches(True)])
+    return values[np.abs(values) > 1e-12 * np.abs(values).max()]
 
 
 def drift_reason(run: Stopping) -> Statement | None:

@@ -39,6 +39,7 @@ class Tube(NamedTuple):
         who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
         strain: what the motors give; None where they have no limits, or may not suffice.
+        graphs: which graphs are meant, and this one, in words.
     """
 
     kind: Kind
@@ -50,6 +51,7 @@ class Tube(NamedTuple):
     who: str
     borders: tuple[dict[str, Any], ...]
     strain: Strain | None
+    graphs: tuple[str, str] = ("any graph in which the leader reaches everybody", "this graph")
 
     @property
     def theorem(self) -> Theorem:
@@ -65,8 +67,8 @@ class Tube(NamedTuple):
         )
         return (
             f"{self.kind.value}: from {self.who}, errors go to zero for any number of agents and "
-            "any graph in which the leader reaches everybody, where the model is exact and zeta' "
-            "is told at all times (T5); on this graph in the end at "
+            f"{self.graphs[0]}, where the model is exact and zeta' "
+            f"is told at all times (T5); on {self.graphs[1]} in the end at "
             f"{self.rate:.3g} 1/s or faster{when}."
             + ("" if self.strain is None else f" {self.strain.sentence()}")
         )
@@ -123,6 +125,11 @@ def tube_of(run: Stopping) -> _Found:
     told = tuple(border.told for border in borders)
     strain, line = strain_of(run)
     tube = Tube(kind, run.rate, gains, far, steepest, arrival, who, told, strain)
+    schedule = run.parts.graph.schedule
+    if schedule is not None:
+        every = "in the end" if schedule.period is None else "in every period"
+        graphs = f"any graphs that take turns and by which the leader reaches everybody {every}"
+        tube = tube._replace(graphs=(graphs, "these"))
     return _Found(tube, (*lines, line))
 
 

@@ -28,7 +28,8 @@ def dataset(result: Result) -> "xr.Dataset":
     `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
     references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
     `edge_weight`, the gain's `P`, `R` and `coupling`, the poles of the modes looked at
-    (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`), and where inputs u are limited
+    (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, of which a directed graph may have
+    an imaginary part in `mode_eigenvalue_imaginary`), and where inputs u are limited
     `limit_low` <= `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format`
     the number of this list.
     """
@@ -114,10 +115,13 @@ def _poles(result: Result) -> dict[str, Any]:
     if not found.linear:
         return {}
     poles, values = found.loop.poles, found.loop.eigenvalues
+    turning = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
+    turning = turning if np.iscomplexobj(values) else {}
     return {
         "pole_real": (("mode", "pole"), np.real(poles)),
         "pole_imaginary": (("mode", "pole"), np.imag(poles)),
-        "mode_eigenvalue": ("mode", values),
+        "mode_eigenvalue": ("mode", np.real(values)),
+        **turning,
     }
 
 
@@ -144,6 +148,7 @@ def _attributes(result: Result) -> dict[str, Any]:
         **laws,
         "model": type(result.model).__name__,
         "position": " ".join(result.model.position),
+        "directed": int(result.graph.directed),
         "format": FORMAT,
     }
 

@@ -68,7 +68,7 @@ def foreseen(
         promise=promise,
         horizon=settings.horizon,
         dt=settings.dt,
-        attributes={"outcome": "completed", "message": ""},
+        attributes={"outcome": "completed", "message": "", "directed": int(graph.directed)},
     )
 
 

@@ -63,10 +63,12 @@ class Lyapunov(NamedTuple):
 def lyapunov(result: Result) -> Lyapunov | None:
     """Return V along a run, in float64.
 
-    None where the followers' law has no P or nothing was stored.
+    None where the followers' law has no P or nothing was stored, and on graphs that are directed or
+    switch, where V is no sum over edges and need not fall (theory page, T7).
     """
     P, graph, offsets = result.drive.metric(result.model), result.graph, result.formation.offsets
-    if P is None or not len(result.times):
+    mutual = not graph.directed and graph.schedule is None
+    if P is None or not len(result.times) or not mutual:
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)

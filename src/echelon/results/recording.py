@@ -111,6 +111,11 @@ class Recording:
         """How many there are."""
         return self.states.shape[1]
 
+    @property
+    def directed(self) -> bool:
+        """Whether edges are arrows: of (i, j) j hears i."""
+        return bool(self.attributes.get("directed", 0))
+
     @functools.cached_property
     def followers(self) -> tuple[int, ...]:
         """Those who do not lead."""

@@ -253,7 +253,10 @@ def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> D
 def _graph(scenario: Scenario) -> Graph:
     spec = scenario.graph
     if spec.edges is not None:
-        return Graph.from_edges(spec.edges, spec.leaders, spec.agents)
+        rest = spec.leaders, spec.agents, spec.directed
+        if spec.schedule:
+            return Graph.switching(spec.stretches, *rest, spec.period)
+        return Graph.from_edges(spec.stretches[0][1], *rest)
     make = getattr(Graph, str(spec.name))
     given = {key: value for key, value in spec.model_dump().items() if value is not None}
     return make(**offered(make, given))

@@ -30,8 +30,9 @@ SOURCES: dict[str, tuple[str, str, bool]] = {
 
 # What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
 _Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
-_GRAPH_KEYS: _Taken = dict.fromkeys(registry.GRAPHS, (("agents",), ())) | {
-    "edges": ((), ("agents",)),
+_GRAPH_KEYS: _Taken = dict.fromkeys(registry.GRAPHS, (("agents",), ("directed",))) | {
+    "complete": (("agents",), ()),
+    "edges": ((), ("agents", "weights", "directed", "schedule", "period")),
     "grid": (("rows", "columns"), ("agents",)),
     "geometric": (("agents", "radius"), ("seed",)),
 }
@@ -170,14 +171,18 @@ def _choices(data: Part) -> Iterator[Finding]:
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Yield the place in the list, and the smaller and larger agent, of every well-formed edge."""
+    """Yield the place in the list, and the two agents, of every well-formed edge.
+
+    The smaller agent comes first, unless the graph is directed.
+    """
+    directed = graph.get("directed") is True
     edges = graph.get("edges")
     for index, edge in enumerate(edges if isinstance(edges, list) else ()):
         if not isinstance(edge, list) or len(edge) < 2:
             continue
         i, j = _whole(edge[0]), _whole(edge[1])
         if i is not None and j is not None and i != j and min(i, j) >= 0:
-            yield index, (min(i, j), max(i, j))
+            yield index, ((i, j) if directed else (min(i, j), max(i, j)))
 
 
 def _edges(document: Document) -> Iterator[Finding]:
@@ -188,13 +193,51 @@ def _edges(document: Document) -> Iterator[Finding]:
         path = ("graph", "edges", index)
         if pair in first:
             at = document.place(("graph", "edges", first[pair]))
-            said = (
-                f"got agents `{pair[0]}` and `{pair[1]}` again, allowed is one edge for each pair"
-            )
+            said = f"got agents `{pair[0]}` and `{pair[1]}` again, allowed is one edge for "
+            said += "each way" if graph.get("directed") is True else "each pair"
             yield path, f"{said}, and theirs stands at {at}."
         first.setdefault(pair, index)
-        if agents is not None and pair[1] >= agents > 0:
-            yield path, f"got agent `{pair[1]}`, {_range(agents)}."
+        if agents is not None and max(pair) >= agents > 0:
+            yield path, f"got agent `{max(pair)}`, {_range(agents)}."
+
+
+def _weights(data: Part) -> Iterator[Finding]:
+    """Yield weights that are not one for each edge, and edges that have one already."""
+    graph = section(data, "graph")
+    edges, weights = graph.get("edges"), graph.get("weights")
+    if not isinstance(edges, list) or not isinstance(weights, list):
+        return
+    if len(edges) != len(weights):
+        said = f"got {len(weights)} weights, allowed is one for each of the {len(edges)} edges"
+        yield ("graph", "weights"), f"{said}."
+    for index, edge in enumerate(edges):
+        if isinstance(edge, list) and len(edge) == 3:
+            said = "got an edge with a weight, allowed is `[i, j]` beside `weights`"
+            yield ("graph", "edges", index), f"{said}."
+    for index, weight in enumerate(weights):
+        number = number_of(weight)
+        if number is not None and not number > 0.0:
+            yield ("graph", "weights", index), f"got `{weight}`, allowed is a number above 0."
+
+
+def _schedule(data: Part) -> Iterator[Finding]:
+    """Yield a period of nothing, and times that do not ascend."""
+    graph = section(data, "graph")
+    stretches, period = graph.get("schedule"), number_of(graph.get("period"))
+    if not isinstance(stretches, list) or not stretches:
+        if graph.get("period") is not None:
+            yield ("graph", "period"), "got a period, allowed is one beside a `schedule`."
+        return
+    last = 0.0
+    for index, stretch in enumerate(stretches):
+        at = number_of(stretch.get("at")) if isinstance(stretch, dict) else None
+        if at is not None and 0.0 < at <= last:
+            said = f"got `{stretch['at']}`, allowed are times that ascend, above {last:g} s here"
+            yield ("graph", "schedule", index, "at"), f"{said}."
+        last = max(last, at or 0.0)
+    if period is not None and 0.0 < period <= last:
+        said = f"got `{graph['period']}`, allowed is more than the last time of the schedule"
+        yield ("graph", "period"), f"{said}, {last:g} s."
 
 
 def _range(agents: int) -> str:
@@ -203,10 +246,14 @@ def _range(agents: int) -> str:
 
 def _numbered(graph: Part) -> int | None:
     """Return the largest number in the edges, plus one; None where an edge cannot be read."""
-    edges, pairs = graph.get("edges"), list(_pairs(graph))
-    if not isinstance(edges, list) or len(pairs) != len(edges):
+    later = graph.get("schedule")
+    all_ = [graph, *(later if isinstance(later, list) else [])]
+    if not all(isinstance(part, dict) and isinstance(part.get("edges"), list) for part in all_):
         return None
-    return max((pair[1] + 1 for _, pair in pairs), default=None)
+    pairs = [pair for part in all_ for _, pair in _pairs(part)]
+    if len(pairs) != sum(len(part["edges"]) for part in all_):
+        return None
+    return max((max(pair) + 1 for pair in pairs), default=None)
 
 
 def _agents(graph: Part) -> int | None:
@@ -303,6 +350,8 @@ def cross_faults(document: Document) -> Iterator[Finding]:
     yield from _sources(data)
     yield from _choices(data)
     yield from _edges(document)
+    yield from _weights(data)
+    yield from _schedule(data)
     yield from _grid(data)
     yield from _members(data)
     yield from _following(data)

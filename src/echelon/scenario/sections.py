@@ -65,14 +65,35 @@ class PlantSpec(BaseModel, **STRICT):
 
 
 @final
+class StretchSpec(BaseModel, **STRICT):
+    """The edges from some time on."""
+
+    at: Annotated[Positive, Unit("s")]
+    """When they take the place of those before, s."""
+    edges: Annotated[Edges, Unit("1")]
+    """Edges `[i, j]` or `[i, j, weight]`; none where nobody hears anybody."""
+
+
+@final
 class GraphSpec(BaseModel, **_either("edges", "name")):
-    """Who hears whom, both ways: a list of edges, or the name of a graph that is made.
+    """Who hears whom: a list of edges, or the name of a graph that is made.
 
     Agents are numbered from 0.
     """
 
     edges: Edges | None = None
-    """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1."""
+    """Edges `[i, j]` or `[i, j, weight]`; the weight has no unit, default 1. Both ends hear each
+    other, unless `directed`."""
+    weights: Annotated[Numbers | None, Unit("1")] = None
+    """Weights of the edges, one for each, where they stand in a list of their own; above 0."""
+    directed: bool = False
+    """Edges are arrows along which it is told: of `[i, j]` j hears i, and i does not hear j. The
+    graphs `path`, `ring` and `star` then lead away from agent 0."""
+    schedule: Annotated[tuple[StretchSpec, ...], Field(strict=False)] = ()
+    """Other edges from later times on, as in `[{at: 3.0, edges: [[0, 1]]}]`; `edges` hold until
+    then, and the last ones for ever."""
+    period: Annotated[Positive | None, Unit("s")] = None
+    """After which all edges of the `schedule` begin again, s."""
     name: Annotated[str, OneOf(registry.GRAPHS)] | None = None
     """Name of a graph that is made, from the keys below."""
     agents: Count | None = None
@@ -88,6 +109,14 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
     """Seed of the places in the graph `geometric`."""
     leaders: Agents = Field(default=(0,), min_length=1)
     """Numbers of the agents that lead; all others follow."""
+
+    @property
+    def stretches(self) -> list[tuple[float, Edges]]:
+        """The edges with their weights, and from when on; of listed ones."""
+        edges = self.edges or ()
+        if self.weights is not None:
+            edges = tuple((i, j, w) for (i, j, _), w in zip(edges, self.weights, strict=True))
+        return [(0.0, edges), *((each.at, each.edges) for each in self.schedule)]
 
 
 @final

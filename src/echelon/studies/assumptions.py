@@ -14,6 +14,7 @@ from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.laws.law import reference_of
 from echelon.models.model import ControlAffine
+from echelon.network.graph import Graph
 from echelon.network.hearing import who_hears_whom
 from echelon.promises.hypotheses import goal_drifts
 from echelon.promises.promise import Promise
@@ -39,14 +40,18 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
     text = "connected and static" + ("" if unit else "; weights need not be 1")
     shown = f"{shown}, {len(graph.edges)} edges"
-    yield Statement(Line.GRAPH, _HOLDS, _PROOF, len(graph.edges), shown, text)
+    other = _other_graph(graph)
+    held = Verdict.of(not other)
+    remedy = "T7 and T8 of the theory page stand in its place" if other else ""
+    yield Statement(Line.GRAPH, held, _PROOF, len(graph.edges), shown, other or text, remedy)
     followers, leaders = len(graph.followers), len(graph.leaders)
     shown = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
     text = who_hears_whom(graph)
     yield Statement(Line.FOLLOWS, _HOLDS, _PROOF, leaders, shown, text)
     shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
     yield Statement(Line.GROUNDED, _HOLDS, _PROOF, low, shown, text)
-    yield Statement(Line.POSITIVE, _HOLDS, _PROOF, low, f"{low:.6g}", "grounded Laplacian")
+    text = "no eigenvalue of any L has a smaller real part" if other else "grounded Laplacian"
+    yield Statement(Line.POSITIVE, held, _PROOF, low, f"{low:.6g}", text, remedy)
     text = "the LMI is not used"
     yield Statement(Line.SCHUR, Verdict.NOT_NEEDED, _PROOF, text=text)
     # A follower beside a leader keeps the weight of that edge on its diagonal and loses the
@@ -56,6 +61,15 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
     remedy = "nothing here rests on it: Lemma 1 serves instead"
     yield Statement(Line.EDGES, Verdict.FAILS, _PROOF, rows, shown, text, remedy)
+
+
+def _other_graph(graph: Graph) -> str:
+    """Return in what a graph is not the paper's undirected and static one; empty where it is."""
+    found = ["heard one way, along arrows by which a leader reaches everybody"] * graph.directed
+    if graph.schedule is not None:
+        times = ", ".join(f"{at:g}" for at in graph.schedule.starts[1:8])
+        found.append(f"switches at {times} s")
+    return "; ".join(found)
 
 
 def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:

@@ -41,6 +41,6 @@ def check(parts: Parts, settings: Settings) -> Checked:
             *drift_lines(parts, settings, found),
             *found.hypotheses.values(),
             killing_line(parts, found),
-            *margin_lines(parts, found),
+            *margin_lines(parts, settings, found),
         )
     return Checked(lines, found)

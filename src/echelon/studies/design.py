@@ -277,7 +277,8 @@ def _advice(gain: Gain, parts: Parts) -> str:
     """
     graph = parts.graph
     followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
-    if gain.inner is None or followers > _ADVISED:
+    fixed = not graph.directed and graph.schedule is None
+    if gain.inner is None or followers > _ADVISED or not fixed:
         return ""
     # The last follower must stay one, and a complete graph has no pair left to link.
     more = int(followers > 1), int(len(graph.edges) < pairs)

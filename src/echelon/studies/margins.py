@@ -4,30 +4,39 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import scipy.sparse.csgraph as csgraph
 
 from echelon.certificates import margins
 from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Verdict
 from echelon.engine.parts import Parts
+from echelon.engine.settings import Settings
+from echelon.laws.stopping_point import StoppingPoint
 from echelon.models.linearization import trim_slopes
 from echelon.models.model import ControlAffine
 from echelon.promises.closed_loop import Loop
 from echelon.promises.promise import Promise
 from echelon.promises.statement import Hypothesis, Line, Statement
+from echelon.promises.stopping import agreement_modes
 
 _KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
+_WIDE = 4
+"""Of lambda_max by lambda_min; beyond it little is left of the delay that could be borne."""
 _STIFF = 1e10
 """Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
 
 
-def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
+def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
+    if parts.graph.schedule is not None:
+        text = "they are of one graph, and none is known for graphs that take turns"
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        return
     if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
         text = "any coupling; what delay is left depends on c and the graph alone"
         yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        yield from _stopping_lines(parts, settings)
         return
     if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
         verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
@@ -47,10 +56,47 @@ def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     shown = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
     yield Statement(Line.DELAY, _HOLDS, _KIND, delay.delay, shown, text)
+    low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
+    alike = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
+    yield _spread_line(low, high, delay.delay, alike)
     yield _scaling_line(parts.model, loop)
     # The bound of the network rests on a symmetric matrix.
     yield from _push_lines(parts.model, loop) if loop.symmetric else ()
     yield from _string_line(parts, loop)
+
+
+def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
+    """Warn where the graph makes its fastest mode many times as strong as its slowest.
+
+    Couplings are chosen for lambda_min, and what delay a mode bears falls with c lambda; `best` is
+    the delay that is left at lambda_min alone.
+    """
+    ratio, shown = high / low, f"{high / low:.3g}"
+    if not ratio > _WIDE:
+        text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
+        return Statement(Line.SPREAD, _HOLDS, _KIND, ratio, shown, text)
+    text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
+    text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
+    remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
+    return Statement(Line.SPREAD, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
+
+
+def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
+    """Yield what delay agreement bears where zeta' = -c L zeta: pi/2 - |arg lambda| by c |lambda|.
+
+    A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and reaches the axis first at that
+    delay.
+    """
+    law, dt = getattr(parts.drive, "follower", None), settings.dt
+    assert isinstance(law, StoppingPoint)
+    c, values = float(law.strength(dt)), agreement_modes(parts.graph, law)
+    delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
+    at, sizes = int(delays.argmin()), np.abs(values)
+    shown = f"{1e3 * delays[at]:.3g} ms"
+    text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"
+    yield Statement(Line.DELAY, _HOLDS, _KIND, float(delays[at]), shown, text)
+    best = 0.5 * np.pi / (c * float(np.real(values).min()))
+    yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
 
 
 def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
@@ -106,13 +152,14 @@ def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
     """On a tree with unit weights: what a chain of parents' inputs would amplify."""
     graph = parts.graph
     tree = len(graph.edges) == graph.agents - 1 and len(graph.leaders) == 1
+    tree = tree and graph.schedule is None
     if not tree or not (graph.weights == 1.0).all() or loop.closed.coupling < 0.5:
         return
     gain = margins.string_gain(loop.closed).gain
-    hops = csgraph.dijkstra(graph.adjacency(), indices=graph.leaders[0], unweighted=True)
-    depth = int(hops.max())
+    depth = int(graph.depths().max())
     shown = f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
-    used = parts.drive.feedforward is Feedforward.PARENT
+    # Heard one way, a branch is such a chain whatever is fed forward.
+    used = parts.drive.feedforward is Feedforward.PARENT or graph.directed
     text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
     if not used:
         text = "what feeding forward the parent's input would amplify; it is not used here"

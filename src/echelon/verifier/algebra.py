@@ -65,23 +65,23 @@ def _least(apart: Array, led: Array) -> tuple[float, float]:
     lost whatever the range of the weights (Grassmann, Taksar, Heyman), and for every x > 0 no
     eigenvalue of it exceeds the largest entry of L^-1 x / x (Collatz, Wielandt).
     """
-    steps = _eliminate(apart, led)
+    steps = eliminated(apart, led)
     if steps is None:
         return 0.0, 0.0
     # Where the next eigenvalue is close, iterations alone would not leave it behind. Small entries
     # of the guess must be too large: from above, y / x comes down to the eigenvalue at once.
-    x = y = np.abs(scipy.linalg.eigh(_solve(*steps, np.eye(len(led))))[1][:, -1]) + 1e-8
+    x = y = np.abs(scipy.linalg.eigh(solved(*steps, np.eye(len(led))))[1][:, -1]) + 1e-8
     for _ in range(_ITERATIONS):
         # What is far from the slowest mode dies out, and must not become zero.
         x = np.maximum(y / np.linalg.norm(y), 1e-150)
-        y = _solve(*steps, x)
+        y = solved(*steps, x)
         if (y / x).max() * (x @ x) <= (1.0 + 1e-14 * len(x)) * (x @ y):
             break
     # Each of the additions rounds once.
     return float(x @ x / (x @ y)), float((1.0 - 8.0 * _EPS * len(x)) / (y / x).max())
 
 
-def _eliminate(apart: Array, led: Array) -> tuple[Array, Array] | None:
+def eliminated(apart: Array, led: Array) -> tuple[Array, Array] | None:
     """Return weights (N, N) and pivots (N,) of an elimination; None where one agent is cut off."""
     W, led, pivots = apart.copy(), led.copy(), np.zeros(len(led))
     for k in range(len(W)):
@@ -96,7 +96,7 @@ def _eliminate(apart: Array, led: Array) -> tuple[Array, Array] | None:
     return W, pivots
 
 
-def _solve(W: Array, pivots: Array, b: Array) -> Array:
+def solved(W: Array, pivots: Array, b: Array) -> Array:
     """Return L^-1 b, b (N,) or (N, K) not negative, by the steps of an elimination."""
     x = b.copy()
     for k in range(len(x)):

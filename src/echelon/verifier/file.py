@@ -35,12 +35,19 @@ class SavedModel(NamedTuple):
 
 
 class SavedGraph(NamedTuple):
-    """The graph: `edges` (E, 3) of i, j and weight, or None where they were too many."""
+    """The graph: `edges` (E, 3) of i, j and weight, or None where they were too many.
+
+    Of a directed one j hears i, and its spectrum may be complex; `sums` are the followers' weights
+    in the sum that falls. One that `switches` has more edges than it has at any time.
+    """
 
     agents: int
     leaders: tuple[int, ...]
     edges: Array | None
     spectrum: Array
+    directed: bool = False
+    switches: bool = False
+    sums: Array | None = None
 
 
 class SavedRegion(NamedTuple):
@@ -267,10 +274,24 @@ def _graph(told: _Part) -> SavedGraph:
     numbers = leaders if edges is None else np.append(leaders, edges[:, :2])
     if not len(leaders) or not all(x == int(x) and 0 <= x < agents for x in numbers):
         raise told.fault("graph", f"must name agents from 0 to {agents - 1}, one leader at least")
-    spectrum = told.array("spectrum", -1)
+    spectrum = _spectrum(told)
     if not len(spectrum):
         raise told.fault("graph.spectrum", "must hold a number")
-    return SavedGraph(agents, tuple(sorted({int(x) for x in leaders})), edges, spectrum)
+    led = tuple(sorted({int(x) for x in leaders}))
+    directed, switches = (told.told.get(key) is True for key in ("directed", "switches"))
+    sums = told.array("sums", agents - len(led)) if told.told.get("sums") is not None else None
+    if sums is not None and not (sums > 0.0).all():
+        raise told.fault("graph.sums", "must be positive")
+    return SavedGraph(agents, led, edges, spectrum, directed, switches, sums)
+
+
+def _spectrum(told: _Part) -> Array:
+    """Return eigenvalues, of which complex ones stand as pairs."""
+    stored = told.entry("spectrum")[0]
+    if not (isinstance(stored, list) and stored and isinstance(stored[0], list)):
+        return told.array("spectrum", -1)
+    pairs = told.array("spectrum", -1, 2)
+    return pairs[:, 0] + 1j * pairs[:, 1]
 
 
 def _region(told: _Part, n: int, m: int) -> SavedRegion:

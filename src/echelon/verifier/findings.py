@@ -2,8 +2,11 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from echelon.core.types import Array
 from echelon.verifier import algebra, exact
+from echelon.verifier.arrows import directed_spectrum
 from echelon.verifier.file import SavedGain
 
 TIGHT = 1e-9
@@ -52,12 +55,13 @@ class Facts(NamedTuple):
     Attributes:
         saved: the file.
         eigenvalues: all of the grounded Laplacian, or those that a file without edges holds.
-        bound: lambda_min is no less.
+        bound: lambda_min is no less; of a directed graph, what its sum of squares is held by.
         pull: R^-1 B' (m, n), rounded once.
         weighted: B R^-1 B' (n, n), the same.
         feedback: B R^-1 B'P (n, n), the same.
         closed: A of the drift, its inner loop closed (n, n).
         speed: the size of its entries in units that make it small, 1/s.
+        least: lambda_min.
     """
 
     saved: SavedGain
@@ -68,18 +72,32 @@ class Facts(NamedTuple):
     feedback: Array
     closed: Array
     speed: float
+    least: float
 
     @property
     def low(self) -> float:
         """Return lambda_min."""
-        return float(self.eigenvalues[0])
+        return self.least
+
+    @property
+    def high(self) -> float:
+        """Return lambda_max, the largest size of an eigenvalue."""
+        return float(np.abs(self.eigenvalues).max())
 
 
 def facts(saved: SavedGain) -> Facts:
     """Recompute what claims rest on."""
     graph, B = saved.graph, saved.model.B
-    stored = algebra.Spectrum(graph.spectrum, float(graph.spectrum[0]))
-    values, bound = stored if graph.edges is None else algebra.spectrum(graph, graph.edges)
+    edges = None if graph.switches else graph.edges
+    # What stands in the file, where nothing says otherwise; of graphs that take turns lambda_min is
+    # none of their eigenvalues.
+    low = saved.lambda_min if graph.switches else float(np.real(graph.spectrum[0]))
+    values, bound = graph.spectrum, low
+    if edges is not None and graph.directed:
+        values, low, bound = directed_spectrum(graph, edges)
+    elif edges is not None:
+        values, bound = algebra.spectrum(graph, edges)
+        low = float(values[0])
     closed = saved.model.A if saved.inner is None else saved.model.A - B @ saved.inner
     return Facts(
         saved,
@@ -88,4 +106,5 @@ def facts(saved: SavedGain) -> Facts:
         *exact.weighted(B, saved.R, saved.P),
         closed,
         algebra.size(closed),
+        low,
     )

@@ -22,7 +22,7 @@ def linearized(facts: Facts) -> Iterator[Finding]:
     """Check what the file says of the system near its trim."""
     saved = facts.saved
     yield said("kind of the slowest mode", saved.kind == "linearization", saved.kind)
-    found, slack = _slowest(facts, algebra.ends_of_many(facts.eigenvalues))
+    found, slack = _slowest(facts, _looked_at(facts))
     if saved.abscissa < 0.0 and slack > _MODE_DECIDED * abs(found):
         text = f"rounding of {slack:.2g} leaves it undecided"
         yield said("slowest mode, 1/s", False, saved.abscissa, found, text)
@@ -37,7 +37,8 @@ def linearized(facts: Facts) -> Iterator[Finding]:
 def _between(facts: Facts) -> Iterator[Finding]:
     """Check that modes decay which were not looked at, if those at the ends do."""
     values, followers = facts.eigenvalues, facts.saved.graph.agents - len(facts.saved.graph.leaders)
-    if followers <= algebra.ALL_MODES or facts.saved.abscissa >= 0.0:
+    every = followers <= algebra.ALL_MODES or facts.saved.graph.directed
+    if every or facts.saved.graph.switches or facts.saved.abscissa >= 0.0:
         return
     values = (
         values[1:-1] if len(values) > 2 else np.geomspace(values[0], values[-1], _BETWEEN)[1:-1]
@@ -46,12 +47,20 @@ def _between(facts: Facts) -> Iterator[Finding]:
     yield said("all modes between decay", found + slack < 0.0, "", found)
 
 
+def _looked_at(facts: Facts) -> Array:
+    """Return the eigenvalues whose modes the file speaks of."""
+    graph = facts.saved.graph
+    if graph.directed or graph.switches:
+        return facts.eigenvalues
+    return algebra.ends_of_many(facts.eigenvalues)
+
+
 def _slowest(facts: Facts, values: Array) -> tuple[float, float]:
     """Return the slowest mode, 1/s, and what rounding may make of it."""
     K = facts.saved.coupling * facts.feedback
     modes = np.linalg.eigvals(facts.closed - values[:, None, None] * K).real.max(axis=1)
     found = [
-        algebra.rightmost(facts.closed - x * K, _doubt(facts, K, float(x)))
+        algebra.rightmost(facts.closed - x * K, _doubt(facts, K, abs(complex(x))))
         for x in values[np.argsort(modes)[-_LOOKED_AT:]]
     ]
     slowest = max(value for value, _ in found)
@@ -63,7 +72,7 @@ def _doubt(facts: Facts, K: Array, value: float) -> algebra.Doubt:
     """Return what solving with R in floating point, and an eigenvalue's rounding, leave open."""
     saved, eps = facts.saved, float(np.finfo(float).eps)
     # The smallest eigenvalue is known to all its digits, the others as parts of the largest.
-    lost = 50.0 * eps * float(facts.eigenvalues[-1]) if value > facts.low else 0.0
+    lost = 50.0 * eps * facts.high if value > facts.low else 0.0
 
     def bound(y: Array, x: Array) -> float:
         # A solver's R^-1 b is that of R + D with |D| <= 8 m eps |R|, D another for each b.

@@ -23,7 +23,7 @@ def regional(facts: Facts) -> Iterator[Finding]:
     if region.theorem == "A5":
         yield said("strength", region.strength == 0.0, region.strength, 0.0, "the drift alone")
     else:
-        yield same("strength", region.strength, 2.0 * saved.coupling * facts.low)
+        yield _strength(facts, region)
     fine = region.rate >= 0.0 if region.theorem == "A5" else region.rate > 0.0
     text = "V may rise" if region.theorem == "A5" else "errors need not shrink"
     # No set is certified either where V may grow.
@@ -38,8 +38,26 @@ def regional(facts: Facts) -> Iterator[Finding]:
     yield from _rate(facts, region)
 
 
+def _strength(facts: Facts, region: SavedRegion) -> Finding:
+    """Compare with 2 c lambda_min, or on a directed graph with what its sum is held by."""
+    saved = facts.saved
+    if not saved.graph.directed:
+        return same("strength", region.strength, 2.0 * saved.coupling * facts.low)
+    most = 2.0 * saved.coupling * facts.bound
+    fine = 0.0 < region.strength <= (1.0 + TIGHT) * most
+    return said("strength", fine, region.strength, most, "no more than the weighted sum is held by")
+
+
+def _skew(facts: Facts) -> float:
+    """Return how far one agent's share of the sum may exceed what it weighs for another."""
+    sums = facts.saved.graph.sums
+    return 1.0 if sums is None else float(np.sqrt(sums.max() / sums.min()))
+
+
 def needs_constant(facts: Facts, region: SavedRegion) -> bool:
     """Tell whether a promise holds for a constant g only."""
+    if facts.saved.graph.directed and region.theorem == "A5":
+        return True
     widest = _widest(facts.saved.P, region)
     cut = region.radius is not None and region.radius <= (1.0 + TIGHT) * _spread(facts) * widest
     return region.theorem == "T1" or region.theorem == "A5" and not cut
@@ -59,12 +77,12 @@ def _spread(facts: Facts) -> float:
     """Return what it costs the radius of a monotone drift that g may vary."""
     # sum delta_i'P delta_i is bounded by V = delta'(L kron P) delta over lambda_min, and V by
     # lambda_max.
-    return float(np.sqrt(facts.eigenvalues[0] / facts.eigenvalues[-1]))
+    return float(np.sqrt(facts.low / facts.high))
 
 
 def _radius(facts: Facts, region: SavedRegion) -> Finding:
     """Compare with the largest r of which {x'P x <= r^2} stays inside the bounds."""
-    widest = _widest(facts.saved.P, region)
+    widest = _widest(facts.saved.P, region) / _skew(facts)
     if region.theorem == "T2":
         text = "a local promise certifies no set"
         return said("radius", region.radius is None, str(region.radius), text=text)
@@ -125,7 +143,8 @@ def _proof(facts: Facts, region: SavedRegion) -> Iterator[Finding]:
     # A little below the number that eigenvalues show, so that it can be proved.
     low = min(Fraction(facts.bound), Fraction(facts.low) * (1 - Fraction(1, 10**11)))
     graph, few = saved.graph, len(facts.eigenvalues) <= _EXACT_FOLLOWERS
-    if graph.edges is not None and few:
+    # Of a directed graph the bound is held to whole numbers where it is found.
+    if graph.edges is not None and few and not graph.directed:
         rows = algebra.grounded_rows(graph, graph.edges)
         for k in range(len(rows)):
             # lambda_min > low exactly when L_g - low I is positive definite.

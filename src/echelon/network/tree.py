@@ -1,0 +1,68 @@
+"""A graph as seen from its leaders: who comes before whom, and who is whose parent."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from echelon.core.errors import GraphError
+from echelon.core.types import Array
+from echelon.network.edges import name_agents
+
+if TYPE_CHECKING:
+    from echelon.network.graph import Graph
+
+
+def ordered_outward(graph: "Graph") -> tuple[tuple[int, tuple[int, ...]], ...]:
+    """Return what `Graph.outward` says.
+
+    Raises:
+        GraphError: the graph switches.
+    """
+    if graph.schedule is not None:
+        raise GraphError("the graph switches, and plans are made in one order for all times.")
+    # Stable, which leaves the equally far in the order of their numbers.
+    order = np.argsort(graph.depths(), kind="stable").tolist()
+    known = {agent: order[:place] for place, agent in enumerate(order)}
+    return tuple(
+        (i, () if i in graph.leaders else tuple(j for j in graph.neighbours(i) if j in known[i]))
+        for i in order
+    )
+
+
+def parents_of(graph: "Graph") -> tuple[int, ...]:
+    """Return what `Graph.parents` says.
+
+    Raises:
+        GraphError: as there.
+    """
+    if graph.schedule is not None:
+        raise GraphError(
+            "the graph switches, and an agent has no one parent for all times; the feed-forward "
+            "`relay` needs none."
+        )
+    depth, parents = graph.depths(), np.arange(graph.agents)
+    i, j = graph.edges[depth[graph.edges].max(axis=1) > 0].T
+    if graph.directed:
+        # Whoever hears another one beside its parent is no link of a chain of its own.
+        heard = depth[j] > 0
+        child, parent = j[heard], i[heard]
+        counted, way = child, "more than one agent to hear"
+    else:
+        child, parent = np.where(depth[i] > depth[j], (i, j), (j, i))
+        # An edge between two that are equally far gives both of them one more way.
+        counted = np.concatenate([child, parent[depth[i] == depth[j]]])
+        way = "more than one way to a leader"
+    several = np.flatnonzero(np.bincount(counted, minlength=graph.agents) > 1)
+    if len(several):
+        raise GraphError(
+            f"the graph is no tree: {name_agents(several)} {way}, and so no one parent; the "
+            "feed-forward `relay` needs none."
+        )
+    parents[child] = parent
+    return tuple(parents.tolist())
+
+
+def shares(graph: "Graph", agent: int, earlier: tuple[int, ...]) -> Array:
+    """Return what part each neighbour has in an agent's targets, by the edges' weights."""
+    weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
+    return weights / weights.sum()
