@@ -205,7 +205,7 @@ class Swarm(Places):
             (self.of[nearest] * far).astype(np.int32),
             *(edges := edge_blocks(loop, self, dtype, far)),
             self.smooth.astype(np.int8),
-            _follow(edges[1]).all(axis=1).astype(np.int8),
+            np.asarray(_follow(edges[1]).all(axis=1), np.int8),
         )
 
     def spacing(self, edges: Array) -> Array:

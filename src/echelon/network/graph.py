@@ -21,11 +21,7 @@ from echelon.network.edges import (
     give_weights,
     split_weights,
 )
-from echelon.network.eigenvalues import (
-    directed_spectrum,
-    switching_spectrum,
-    symmetric_spectrum,
-)
+from echelon.network.eigenvalues import directed_spectrum, switching_spectrum, symmetric_spectrum
 from echelon.network.exchange import Exchange
 from echelon.network.radius import advising
 from echelon.network.reach import check_reached
@@ -392,8 +388,7 @@ class Graph:
 
     @property
     def _known(self) -> tuple[object, ...]:
-        told = self.schedule
-        when = None if told is None else (*(x.tobytes() for x in told[:2]), told.period)
+        when = self.schedule and (*(x.tobytes() for x in self.schedule[:2]), self.schedule.period)
         return self.agents, self.leaders, self.directed, when
 
     def __repr__(self) -> str:
