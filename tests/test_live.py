@@ -211,7 +211,7 @@ def test_a_knob_is_clamped_and_nonsense_is_refused_in_a_sentence(session):
         ("turn", float("nan")): "`turn` got `nan`, and must be a number.",
         ("turn", True): "`turn` got `True`, and must be a number.",
         ("kick", 9): "`kick` got `9`, and must be the number of an agent.",
-        ("cut", (0, 2)): "`(0, 2)` is no link of the graph.",
+        ("cut", (0, 2)): "`[0, 2]` is no link of the graph.",
         ("cut", 7): "`7` is no link of the graph.",
     }.items():
         with pytest.raises(SimulationError) as fault:

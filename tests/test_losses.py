@@ -239,20 +239,33 @@ def under(most, call, *arguments):
 FRAMES = ["--set", "simulation.horizon=10", "--no-figures"]
 
 
-def test_a_full_disk_shows_the_report_and_keeps_what_was_written(here, echelon, monkeypatch):
+def run_on_a_full_disk(echelon, monkeypatch, seconds):
+    """Fly with room for small files alone, stretches written after so many seconds."""
     write = files._write
     with monkeypatch.context() as patch:
+        patch.setattr(engine, "_SECONDS", seconds)
         patch.setattr(files, "_write", lambda *file: under(30_000, write, *file))
         code, out, err = echelon("run", "mine.yaml", *FRAMES, "--out", "o")
     assert code == 2 and "follower 3" in out
-    assert err.endswith(
+    return err
+
+
+def test_a_full_disk_shows_the_report_and_keeps_what_was_written(here, echelon, monkeypatch):
+    assert run_on_a_full_disk(echelon, monkeypatch, 0.0).endswith(
         "echelon: the folder `o` cannot be written: File too large; what was computed is kept, and "
         "`echelon run --resume o` goes on.\n"
     )
     assert not list(here.rglob("*.part")) and not (here / "o" / "run.nc").exists()
-    assert echelon("run", "--resume", "o", "--no-figures")[0::2] == (0, "")
+    assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
     assert echelon("run", "mine.yaml", *FRAMES, "--out", "whole")[0] == 0
     assert_same(here / "o", here / "whole")
+
+
+def test_where_nothing_could_be_kept_nothing_is_said_to_be(here, echelon, monkeypatch):
+    # The whole run is one stretch, which is larger than a file may be.
+    told = run_on_a_full_disk(echelon, monkeypatch, np.inf)
+    assert told.endswith("File too large; nothing that was computed could be kept.\n")
+    assert not (here / "o").exists()
 
 
 @pytest.mark.slow

@@ -47,6 +47,11 @@ class Chunks:
         """Whether the run may go on."""
         return self.place.is_dir()
 
+    @property
+    def hold_any(self) -> bool:
+        """Whether a stretch was written."""
+        return any(self.place.glob("*.npz"))
+
     def begin(self, scenario: Scenario, more: Mapping[str, str] = MappingProxyType({})) -> None:
         """Write the scenario with all files that it names, before anything is computed.
 
@@ -157,7 +162,7 @@ class Chunks:
 
     def forget(self) -> None:
         """Remove all that `begin` wrote, where nothing was computed since."""
-        if not self.exist or any(self.place.glob("*.npz")):
+        if not self.exist or self.hold_any:
             return
         self.remove()
         shutil.rmtree(self.folder / INPUTS, ignore_errors=True)

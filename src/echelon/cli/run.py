@@ -83,7 +83,7 @@ def run(
             watched.show_all(job.chunks.folder)
     if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
         # Then the disk ended it, and its message says so.
-        raise OutputError(f"{result.message[:-1]}, and {_again(job.chunks.folder)}.")
+        raise OutputError(f"{result.message[:-1]}, and {_kept(job.chunks)}.")
     raise typer.Exit(STOP.exit_code or result.outcome.exit_code)
 
 
@@ -152,8 +152,11 @@ def _fly(job: _Job, watched: "Watched | None", quiet: bool) -> "Result":
         return build.run(job.scenario, progress, job.built, keep, job.before)
 
 
-def _again(folder: Path) -> str:
-    return f"`echelon run --resume {folder}` goes on"
+def _kept(chunks: "Chunks") -> str:
+    """Return what becomes of a run that could not be written whole."""
+    if not chunks.hold_any:
+        return "nothing that was computed could be kept"
+    return f"what was computed is kept, and `echelon run --resume {chunks.folder}` goes on"
 
 
 @contextmanager
@@ -186,8 +189,7 @@ def _write(chunks: "Chunks", result: "Result", figures: bool, quiet: bool) -> No
     try:
         write_findings(result, chunks.folder, figures)
     except OutputError as error:
-        again = f"what was computed is kept, and {_again(chunks.folder)}"
-        raise OutputError(f"{str(error)[:-1]}; {again}.") from error
+        raise OutputError(f"{str(error)[:-1]}; {_kept(chunks)}.") from error
     if result.outcome.reached or result.outcome is Outcome.DIVERGED:
         chunks.remove()
     if not quiet:
