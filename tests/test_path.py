@@ -21,8 +21,10 @@ def line_of(found, name=Hypothesis.ALONG):
 
 
 @pytest.mark.parametrize("yaw", [1.05, -1.2])
-def test_a_yaw_that_loses_the_formation_is_not_promised(yaw):
-    found = ech.promise(*built("paper", f"reference.yaw={yaw}"))
+def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw):
+    turning = ech.promise(*built("paper", f"reference.yaw={yaw}"))
+    assert turning.promised and not line_of(turning).fails
+    found = ech.promise(*built("paper", f"reference.yaw={yaw}", "follower.frame=world"))
     line = line_of(found)
     assert not found.promised and line.fails and line.kind is Kind.SAMPLES
     assert line.number > 0.1 and f"`yaw` {yaw:.3g} rad" in found.sentence()
