@@ -25,6 +25,8 @@ SHOWN = 32
 """Of more eigenvalues of the graph than these, so many stand for all in the margins."""
 _FEW = 8  # modes that a longest step is sought with, the extreme ones among them
 _DENSE = 400
+_MANY = 1000
+"""As many complex eigenvalues as a circle of agents may have."""
 _SLACK = 1e-9
 """Relative; what a solver leaves of the inequality behind an edge, which is often tight."""
 
@@ -80,7 +82,7 @@ class Loop(NamedTuple):
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) of that integrator with which every mode decays."""
         A, B = self.open
-        few = np.unique(np.linspace(0, len(self.gains) - 1, _FEW).astype(int))
+        few = telling(self.closed.strengths, _FEW)
         return longest_step(A, B, self.gains[few], settings.integrator)
 
     @property
@@ -194,13 +196,28 @@ def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:
     return certify(linear, graph.spectrum(), gain.P, gain.R, gain.coupling, None).abscissa
 
 
+def telling(values: Array, count: int) -> Array:
+    """Return the places of so many eigenvalues (K,), spread evenly, and of those at an extreme.
+
+    Of complex ones those count too that are the largest, lean the most, or are left the least
+    delay, (pi/2 - |arg lambda|) / |lambda|: of each, the first few.
+    """
+    few = np.linspace(0, len(values) - 1, count).astype(int)
+    if not np.iscomplexobj(values):
+        return np.unique(few)
+    size, lean = np.abs(values), np.abs(np.angle(values))
+    marks = (-size, -np.abs(values.imag), -lean, (0.5 * np.pi - lean) / np.maximum(size, 1e-300))
+    return np.unique([*few, *(k for mark in marks for k in np.argsort(mark)[: count // 2])])
+
+
 def _representatives(modes: Modes) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
     (values, total, *_), _, what = modes
     if np.iscomplexobj(values):
         # The modes of a conjugate pair mirror each other.
-        values = values[np.imag(values) >= 0.0]
-        total = len(values)
+        values = np.unique(values[np.imag(values) >= 0.0])
+        # A pair in the midst may need the shortest step, so all are looked at where they can be.
+        return values[telling(values, _MANY)], f"all {what} of the graph, one of each pair"
     if len(values) < total:
         between = np.geomspace(values[0], values[-1], SHOWN)
         return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"

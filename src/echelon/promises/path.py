@@ -22,7 +22,7 @@ from echelon.engine.settings import Settings
 from echelon.laws.law import Law, LocalView, gain_of, without_certificates
 from echelon.models.heading import state_turn
 from echelon.models.model import ControlAffine
-from echelon.promises.closed_loop import Loop
+from echelon.promises.closed_loop import Loop, telling
 from echelon.promises.leaders import Leaders
 from echelon.promises.route import MOMENTS, Route, Rows, route_of
 
@@ -252,7 +252,7 @@ def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
         # In axes that turn, delta turns the other way by itself.
         A = A - rows.rates[:, None, None] * state_turn(parts.model).slope
     values = loop.closed.eigenvalues
-    few = values[np.unique(np.linspace(0, len(values) - 1, _MODES).astype(int))]
+    few = values[telling(values, _MODES)]
     return Slopes(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
 
 

@@ -6,6 +6,7 @@ integrator, feed-forward, limits and starts that run; what a gain says of itself
 """
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, cast, final
@@ -34,7 +35,7 @@ from echelon.promises.region import region_of, slopes_beside, weaken
 from echelon.promises.statement import Cause, Hypothesis, Statement
 from echelon.promises.stopping import Stopping, condition_lines, drift_reason, stopping_of
 from echelon.promises.tube import Tube, tube_of
-from echelon.promises.turning import turns_in_words
+from echelon.promises.turning import slowest_in_turns, turns_in_words
 
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
 
@@ -57,6 +58,7 @@ class Promise:
         turns: what the leader's heading may do, in words; empty where the law does not turn.
         tube: what T5 promises; None under other laws, or where it promises nothing.
         hold: the longest step that T5 allows, s; None under other laws.
+        slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """
 
     loop: Loop
@@ -71,6 +73,7 @@ class Promise:
     turns: str = ""
     tube: Tube | None = None
     hold: float | None = None
+    slowest_turn: float = -math.inf
 
     @property
     def linear(self) -> bool:
@@ -114,8 +117,10 @@ class Promise:
             return None
         ground = self._ground
         if ground is None and self.loop.common is not None:
-            return max(0.0, self.loop.common)
-        return -self.loop.slowest if ground is None else ground.rate
+            return max(0.0, min(self.loop.common, -self.slowest_turn))
+        if ground is None:
+            return -max(self.loop.slowest, self.slowest_turn)
+        return ground.rate
 
     @property
     def edge(self) -> float | None:
@@ -260,8 +265,8 @@ def promises(parts: Parts, settings: Sequence[Settings]) -> Iterator[Promise]:
     """
     alike = (s for s in _kept.get(parts, {}) if s._replace(seed=0) == settings[0]._replace(seed=0))
     first, prepared = promise(parts, next(alike, settings[0])), prepare(parts, settings[0])
-    if _asks_where(prepared.parts, first.loop) and first.frozen is None:
-        # Nobody leaves the trim, and a seed may be what does.
+    if first.hold is not None or _asks_where(prepared.parts, first.loop) and first.frozen is None:
+        # A tube is of where agents start; or nobody leaves the trim, and a seed may be what does.
         yield from (promise(parts, each) for each in settings)
         return
     with precision("float64"):
@@ -338,6 +343,7 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
         own=None if leaders.rest else leaders.slowest,
         frozen=case.frozen,
         turns=turns_in_words(case),
+        slowest_turn=max(slowest_in_turns(case).values(), default=-math.inf),
     )
 
 

@@ -209,6 +209,12 @@ def _step_line(run: Stopping) -> Statement:
     name, dt, c = Hypothesis.STEP, run.settings.dt, run.coupling
     share = c * run.law.reach.heaviest * dt
     radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
+    led = float(run.leader.strength(dt)) * dt
+    if led > 1.0 + 1e-12:
+        # Its distance from its path would grow, on which the tube and the motors rest.
+        text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {led:.3g} is above 1"
+        remedy = f"lower `leader.coupling` to {1.0 / dt:.4g}"
+        return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, led, shown, text, remedy, text)
     if share <= 1.0 + 1e-12 and radius < 1.0:
         text = f"Euler's step of zeta grows nowhere; spectral radius {radius:.4g} a step"
         return Statement(name, Verdict.HOLDS, Kind.LINEARIZATION, share, shown, text)
@@ -224,12 +230,19 @@ def _step_line(run: Stopping) -> Statement:
 
 def _radius(run: Stopping) -> float:
     """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
-    loop, found, ends = run.law.ready, 0.0, _strengths(run)
+    led = np.array([run.leader.strength(run.settings.dt)])
+    followed = _held(run, run.law.ready, run.coupling * _strengths(run))
+    return max(followed, _held(run, run.leader.ready, led))
+
+
+def _held(run: Stopping, loop: FlatLoop, strengths: Array) -> float:
+    """Return the same of agents that feel what is off by so much each (K,), 1/s."""
+    found = 0.0
     for k, degree in enumerate(loop.chains.degrees):
         A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
         stop = loop.stiffness[k] * loop.weights[:degree, k]
         inner = np.append(0.0, stop[:-1])
-        gains = inner + run.coupling * ends[:, None] * stop
+        gains = inner + strengths[:, None] * stop
         dt, how = run.settings.dt, run.settings.integrator
         found = max(found, held_radius(A, B, gains[:, None], dt, how))
     return found

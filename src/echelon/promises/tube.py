@@ -10,7 +10,7 @@ import numpy as np
 from echelon.certificates.tube import Push, Room, room_of
 from echelon.core.errors import GainError, listing
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.models.model import FlatBound
 from echelon.promises.arrival import Arrival, arrival_of
 from echelon.promises.motors import Strain, strain_of
@@ -23,6 +23,9 @@ _ROUNDED = Fraction(1, 10**6)
 _STARTS = 64
 """Starts of agents that are looked at one by one; those that differ in one speed alone are two."""
 _PROOF = Kind.PROOF
+
+
+_ANY = ("any graph in which the leader reaches everybody", "this graph")
 
 
 class Tube(NamedTuple):
@@ -51,7 +54,7 @@ class Tube(NamedTuple):
     who: str
     borders: tuple[dict[str, Any], ...]
     strain: Strain | None
-    graphs: tuple[str, str] = ("any graph in which the leader reaches everybody", "this graph")
+    graphs: tuple[str, str] = _ANY
 
     @property
     def theorem(self) -> Theorem:
@@ -125,12 +128,22 @@ def tube_of(run: Stopping) -> _Found:
     told = tuple(border.told for border in borders)
     strain, line = strain_of(run)
     tube = Tube(kind, run.rate, gains, far, steepest, arrival, who, told, strain)
-    schedule = run.parts.graph.schedule
-    if schedule is not None:
-        every = "in the end" if schedule.period is None else "in every period"
-        graphs = f"any graphs that take turns and by which the leader reaches everybody {every}"
-        tube = tube._replace(graphs=(graphs, "these"))
-    return _Found(tube, (*lines, line))
+    return _Found(tube._replace(graphs=_graphs(run)), (*lines, line))
+
+
+def _graphs(run: Stopping) -> tuple[str, str]:
+    """Return of which graphs T5 speaks, and how this one is called."""
+    schedule, law = run.parts.graph.schedule, run.law
+    if law.feedforward is Feedforward.PARENT:
+        # The speeds of the links add up in the tube.
+        return f"any tree in which none is more than {run.links} links from a leader", "this one"
+    if schedule is None:
+        return _ANY
+    every = "in the end" if schedule.period is None else "in every period"
+    along = "along neighbours nearer to it " if law.leaderward else ""
+    return f"any graphs that take turns and by which the leader reaches everybody {along}{every}", (
+        "these"
+    )
 
 
 def _nothing(text: str, remedy: str, *before: Statement) -> _Found:

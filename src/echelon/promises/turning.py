@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.certificates.lmi import rate_of
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
 from echelon.engine.laws import Laws
@@ -68,7 +69,12 @@ def turns_in_words(case: Case) -> str:
 
 
 def slowest_in_turns(case: Case) -> dict[float, float]:
-    """Return the slowest mode (1/s) in steady turns at the least and largest rate of the path."""
+    """Return the slowest mode (1/s) in steady turns at the least and largest rate of the path.
+
+    Of graphs that take turns it is what the sum of all delta'P delta promises, halved (T8).
+    """
+    if not turns_with_heading(case):
+        return {}
     rates = case.frozen.turns if case.frozen else ()
     found = {rate: slowest_in_turn(case, rate) for rate in rates}
     return {rate: slowest for rate, slowest in found.items() if slowest is not None}
@@ -87,7 +93,12 @@ def slowest_in_turn(case: Case, rate: float) -> float | None:
     gains = [loop.inner + strength * K for strength in loop.closed.strengths]
     own = gain_of(case.parts.drive.leader)
     gains += [] if own is None else [own.coupling * own.R_inverse @ B.T @ own.P]
-    return float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
+    slowest = float(np.linalg.eigvals(A - B @ np.array(gains)).real.max())
+    if case.parts.graph.schedule is None:
+        return slowest
+    # Decaying modes of each graph do not suffice; one sum that falls on all of them does.
+    felt = 2.0 * gain.coupling * case.parts.graph.spectrum().proved
+    return max(slowest, -rate_of(gain.P, (A - B @ loop.inner)[None], B, gain.R, felt))
 
 
 def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None:
