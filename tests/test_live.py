@@ -427,6 +427,7 @@ def test_a_page_that_is_closed_ends_nothing_and_nobody_watching_stops_the_clock(
         ({"cut": [0, 2]}, "`live` at 1 s: `[0, 2]` is no link of the graph."),
         ({"law": "best"}, "`live` at 1 s: there is no law `best` here; there are `consensus`"),
         ({"shape": "star"}, "`live` at 1 s: there is no shape `star` here; there are"),
+        ({"law": "passive", "coupling": 2.0}, "`live` at 1 s: there is no knob `coupling`"),
         ({"kick": {4: [1.0, 0, 0, 0]}}, "`live` at 1 s: `kick` got agent 4 with 4 numbers"),
     ],
 )

@@ -458,7 +458,10 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     result = ech.simulate(parts, settings(horizon=0.1))
     told, data = ech.summary(result)["promise"], ech.dataset(result)
     assert told == ech.promise(parts, settings(horizon=0.1)).as_mapping()
-    assert {each["statement"] for each in told["hypotheses"]} == {h.value for h in Hypothesis}
+    # Lines of laws that turn, of graphs that switch and of motors are there only where these are.
+    apart = {Hypothesis.TURNING, Hypothesis.SWITCHING, Hypothesis.LIMITS}
+    always = {h.value for h in Hypothesis if h not in apart}
+    assert {each["statement"] for each in told["hypotheses"]} == always
     for each in told["hypotheses"]:
         assert each["number"] is None or isinstance(each["number"], (int, float))
     np.testing.assert_array_equal(data["P"], gain.P)

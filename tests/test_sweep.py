@@ -187,6 +187,24 @@ def test_promises_of_many_seeds_are_those_of_each(changes):
         assert one.as_mapping() == promise(parts, each).as_mapping()
 
 
+def test_runs_with_noise_and_runs_without_fly_in_one_sweep():
+    scenario = ech.load_scenario("van-der-pol", [*SHORT, "simulation.engine=native"])
+    noise = {f"disturbance.input_rms.{ech.models.VanDerPol.input_names[0]}": [0.0, 0.05]}
+    found = ech.sweep(scenario, {**noise, "seed": range(2)})
+    assert (found["outcome"] == 0).all()
+    still, shaken = found["final_error"].values.reshape(2, -1)
+    assert np.isfinite(shaken).any() and not np.array_equal(still, shaken, equal_nan=True)
+
+
+def test_of_starts_that_no_tube_covers_none_is_promised_among_many():
+    far = ["initial.spread={velocity: 18.0}", "simulation.horizon=1", "report.steady_window=0.5"]
+    parts, chosen = built("paper-global", *far)
+    asked = [chosen._replace(seed=k) for k in (0, 1)]
+    first, second = promises(parts, asked)
+    assert [first.promised, second.promised] == [promise(parts, s).promised for s in asked]
+    assert first.tube is not second.tube
+
+
 # ---- the dataset ----
 
 

@@ -1,10 +1,12 @@
 """`echelon run --view`: a run in the browser while it is computed."""
 
 import contextlib
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
+from echelon.cli.stop import STOP
 from echelon.cli.view import show_address, wait
 from echelon.core.errors import OutputError
 
@@ -28,7 +30,7 @@ class Watched:
         from echelon.engine.prepare import prepare
         from echelon.promises.promise import promise
         from echelon.results.foreseen import foreseen
-        from echelon.results.lyapunov import potential
+        from echelon.results.lyapunov import goes_both_ways, potential
         from echelon.viewer.growing import Growing
 
         prepared = prepare(*built)
@@ -38,7 +40,7 @@ class Watched:
         P = parts.drive.metric(parts.model)
         # Of a law that turns, P stands in axes that turn too, and V is told at the end.
         turns = getattr(getattr(parts.drive, "follower", None), "turning", False)
-        shown = None if turns else P
+        shown = P if goes_both_ways(parts.graph) and not turns else None
         self.potential = shown if shown is None else potential(parts.model, parts.graph, shown)
         self.page = Growing(self.run)
 
@@ -55,8 +57,10 @@ class Watched:
         """Show the run that is done, until Ctrl-C."""
         from echelon.archive.open import open_run
 
-        self.page.finish(open_run(folder))
-        wait()
+        with STOP.hold(said=""):
+            self.page.finish(open_run(folder))
+            print("echelon: the run is done, and its page stays. Ctrl-C ends.", file=sys.stderr)
+            wait()
 
 
 @contextlib.contextmanager

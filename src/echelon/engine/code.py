@@ -81,7 +81,8 @@ class Kernels:
         Raises:
             Unsupported: a law or the model uses what has no scalar operations.
         """
-        key = (own.signature, bits, together, lines, weighted)
+        # The rows too: those of wind and noise are there only where these are.
+        key = (own.signature, Rows.of(own.loop, own.count), bits, together, lines, weighted)
         if key not in self._made:
             # The oldest goes: a sweep over models has one after the other.
             while len(self._made) >= _KEPT:

@@ -143,15 +143,14 @@ class Fleet:
             except (Unsupported, MissingExtraError, TypeError):
                 # A model that wants its numbers as numbers is traced for each of them.
                 return {}
-            record = _Flock(len(jobs), Grid(settings, stepper.longest), jobs[0].prepared)
+            record = _Flock(len(jobs), Grid(settings, stepper.longest), jobs[0].prepared, bits)
             record.fly(stepper, told)
         # Each by itself then goes on by JAX.
-        far = np.asarray(beyond(record.states, bits).any(axis=(0, 2, 3)))
         seconds = (time.perf_counter() - began) / len(jobs)
         return {
             job.place: record.result(k, job.prepared, seconds)
             for k, job in enumerate(jobs)
-            if not far[k]
+            if not record.far[k]
         }
 
 
@@ -159,13 +158,13 @@ class Fleet:
 class _Flock:
     """What is kept of formations that fly together."""
 
-    def __init__(self, count: int, grid: Grid, first: Prepared) -> None:
-        self.count, self.grid, self.first = count, grid, first
+    def __init__(self, count: int, grid: Grid, first: Prepared, bits: int) -> None:
+        self.count, self.grid, self.first, self.bits = count, grid, first, bits
         self.times, self._states = list[Array](), list[Array]()
         self._inputs, self._references = list[Array](), list[Array]()
         nothing = on_host(first.problem.meter.nothing())
         self.sums = Sums(*(np.stack([part] * count) for part in nothing))
-        self.finite = np.ones(count, bool)
+        self.finite, self.far = np.ones(count, bool), np.zeros(count, bool)
 
     def fly(self, stepper: NativeStepper, told: Told | None) -> None:
         """Take all steps."""
@@ -188,19 +187,15 @@ class _Flock:
         self.sums = _where(self.finite, self.sums.plus(_split(made.sums, self.count)), self.sums)
         finite = np.isfinite(x).all(axis=(2, 3)) & np.isfinite(u).all(axis=(2, 3))
         stored = self.grid.stored(points)
-        # Frames between those that are stored tell of a loss too.
+        # Frames between those that are stored tell of a loss too, and of states too large.
         self.finite &= finite.all(axis=0)
+        self.far |= beyond(x, self.bits).any(axis=(0, 2, 3))
         self.times.append(self.first.problem.settings.dt * points[stored])
         self._states.append(x[stored])
         self._inputs.append(u[stored])
         if reference is not None:
             self._references.append(reference[points - first][stored])
         return int(stored.sum())
-
-    @property
-    def states(self) -> Array:
-        """Of all frames, (T, F, N, n)."""
-        return np.concatenate(self._states)
 
     def result(self, k: int, prepared: Prepared, seconds: float) -> Result:
         """Return one of the runs."""

@@ -183,12 +183,14 @@ class NativeStepper(Stepper):
     def _look(self, step: int, first: int, table: Array | None) -> Array:
         """Return the inputs of a step that is not taken."""
         changed = (self.blocks, self.edges, *self.mirrors)
-        kept = [array.copy() for array in changed]
+        kept, drawn = [array.copy() for array in changed], self._drawn
         self._run(step, 1, first, table)
         found = self._read(self.rows.input)
         self.mirrors.reverse()
         for array, before in zip(changed, kept, strict=True):
             array[:] = before
+        # What was drawn for it is gone from the blocks again.
+        self._drawn = drawn
         return found
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:

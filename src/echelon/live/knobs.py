@@ -333,4 +333,5 @@ def check_choice(what: str, name: object, allowed: Iterable[str]) -> None:
         SimulationError: it may not.
     """
     if name not in list(allowed):
-        raise SimulationError(f"there is no {what} `{name}` here; there are {listing(allowed)}.")
+        there = f"there are {listing(allowed)}" if list(allowed) else "none can be chosen"
+        raise SimulationError(f"there is no {what} `{name}` here; {there}.")

@@ -55,15 +55,17 @@ class Session:
         Raises:
             SimulationError: something cannot be done, and when.
         """
+        panel = self.panel
         for event in self.future:
             try:
-                self._check_event(event)
+                panel = self._check_event(panel, event)
             except EchelonError as error:
                 said = _without_place(error)
                 raise SimulationError(f"`live` at {event['at']:g} s: {said}") from error
 
-    def _check_event(self, event: Mapping[str, Any]) -> None:
-        panel = self.loops[self.prepare(str(event["law"]))][0] if "law" in event else self.panel
+    def _check_event(self, panel: Panel, event: Mapping[str, Any]) -> Panel:
+        """Check one thing that is done under the law of a panel; return that of the law then."""
+        panel = self.loops[self.prepare(str(event["law"]))][0] if "law" in event else panel
         agents, n = self.swarm.states.shape
         for name, value in event.items():
             if name in ("cut", "restore"):
@@ -77,6 +79,9 @@ class Session:
                             f"`kick` got agent {agent} with {len(by)} numbers, and must be of "
                             f"agents 0 to {agents - 1} with {n}."
                         )
+            elif name not in ("at", "law"):
+                panel.turned(panel.start, name, value)
+        return panel
 
     # ---- the loop -------------------------------------------------------------------------------
 
@@ -114,15 +119,16 @@ class Session:
         """Do what was asked since the last picture, and what the scenario says is due."""
         with self.changed:
             todo, self.todo = self.todo, []
+        now = self.swarm.steps * self.swarm.settings.dt
+        while self.future and self.future[0]["at"] <= now + 1e-9:
+            event = self.future.pop(0)
+            todo.append(lambda event=event: self.apply(event))
         for act in todo:
             try:
                 act()
             except EchelonError as error:
                 # What could be done when it was asked, and no more, as under another law.
                 self.say({"note": _without_place(error)})
-        now = self.swarm.steps * self.swarm.settings.dt
-        while self.future and self.future[0]["at"] <= now + 1e-9:
-            self.apply(self.future.pop(0))
 
     def show(self, picture: Picture) -> None:
         """Make a picture the latest one."""
@@ -273,7 +279,6 @@ class Session:
     def apply(self, event: Mapping[str, Any]) -> None:
         """Do one thing, and note it with its time."""
         now = round(self.swarm.steps * self.swarm.settings.dt, 9)
-        self.events.append({"at": now, **{k: v for k, v in event.items() if k != "at"}})
         knobs = self.knobs
         for name, value in event.items():
             if name == "kick":
@@ -288,6 +293,8 @@ class Session:
                 knobs = _CHOSEN[name](self.panel, knobs, value)
             elif name != "at":
                 knobs = self.panel.turned(knobs, name, value)
+        # What is refused on the way is not done again by the scenario that is saved.
+        self.events.append({"at": now, **{k: v for k, v in event.items() if k != "at"}})
         if knobs != self.knobs:
             self._stand(knobs)
 

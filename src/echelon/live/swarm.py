@@ -23,7 +23,7 @@ from echelon.live.mover import mover_of
 from echelon.models.model import ControlAffine
 from echelon.network.exchange import Exchange
 from echelon.network.graph import Graph
-from echelon.results.lyapunov import potential
+from echelon.results.lyapunov import goes_both_ways, potential
 from echelon.world.disturbance import Disturbance
 from echelon.world.world import World
 
@@ -206,7 +206,7 @@ class Swarm:
         gain = self.panel.gain(knobs)
         P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
         # Of a law that turns, P stands in axes that turn too.
-        if P is None or self.loop.follower.turning or self.parts.graph.directed:
+        if P is None or self.loop.follower.turning or not goes_both_ways(self.parts.graph):
             return None
         if (knobs.cut, knobs.method) not in self.potentials:
             try:

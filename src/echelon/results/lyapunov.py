@@ -60,6 +60,11 @@ class Lyapunov(NamedTuple):
         return falls & (self.drift_after <= slack) & rises
 
 
+def goes_both_ways(graph: Graph) -> bool:
+    """Tell whether V is known of a graph: each edge is heard both ways, and all the time."""
+    return not graph.directed and graph.schedule is None
+
+
 def lyapunov(result: Result) -> Lyapunov | None:
     """Return V along a run, in float64.
 
@@ -67,8 +72,7 @@ def lyapunov(result: Result) -> Lyapunov | None:
     switch, where V is no sum over edges and need not fall (theory page, T7).
     """
     P, graph, offsets = result.drive.metric(result.model), result.graph, result.formation.offsets
-    mutual = not graph.directed and graph.schedule is None
-    if P is None or not len(result.times) or not mutual:
+    if P is None or not len(result.times) or not goes_both_ways(graph):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
         x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
