@@ -206,7 +206,7 @@ def telling(values: Array, count: int) -> Array:
     if not np.iscomplexobj(values):
         return np.unique(few)
     size, lean = np.abs(values), np.abs(np.angle(values))
-    marks = (-size, -np.abs(values.imag), -lean, (0.5 * np.pi - lean) / np.maximum(size, 1e-300))
+    marks = (-size, -np.abs(np.imag(values)), -lean, (0.5 * np.pi - lean) / np.maximum(size, 1e-300))
     return np.unique([*few, *(k for mark in marks for k in np.argsort(mark)[: count // 2])])
 
 
