@@ -16,6 +16,7 @@ from echelon.engine.loop import assemble, begin, control, step
 from echelon.engine.prepare import prepare
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.linearization import linearize
+from echelon.models.model import wound
 from echelon.network.eigenvalues import _least
 from echelon.promises.promise import promise
 from echelon.promises.statement import Hypothesis, Line
@@ -436,3 +437,49 @@ def flights(loop, weights, starts, steps):
         return jax.lax.fori_loop(0, steps, on, (begin(mine, x), jnp.inf))[1]
 
     return jax.jit(jax.vmap(one))(weights, starts)
+
+
+def test_a_pair_in_the_midst_of_a_spectrum_counts_for_the_step():
+    # Sixty agents with real eigenvalues from 1 to 100, and three in a circle: 92 and 52i.
+    star = [(0, i, 1.0 + 99.0 * (i - 1) / 59.0) for i in range(1, 61)]
+    circle = [(61, 62, 60.0), (62, 63, 60.0), (63, 61, 60.0)]
+    graph = ech.Graph([*star, (0, 61, 60.0), *circle], directed=True)
+    gain = ech.synthesize(CARTS, graph, ech.gains.Riccati())
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    offsets = ech.Formation(np.zeros((64, 4)))
+    parts = ech.Parts(CARTS, graph, offsets, drive, initial={"position": 1.0})
+    longest = promise(parts, ech.Settings(1.0, 0.002)).longest_step(ech.Settings(1.0, 0.002))
+    for share, holds in ((0.95, True), (1.05, False)):
+        chosen = ech.Settings(200 * share * longest, share * longest)
+        assert promise(parts, chosen).promised is holds
+        errors = np.linalg.norm(ech.simulate(parts, chosen).errors[:, 61:], axis=(1, 2))
+        assert (errors[-1] < errors[0]) is holds
+
+
+class Dial(ech.ControlAffine):
+    """One angle, which winds."""
+
+    state_names, input_names = ("angle",), ("rate",)
+
+    def drift(self, x):
+        return jnp.zeros_like(x)
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+    def difference(self, x, y):
+        return wound(x - y, 0)
+
+
+def test_of_angles_that_wind_no_start_half_a_turn_apart_is_promised():
+    model, graph = Dial(), ech.Graph.ring(8)
+    gain = ech.synthesize(model, graph, ech.gains.RobustLQR(domain={}))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    # Twisted once around: nobody's neighbours pull more one way than the other.
+    starts = 2.0 * np.pi * np.arange(8)[:, None] / 8
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((8, 1))), drive, initial=starts)
+    chosen = ech.Settings(5.0, 0.01)
+    run, found = ech.simulate(parts, chosen), promise(parts, chosen)
+    assert np.abs(run.errors[-1]).max() > 5.0
+    assert found.hypotheses[Hypothesis.STARTS].verdict is Verdict.FAILS
+    assert found.certified.radius < np.pi

@@ -205,6 +205,7 @@ def test_what_is_promised_of_a_turn_is_the_rate_at_which_errors_shrink():
     early, late = sizes[[400, 650]]
     assert np.log(late / early) / 5.0 == pytest.approx(line.number, rel=0.02)
     assert "or to a steady turn at 1 rad/s, at any `yaw`" in found.sentence()
+    assert found.rate == -max(line.number, found.slowest)
 
 
 def test_a_steady_turn_moves_nothing_in_axes_that_turn():

@@ -205,8 +205,8 @@ def telling(values: Array, count: int) -> Array:
     few = np.linspace(0, len(values) - 1, count).astype(int)
     if not np.iscomplexobj(values):
         return np.unique(few)
-    size, lean = np.abs(values), np.abs(np.angle(values))
-    marks = (-size, -np.abs(np.imag(values)), -lean, (0.5 * np.pi - lean) / np.maximum(size, 1e-300))
+    size, lean = np.maximum(np.abs(values), 1e-300), np.abs(np.angle(values))
+    marks = (-size, -np.abs(np.imag(values)), -lean, (0.5 * np.pi - lean) / size)
     return np.unique([*few, *(k for mark in marks for k in np.argsort(mark)[: count // 2])])
 
 
