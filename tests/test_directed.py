@@ -453,7 +453,7 @@ def test_a_pair_in_the_midst_of_a_spectrum_counts_for_the_step():
         chosen = ech.Settings(200 * share * longest, share * longest)
         assert promise(parts, chosen).promised is holds
         errors = np.linalg.norm(ech.simulate(parts, chosen).errors[:, 61:], axis=(1, 2))
-        assert (errors[-1] < errors[0]) is holds
+        assert bool(errors[-1] < errors[0]) is holds
 
 
 class Dial(ech.ControlAffine):
