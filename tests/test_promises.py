@@ -111,14 +111,15 @@ HEAVY = {"robust-lqr", "contraction"}
 def combinations():
     """All of them: of each scenario and method one feed-forward in turn, the rest as a study.
 
-    A hull of a quadrotor takes a minute or two, and the variants of `paper` have the same one. What
+    A hull of a quadrotor takes a minute or two, and `yaw-turn` and the variants of `paper` have that
+    of `paper`. What
     is an experiment of another law has nothing of its own under this one.
     """
     words, every = list(map(str, Feedforward)), sorted(ech.bundled_scenarios())
     laws = {name: str(ech.load_scenario(name).follower.law) for name in every}
     for i, scenario in enumerate(name for name in every if laws[name] != "stopping-point"):
         for j, method in enumerate(METHODS):
-            again = scenario.startswith("paper-") and method in HEAVY
+            again = method in HEAVY and (scenario.startswith("paper-") or scenario == "yaw-turn")
             for k, feedforward in enumerate(words):
                 drawn = (i + j) % len(words) == k and not again
                 marks = pytest.mark.slow if drawn else pytest.mark.study
