@@ -111,9 +111,8 @@ HEAVY = {"robust-lqr", "contraction"}
 def combinations():
     """All of them: of each scenario and method one feed-forward in turn, the rest as a study.
 
-    A hull of a quadrotor takes a minute or two, and `yaw-turn` and the variants of `paper` have that
-    of `paper`. What
-    is an experiment of another law has nothing of its own under this one.
+    A hull of a quadrotor takes a minute or two, and `yaw-turn` and the variants of `paper` have
+    that of `paper`. What is an experiment of another law has nothing of its own under this one.
     """
     words, every = list(map(str, Feedforward)), sorted(ech.bundled_scenarios())
     laws = {name: str(ech.load_scenario(name).follower.law) for name in every}
