@@ -157,7 +157,6 @@ def test_a_formation_is_held_behind_a_leader_that_turns(run):
 
 
 def test_both_engines_turn_alike_and_a_whole_turn_is_no_error(run):
-    pytest.importorskip("llvmlite")
     starts = {k: run.states[0, k] + 2.0 * np.pi * k * np.eye(6)[4] for k in (1, 2)}
     other = flown(TURNING, starts, horizon=6.0, engine="native")
     apart = other.states - run.states[: len(other.states)]

@@ -217,7 +217,9 @@ def _representatives(modes: Modes) -> tuple[Array, str]:
         # The modes of a conjugate pair mirror each other.
         values = np.unique(values[np.imag(values) >= 0.0])
         # A pair in the midst may need the shortest step, so all are looked at where they can be.
-        return values[telling(values, _MANY)], f"all {what} of the graph, one of each pair"
+        few = telling(values, _MANY)
+        which = "all" if len(few) == len(values) else f"{len(few)}, the extreme ones among them,"
+        return values[few], f"{which} {what} of the graph, one of each pair"
     if len(values) < total:
         between = np.geomspace(values[0], values[-1], SHOWN)
         return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"

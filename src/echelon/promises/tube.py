@@ -234,12 +234,15 @@ def _few(starts: Array) -> Array:
     return found
 
 
+_NO_BORDER = "no border of flat coordinates can be met"
+
+
 def _set_lines(run: Stopping, borders: Sequence[_Border], kind: Kind) -> Iterator[Statement]:
     """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
         text = "its flat coordinates have no border: any state is a start"
         yield Statement(Hypothesis.SET, Verdict.HOLDS, kind, math.inf, "everywhere", text)
-        yield Statement(Hypothesis.STARTS, Verdict.HOLDS, kind, 0.0, "inside", "every start does")
+        yield Statement(Hypothesis.STARTS, Verdict.HOLDS, kind, 0.0, "inside", _NO_BORDER)
         return
     nearest = min(borders, key=lambda b: b.left)
     bound = nearest.bound
