@@ -1,5 +1,6 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, final
 
 import jax
@@ -139,15 +140,42 @@ class Laws(Drive):
             SimulationError: native code is asked for, and cannot be made.
         """
         loop, settings = assemble(problem, self.leader, self.follower), problem.settings
-        by_jax = JaxStepper(loop, problem.states, devices=settings.devices)
-        if not worth_native(settings, len(problem.states)):
-            return by_jax
-        try:
-            return NativeStepper([loop], problem.states, int(settings.precision[5:]), by_jax)
-        except (Unsupported, MissingExtraError) as error:
-            if settings.engine == "native":
-                raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
-            return JaxStepper(loop, problem.states, _in_words(error))
+        states, devices = problem.states, settings.devices
+
+        def native() -> Stepper:
+            bits = int(settings.precision[5:])
+            return NativeStepper([loop], states, bits, JaxStepper(loop, states))
+
+        return choose_stepper(
+            settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
+        )
+
+
+def choose_stepper(
+    settings: Settings,
+    agents: int,
+    native: Callable[[], Stepper],
+    by_jax: Callable[[str], Stepper],
+) -> Stepper:
+    """Return what steps so many agents.
+
+    Args:
+        settings: of the run.
+        agents: how many.
+        native: makes native code.
+        by_jax: takes why there is none, in words; empty where none is wanted.
+
+    Raises:
+        SimulationError: native code is asked for, and cannot be made.
+    """
+    if not worth_native(settings, agents):
+        return by_jax("")
+    try:
+        return native()
+    except (Unsupported, MissingExtraError) as error:
+        if settings.engine == "native":
+            raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
+        return by_jax(_in_words(error))
 
 
 _WORTH = 100_000
@@ -161,10 +189,14 @@ def worth_native(settings: Settings, agents: int) -> bool:
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1:
+    if settings.devices > 1 or not is_long(settings, agents):
         return False
-    long = settings.steps * agents >= _WORTH
-    return long and is_installed() and jax.default_backend() == "cpu"
+    return is_installed() and jax.default_backend() == "cpu"
+
+
+def is_long(settings: Settings, agents: int) -> bool:
+    """Tell whether it pays to compile something else than the steps of a run alone."""
+    return settings.engine == "native" or settings.steps * agents >= _WORTH
 
 
 def _in_words(error: EchelonError) -> str:
