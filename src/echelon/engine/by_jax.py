@@ -114,10 +114,17 @@ class JaxFormations(Stepper):
         """Store frames and take steps; formations follow each other in what is returned."""
         made = _advance_all(self.loop, self.axes, now, jnp.asarray(counts), reference)
         (x, u), sums = on_host(made[1:])
-        frames = (part.reshape(len(part), -1, part.shape[-1]) for part in (x, u))
-        twice = {name: getattr(sums, name).reshape(2, -1) for name in ("errors", "tracking")}
-        flat = {k: v.reshape(-1, *v.shape[2:]) for k, v in sums._asdict().items()}
-        return Chunk(made[0], *frames, Sums(**flat | twice | {"steps": sums.steps}))
+        # As if it were one swarm: the formations stand along the second axis, or the first.
+        twice = {name: _merged(getattr(sums, name), 1) for name in ("errors", "tracking")}
+        rest = {k: _merged(v, 0) for k, v in sums._asdict().items() if k not in twice}
+        rest["steps"] = sums.steps
+        return Chunk(made[0], _merged(x, 1), _merged(u, 1), Sums(**rest, **twice))
+
+
+def _merged(array: Array, axis: int) -> Array:
+    """Return an array with an axis and the next one as one."""
+    head, tail = array.shape[:axis], array.shape[axis + 2 :]
+    return array.reshape(*head, int(np.prod(array.shape[axis : axis + 2])), *tail)
 
 
 _ALL = Moment(None, 0, 0, 0, 0)  # type: ignore[arg-type]
@@ -152,6 +159,6 @@ def _side_by_side(loops: Sequence[Loop]) -> tuple[Loop, Any]:
 
 
 def _differ(leaves: Sequence[Any]) -> bool:
-    if not is_number(leaves[0]):
-        return isinstance(leaves[0], jax.Array)  # a key of what is drawn
+    if not is_number(leaves[0]) and not isinstance(leaves[0], np.ndarray):
+        return False
     return any(np.asarray(leaf).tobytes() != np.asarray(leaves[0]).tobytes() for leaf in leaves)

@@ -1,6 +1,6 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, final
 
 import jax
@@ -95,13 +95,18 @@ class Laws(Drive):
         Raises:
             LawError: one is refused.
         """
-        graph = problem.graph
+        refused = self.refusals(problem.model, problem.graph, problem.states[None])
+        for _, agent, text in refused:
+            raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")
+
+    def refusals(
+        self, model: ControlAffine, graph: Graph, states: Array
+    ) -> Iterator[tuple[int, int, str]]:
+        """Yield which of many starts (K, N, n) a law cannot take: which, the agent, and why."""
         for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
-            refused = law.refusals(problem.model, problem.states[list(agents)])
-            for place, text in refused:
-                raise LawError(
-                    f"agent {agents[place]} starts where its law has no meaning: {text}."
-                )
+            starts = states[:, list(agents)].reshape(-1, states.shape[2])
+            for place, text in law.refusals(model, starts):
+                yield place // len(agents), agents[place % len(agents)], text
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and what of the reference the leaders cannot do."""

@@ -8,6 +8,7 @@ other.
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
@@ -23,7 +24,7 @@ from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.family import Families
 from echelon.engine.grid import Grid
 from echelon.engine.initial import Starts
-from echelon.engine.laws import Laws, choose_stepper, is_long
+from echelon.engine.laws import Laws, choose_stepper, is_long, worth_native
 from echelon.engine.loop import Loop, assemble
 from echelon.engine.motion import Motion
 from echelon.engine.native import Kernels, NativeStepper, beyond
@@ -100,11 +101,12 @@ class Fleet:
                 job = None  # `simulate` says it again
             if job is not None:
                 families.setdefault(job.case.family, []).append(job)
-        return [jobs for jobs in families.values() if _fit(jobs)]
+        found = (_accepted(jobs) for jobs in families.values())
+        return [jobs for jobs in found if jobs and _fit(jobs)]
 
     def _job(self, place: int, parts: Parts, settings: Settings) -> _Job | None:
         """Return a run as a job; None where no laws drive it."""
-        case = self._case(parts, settings._replace(seed=0))
+        case = self._case(parts, settings)
         if case.loop is None or settings.devices > 1:
             return None
         prepared, loop = case.prepared, case.loop
@@ -114,12 +116,11 @@ class Fleet:
                 motion = Motion.of(parts.model, parts.world, settings)
             problem = problem._replace(motion=motion)
             loop = eqx.tree_at(lambda x: x.motion, loop, motion)
-        prepared.parts.drive.accept(problem)
         return _Job(place, case, prepared._replace(problem=problem), loop)
 
     def _case(self, parts: Parts, settings: Settings) -> _Case:
-        known = self._cases.setdefault(parts, {})
-        if settings not in known:
+        known, alike = self._cases.setdefault(parts, {}), settings._replace(seed=0)
+        if alike not in known:
             prepared = prepare(parts, settings)
             check_memory(parts, settings)
             drive = prepared.parts.drive
@@ -127,9 +128,9 @@ class Fleet:
                 loop = family = None
                 if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
-                    family = self.kinds.of(loop, settings)
-                known[settings] = _Case(prepared, Starts(prepared.parts), loop, family)
-        return known[settings]
+                    family = self.kinds.of(loop, alike)
+                known[alike] = _Case(prepared, Starts(prepared.parts), loop, family)
+        return known[alike]
 
     # ---- flights ----
 
@@ -206,15 +207,26 @@ class _Flock:
             self._references.append(reference[points - first][stored])
         return int(stored.sum())
 
+    @cached_property
+    def _whole(self) -> tuple[Array, Array, Array, Array | None]:
+        """Times, states and inputs of each run, and the reference."""
+        states, inputs = (
+            np.ascontiguousarray(np.concatenate(parts).swapaxes(0, 1))
+            for parts in (self._states, self._inputs)
+        )
+        reference = np.concatenate(self._references) if self._references else None
+        return np.concatenate(self.times), states, inputs, reference
+
     def result(self, k: int, prepared: Prepared, stepper: Stepper, seconds: float) -> Result:
         """Return one of the runs."""
+        times, states, inputs, reference = self._whole
         stretch = Stretch(
             first=0,
             done=self.grid.steps,
-            times=np.concatenate(self.times),
-            states=np.concatenate([part[:, k] for part in self._states]),
-            inputs=np.concatenate([part[:, k] for part in self._inputs]),
-            reference=np.concatenate(self._references) if self._references else None,
+            times=times,
+            states=states[k],
+            inputs=inputs[k],
+            reference=reference,
             sums=Sums(*(part[k] for part in self.sums)),
             moment=(),
             stopped=None,
@@ -251,10 +263,23 @@ def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | Eche
         return error
 
 
+def _accepted(jobs: list[_Job]) -> list[_Job]:
+    """Return the runs whose starts the laws take."""
+    prepared = jobs[0].prepared
+    model, graph, drive = prepared.parts.model, prepared.parts.graph, prepared.parts.drive
+    assert isinstance(drive, Laws)
+    states = np.stack([job.prepared.problem.states for job in jobs])
+    refused = {k for k, _, _ in drive.refusals(model, graph, states)}
+    return [job for k, job in enumerate(jobs) if k not in refused]
+
+
 def _fit(jobs: list[_Job]) -> bool:
     """Tell whether runs are worth stepping together: long enough, and filling their vectors."""
     problem = jobs[0].prepared.problem
-    agents = len(problem.states)
-    if len(jobs) < 2 or agents > _SMALL and len(jobs) < 8:
+    agents, settings = len(problem.states), problem.settings
+    if len(jobs) == 1:
+        # By itself, but by code that was made for others.
+        return worth_native(settings, agents)
+    if agents > _SMALL and len(jobs) < 8:
         return False
-    return is_long(problem.settings, len(jobs) * agents)
+    return is_long(settings, len(jobs) * agents)
