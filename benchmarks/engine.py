@@ -39,7 +39,7 @@ from echelon.engine.many import Fleet
 from echelon.kernels import Code, program
 
 Row: TypeAlias = dict[str, float]
-_TURNS = 5
+_TURNS = 4
 _BITS = (32, 64)
 _MILLION = 1_000_000
 
@@ -103,7 +103,7 @@ def measure_ring(
 ) -> Row:
     """Return the rates of a ring beside the yardstick's."""
     side = made.steppers(flock(ech.Graph.ring(agents), model), bits)
-    steps = max(4, 2 * _MILLION // agents)
+    steps = max(20, 2 * _MILLION // agents)
     name = "a newcomer's model" if model is not None else f"ring of {agents:,}"
     return turns(
         f"{name}, float{bits}",
@@ -229,7 +229,7 @@ def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     Swarm(side.native.loop, side.native.places.lanes)
     built += time.process_time() - begin
     crews = {n: Crew(side.native.places, None, n) for n in (1, 2)}
-    rates, steps = list[float](), 4
+    rates, steps = list[float](), 12
 
     def fly(threads: int) -> float:
         side.native.crew = crews[threads]

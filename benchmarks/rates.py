@@ -28,7 +28,7 @@ def measured(agents: int, yardstick: Path) -> dict[str, float]:
     import echelon as ech
 
     c, found = made.Yardstick(yardstick), dict[str, float]()
-    steps = max(4, min(9_000, 1_000_000 // agents))
+    steps = max(20, min(9_000, 1_000_000 // agents))
     fewer = max(2, min(2_000, 100_000 // agents))
     for bits in (32, 64):
         side = made.steppers(made.flock(ech.Graph.ring(agents)), bits)
@@ -36,7 +36,7 @@ def measured(agents: int, yardstick: Path) -> dict[str, float]:
         ways = {
             "native": partial(made.rate, side.native, agents, [steps], side.reference, bits),
             "JAX": partial(made.rate, side.by_jax, agents, [fewer], side.reference, bits),
-            "C": partial(c.rate, kernel, agents, 4 * steps),
+            "C": partial(c.rate, kernel, agents, steps),
         }
         ways["JAX"]()  # compiles
         for _ in range(_TURNS):

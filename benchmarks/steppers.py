@@ -37,14 +37,13 @@ class Newcomer(ech.ControlAffine):
 
     def _turned(self, x: Any) -> tuple[Any, Any]:
         """Return the rotation of the body, and what makes rates of angles of body rates."""
-        (sr, sp, sy), (cr, cp, cy) = jnp.sin(x[6:9]), jnp.cos(x[6:9])
+        (sr, sp, sy), (cr, cp, cy), tp = jnp.sin(x[6:9]), jnp.cos(x[6:9]), jnp.tan(x[7])
         one, zero = jnp.ones_like(sr), jnp.zeros_like(sr)
         about_x = jnp.array([[one, zero, zero], [zero, cr, -sr], [zero, sr, cr]])
         about_y = jnp.array([[cp, zero, sp], [zero, one, zero], [-sp, zero, cp]])
         about_z = jnp.array([[cy, -sy, zero], [sy, cy, zero], [zero, zero, one]])
-        rates = jnp.array([[one, sr * sp / cp, cr * sp / cp], [zero, cr, -sr]])
-        last = jnp.array([[zero, sr / cp, cr / cp]])
-        return about_z @ about_y @ about_x, jnp.concatenate([rates, last])
+        rates = [[one, sr * tp, cr * tp], [zero, cr, -sr], [zero, sr / cp, cr / cp]]
+        return about_z @ about_y @ about_x, jnp.array(rates)
 
     def drift(self, x: Any) -> Any:
         """Return f(x): drag by the angle at which air meets the body, more of it when fast."""
