@@ -130,6 +130,18 @@ def both(v):
     return jnp.where(v[1] > 0.5, near, far)
 
 
+def chained(v):
+    """What one side needs rests on a choice by the same truth, which needs the same side."""
+    first = v
+    for _ in range(8):
+        first = jnp.cos(first) + 0.2 * first[::-1]
+    chosen = jnp.where(v[0] > 0.2, first, v) + 1.0
+    second = chosen
+    for _ in range(8):
+        second = jnp.exp(-second * second) + 0.3 * second[::-1]
+    return jnp.concatenate([jnp.where(v[0] > 0.2, second, chosen), chosen])
+
+
 def metres(v):
     M = jnp.array([[2.0, 0.1, 0.0], [0.1, 3.0, 0.2], [0.0, 0.2, 1.0]]) + jnp.diag(v**2)
     return jnp.concatenate([jnp.linalg.solve(M, v), jnp.linalg.inv(M)[0]])
@@ -158,6 +170,8 @@ PROGRAMS = {
     "a branch": branch,
     "much behind a branch": much,
     "much on both sides": both,
+    "much that rests on a choice by the same truth": jnp.sinc,
+    "much on the one side of a choice and of the next": chained,
     "equations": metres,
     "equations that need a pivot": pivoted,
     "a root of a matrix": halves,
