@@ -12,7 +12,7 @@ from lanes import lowered, run, text_of
 from scipy.special import erf
 
 from echelon.core.numerics import precision
-from echelon.kernels import Graph, Unsupported
+from echelon.kernels import Graph, Unsupported, native
 
 rng = np.random.default_rng(7)
 WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)
@@ -416,6 +416,29 @@ def test_whatever_is_traced_has_code_or_is_refused_in_words(function):
         assert str(refused)
     else:
         np.testing.assert_allclose(found, by_jax(function, columns), rtol=1e-12)
+
+
+LESS = {
+    "avx512": "vectors of 256 bits, with fused multiply-add",
+    "avx512 avx2 avx fma": "vectors of 128 bits, without fused multiply-add",
+    "avx512 avx2 avx fma sse4": "vectors of 128 bits, without fused multiply-add",
+}
+
+
+@pytest.mark.parametrize("without", LESS)
+@pytest.mark.parametrize("bits", [64, 32])
+def test_a_processor_with_less_computes_the_same_and_says_what_it_has(monkeypatch, without, bits):
+    function, columns = PROGRAMS["a loop"], rng.normal(size=(3, 40))
+    whole = run(function, columns, bits)
+    has = native.features().split(",")
+    less = [f"-{x[1:]}" if x[1:].startswith(tuple(without.split())) else x for x in has]
+    monkeypatch.setattr(native, "features", lambda: ",".join(less))
+    if "+avx512f" in has:
+        assert native.vectors().endswith(LESS[without])
+    found = run(function, columns, bits)
+    if "fma" not in without:
+        assert found.tobytes() == whole.tobytes()
+    np.testing.assert_allclose(found, whole, rtol=1e-13 if bits == 64 else 1e-5)
 
 
 def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):

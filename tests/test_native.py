@@ -1,5 +1,9 @@
 """Native steps against JAX's: states, inputs, sums and moments, for all that a run may have."""
 
+import time
+from concurrent import futures
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -211,6 +215,41 @@ def test_bits_do_not_depend_on_threads():
     alone, shared = chunks
     assert shared.now.states.tobytes() == alone.now.states.tobytes()
     assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, alone.sums, strict=True))
+
+
+def test_threads_of_which_not_all_were_started_do_not_wait_for_the_others():
+    did = []
+
+    class Interrupted(ThreadPoolExecutor):
+        def submit(self, *args):
+            if self._threads:
+                raise KeyboardInterrupt
+            return super().submit(*args)
+
+    with Interrupted(2) as pool, pytest.raises(KeyboardInterrupt):
+        crew.share(pool, did.append, range(2))
+    # The pool has ended, and so has its thread.
+    assert did == []
+
+
+def test_what_threads_write_to_lives_until_they_end(monkeypatch):
+    did, calls = [], []
+
+    def wait(begun):
+        calls.append(len(begun))
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        futures.wait(begun)
+
+    def act(part):
+        time.sleep(0.05)
+        did.append(part)
+
+    monkeypatch.setattr(crew, "wait", wait)
+    with ThreadPoolExecutor(2) as pool:
+        with pytest.raises(KeyboardInterrupt):
+            crew.share(pool, act, range(2))
+        assert sorted(did) == [0, 1] and calls == [2, 2]
 
 
 # ---- what is told ----
