@@ -20,15 +20,25 @@ QUADROTOR = ech.models.Quadrotor()
 CIRCLE = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5))
 
 
-def stepped(parts, chosen, counts, engine):
-    """Return the chunk of some frames, and the stepper, by one of the engines."""
+def ready(parts, chosen, engine):
+    """Return what is to be flown and the stepper, by one of the engines."""
     prepared = prepare(parts, chosen._replace(engine=engine))
-    stepper = prepared.parts.drive.stepper(prepared.problem)
+    return prepared, prepared.parts.drive.stepper(prepared.problem)
+
+
+def steps_of(prepared, stepper, chosen, counts):
+    """Return the chunk of some frames from the start."""
     with jax.enable_x64(chosen.precision == "float64"):
         times = chosen.dt * jnp.arange(int(np.sum(counts)) + 1)
         wanted = prepared.parts.drive.reference_states(prepared.parts.model, times)
         wanted = None if wanted is None else np.asarray(wanted, float)
-        return stepper.advance(stepper.start(), np.array(counts), wanted), stepper
+        return stepper.advance(stepper.start(), np.array(counts), wanted)
+
+
+def stepped(parts, chosen, counts, engine):
+    """Return the chunk of some frames, and the stepper, by one of the engines."""
+    prepared, stepper = ready(parts, chosen, engine)
+    return steps_of(prepared, stepper, chosen, counts), stepper
 
 
 def check_alike(parts, chosen, counts=(1, 0, 17, 60, 0), tolerance=1e-13):
@@ -162,12 +172,17 @@ def test_single_precision_is_that_of_jax_to_its_own_rounding():
 # ---- the same bits, however it is cut ----
 
 
+@pytest.fixture(scope="module")
+def six():
+    chosen = run_settings()
+    return *ready(flock(ech.Graph.path(6)), chosen, "native"), chosen
+
+
 @given(cuts=st.lists(st.integers(0, 30), min_size=1, max_size=6))
 @settings(max_examples=8)
-def test_bits_do_not_depend_on_where_a_run_is_cut(cuts):
-    parts, chosen = flock(ech.Graph.path(6)), run_settings()
-    whole, _ = stepped(parts, chosen, [sum(cuts)], "native")
-    cut, stepper = stepped(parts, chosen, cuts, "native")
+def test_bits_do_not_depend_on_where_a_run_is_cut(six, cuts):
+    _, stepper, _ = six
+    whole, cut = (steps_of(*six, counts) for counts in ([sum(cuts)], cuts))
     assert cut.now.states.tobytes() == whole.now.states.tobytes()
     with jax.enable_x64(True):
         kept = stepper.recall(numbers(cut.now))
