@@ -264,24 +264,24 @@ def test_long_runs_are_native_and_short_ones_are_not():
     assert short.engine == "jax" and not short.warnings
 
 
-class Sorts(ech.laws.Law):
+class Bends(ech.laws.Law):
     """Uses what has no native code."""
 
     def update(self, model, view, memory):
-        return jnp.sort(view.disagreement)[:1] * 0.0, memory
+        return jax.scipy.special.erfinv(view.disagreement)[:1] * 0.0, memory
 
 
 def test_what_has_no_native_code_runs_by_jax_and_says_why():
     model, graph = ech.models.Pendulum(), ech.Graph.path(2)
-    drive = ech.Laws(ech.laws.TrimInput(), Sorts())
+    drive = ech.Laws(ech.laws.TrimInput(), Bends())
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 2))), drive)
-    told = r"there is no native code for `sort` in .*test_native\.py, line \d+"
+    told = r"there is no native code for `erf_inv` in .*test_native\.py, line \d+"
     with pytest.raises(ech.errors.SimulationError, match=rf"^`engine` is `native`, and {told}\.$"):
         ech.simulate(parts, run_settings(engine="native"))
     found = ech.simulate(parts, run_settings(horizon=600.0, dt=0.01, store_every=1000))
     assert found.engine == "jax"
     [warning] = [w for w in found.warnings if w.startswith("JAX steps the agents")]
-    assert "`sort`" in warning
+    assert "`erf_inv`" in warning
 
 
 def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():
