@@ -82,15 +82,16 @@ _AT_MOST: Row = {
 """What each must not exceed."""
 
 
-def turns(name: str, ways: dict[str, Callable[[], float]]) -> Row:
+def turns(name: str, ways: dict[str, Callable[[], float]], count: int = _TURNS) -> Row:
     """Return the rates of some ways, taken in turn, in millions a second, and ratios to the first.
 
     Args:
         name: of what is stepped.
         ways: each returns the rate of one turn; the first is native code.
+        count: turns of each.
     """
     found = {way: list[float]() for way in ways}
-    for _ in range(_TURNS):
+    for _ in range(count):
         for way, measure in ways.items():
             found[way].append(measure())
     best = {way: max(rates) for way, rates in found.items()}
@@ -110,6 +111,7 @@ def measure_ring(
         f"{name}, float{bits}",
         {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
         | _in_c(yardstick, agents, steps, lambda c: c.ring(agents, bits)),
+        _TURNS if agents < _MILLION else 2,
     )
 
 
@@ -315,7 +317,7 @@ def measure_gradient(_: Yardstick | None) -> Row:
     for engine in ("native", "jax"):
         differentiate(engine)  # compiles
     ways = {"JAX": partial(differentiate, "jax"), "forward": forward}
-    found = turns("", {"native": partial(differentiate, "native"), **ways})
+    found = turns("", {"native": partial(differentiate, "native"), **ways}, 2)
     return {
         "gradient of 200 steps, to forward": round(1.0 / found[", to forward"], 2),
         "gradient of 200 steps, to JAX": round(1.0 / found[", to JAX"], 3),

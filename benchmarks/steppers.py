@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -118,7 +117,7 @@ def rate(
 
 
 def formations(
-    bits: int, own: bool, threads: int = 1, integrator: Any = "rk4"
+    bits: int, own: bool, threads: int = 1, integrator: Any = "rk4", steps: int = STEPS
 ) -> tuple[NativeStepper, np.ndarray]:
     """Return what steps 2,560 formations of 4 that all hear each other, and the reference.
 
@@ -132,7 +131,7 @@ def formations(
     with precision("float64"):
         loop = assemble(prepared.problem, drive.leader, drive.follower)
         states = prepared.problem.states + 0.02 * draws.uniform(-1, 1, (FORMATIONS, 4, 12))
-        times = DT * jax.numpy.arange(STEPS + 1)
+        times = DT * jnp.arange(steps + 1)
         reference = np.asarray(drive.reference_states(prepared.parts.model, times))
         loops = [_regained(loop, draws) for _ in range(FORMATIONS)] if own else None
     pool = ThreadPoolExecutor(threads) if threads > 1 else None
