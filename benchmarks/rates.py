@@ -70,7 +70,7 @@ def drawn(rows: list[dict[str, float]]) -> "Figure":
             )
         axes.set_xlabel("agents on a ring")
         axes.set_ylabel("steps of one agent a second, one core")
-        axes.legend(ncols=3, loc="lower right")
+        axes.legend(ncols=3, loc="center", bbox_to_anchor=(0.5, 0.42))
     return figure
 
 
