@@ -350,7 +350,7 @@ def measure_peers(_: Yardstick | None) -> Row:
     started = {name: peers.start(name, peers.ROOT / "build" / "peers") for name in names}
     workers = {name: worker for name, worker in started.items() if worker is not None}
     rates = {name: list[float]() for name in workers}
-    for _ in range(_TURNS):
+    for _turn in range(_TURNS):
         for name, worker in workers.items():
             rates[name].append(peers.ask(worker))
     for worker in workers.values():
