@@ -11,7 +11,7 @@ import numpy as np
 from echelon.engine.loop import Loop
 from echelon.engine.own import Own
 from echelon.engine.scalars import Rows, body_of, signals_of
-from echelon.kernels import Code, Plan, program, shared
+from echelon.kernels import Code, Plan, program, shared, winds
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
@@ -59,6 +59,9 @@ def _kernel(own: Own, bits: int, together: bool, lines: bool, weighted: bool) ->
         table=n if wanted else 0,
         dt=loop.motion.dt,
     )
+    # A leader that hears nobody, and is told nothing, waits for nobody.
+    ahead = lines and loop.levels is None and not plan.first.hears
+    plan = plan._replace(width=plan.width + winds(plan), ahead=ahead)
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     code = Code(program(plan), Path(cache) if cache else None)

@@ -20,14 +20,19 @@ from echelon.engine.sums import ALWAYS, Sums
 from echelon.kernels import aligned
 from echelon.world.disturbance import draw
 
-_AGENT_STEPS, _FEWEST = 2_000_000, 4
-"""Of a chunk: some tenths of a second."""
+_AGENT_STEPS, _MORE, _ENOUGH, _FEWEST = 2_000_000, 8_000_000, 1_000, 4
+"""Of a chunk, and of one with no more steps than enough: some tenths of a second."""
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-_STEPS = 2_048
-"""Of a call: what all agents have in common is kept for each of them."""
+_AT_A_TIME = 256
+"""Blocks that are read together."""
+_STEPS, _TURNS, _KEPT = 2_048, 200_000, 10_000_000
+"""Of a call: what all agents have in common is kept for each of them, and each level has a turn.
+
+And the numbers of leaders ahead that are kept.
+"""
 
 
 def beyond(states: Array, bits: int) -> Array:
@@ -95,13 +100,24 @@ class NativeStepper(Stepper):
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
         shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
         self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
-        self.found = places.find(plan.width, plan.rows, self.dtype)
+        self.found = places.find(plan.width, plan.told if plan.ahead else plan.rows, self.dtype)
+        self.led = int(places.segments[1]) * plan.lanes
+        if plan.ahead:
+            assert isinstance(places, Swarm)
+            each = self.found.edges.nbytes + self.found.edge_ends.nbytes + self.blocks.nbytes
+            places.measure(self.found, (each + 2 * self.mirrors[0].nbytes) // places.blocks)
         self.edges, self.heavy = self.found.edges, self.found.weights
 
-    def _read(self, rows: range) -> Array:
-        """Return rows of all agents, (N, rows)."""
-        part = self.blocks[:, rows.start : rows.stop].transpose(0, 2, 1)
-        return part.reshape(len(self.places.agents), -1)[self.places.of]
+    def _read(self, rows: range, out: Array | None = None) -> Array:
+        """Return rows of all agents, (N, rows), in an array that is given or new."""
+        agents, lanes = self.places.agents, self.plan.lanes
+        out = np.empty((len(self.places.of), len(rows)), self.dtype) if out is None else out
+        # So many at once that they are turned about within a cache; copies are all alike.
+        for first in range(0, len(self.blocks), _AT_A_TIME):
+            part = self.blocks[first : first + _AT_A_TIME, rows.start : rows.stop]
+            who = agents[first * lanes : (first + len(part)) * lanes]
+            out[who] = part.transpose(0, 2, 1).reshape(len(who), -1)
+        return out
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
@@ -129,7 +145,8 @@ class NativeStepper(Stepper):
     @property
     def longest(self) -> int:
         """Steps that take some tenths of a second, or a few of very many agents."""
-        return max(_FEWEST, _AGENT_STEPS * len(self.loops) // len(self.states))
+        agents = len(self.states) // len(self.loops)
+        return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, _MORE // agents))
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
@@ -164,45 +181,49 @@ class NativeStepper(Stepper):
     def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
-        step, states, inputs = first, list[Array](), list[Array]()
-        for count in counts.tolist():
-            states.append(self._read(self.rows.state))
+        step, agents = first, len(self.places.of)
+        x, u = (np.empty((len(counts), agents, len(r))) for r in (self.rows.state, self.rows.input))
+        for k, count in enumerate(counts.tolist()):
+            self._read(self.rows.state, x[k])
             if count:
-                self._run(step, 1, first, table)
-                inputs.append(self._read(self.rows.input))
-                self._run(step + 1, count - 1, first, table)
+                self._run(step, count, first, table)
+                self._read(self.rows.input, u[k])
                 step += count
-            elif step == first or counts[len(inputs) - 1]:
-                inputs.append(self._look(step, first, table))
+            elif step == first or counts[k - 1]:
+                self._look(step, first, table, u[k])
             else:
-                inputs.append(inputs[-1])
+                u[k] = u[k - 1]
         self._held = self._moment(step)
-        x, u = (np.stack(part).astype(np.float64) for part in (states, inputs))
         return Chunk(self._held, x, u, self._sums(first, step))
 
-    def _look(self, step: int, first: int, table: Array | None) -> Array:
-        """Return the inputs of a step that is not taken."""
+    def _look(self, step: int, first: int, table: Array | None, out: Array) -> None:
+        """Read the inputs of a step that is not taken."""
         changed = (self.blocks, self.edges, *self.mirrors)
         kept, drawn = [array.copy() for array in changed], self._drawn
         self._run(step, 1, first, table)
-        found = self._read(self.rows.input)
+        self._read(self.rows.input, out)
         self.mirrors.reverse()
         for array, before in zip(changed, kept, strict=True):
             array[:] = before
         # What was drawn for it is gone from the blocks again.
         self._drawn = drawn
-        return found
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps under one draw of the wind, and one stretch of the graph, after the other."""
-        wind = self.loop.motion.wind
+        """Take steps under one draw of the wind, and one stretch of the graph, after the other.
+
+        The inputs of the first one are left in the rows.
+        """
+        wind, shown = self.loop.motion.wind, step
+        most = _TURNS // len(self.places.segments)
+        if self.plan.ahead:
+            most = min(most, _KEPT // (self.led * (self.plan.width + self.plan.told)))
         while steps:
-            count = min(steps, _STEPS, self._switch(step))
+            count = min(steps, _STEPS, max(1, most), self._switch(step))
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
                 count = min(count, hold - step % hold)
-            self._call(step, count, None if table is None else table[step - first :])
+            self._call(step, count, shown, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
 
     def _switch(self, step: int) -> int:
@@ -227,22 +248,26 @@ class NativeStepper(Stepper):
             if part is not None:
                 self._write(rows, part[at].reshape(len(self.states), -1))
 
-    def _call(self, step: int, steps: int, table: Array | None) -> None:
+    def _call(self, step: int, steps: int, shown: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
-        arrays = self.found._asdict() | {"segments": self.places.segments}
+        places, plan, arrays = self.places, self.plan, self.found._asdict()
+        if plan.ahead:
+            arrays["ahead"] = aligned((steps + 1, plan.width, self.led), self.dtype)
+            arrays["told"] = aligned((steps, plan.told, self.led), self.dtype)
+            arrays["ahead"][0] = self.mirrors[0][:, : self.led]
         values = {name: array.ctypes.data for name, array in arrays.items()}
         values |= {} if table is None else {"table": table.ctypes.data}
-        values |= {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
-        # The inputs of single steps are read afterwards; those of many would be stored for nothing.
-        values |= {"edge_blocks": len(self.found.edge_ends), "shown": int(steps == 1)}
-        values["line"] = self.places.line
-        values["first_steady"] = int(self.loop.meter.first_steady)
+        values |= {"first_step": step, "steps": steps, "shown": shown, "led": self.led}
+        values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
+        values |= {"line": places.line, "first_steady": int(self.loop.meter.first_steady)}
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
         firsts["edges"] = self.edges
         common = np.empty(steps * self.common, self.dtype)
         self.crew.run(self.code, values, firsts, common)
         if steps % 2:
             self.mirrors.reverse()
+        if plan.ahead:
+            self.mirrors[0][:, : self.led] = arrays["ahead"][-1]
 
     # ---- moments and sums ----
 
@@ -289,6 +314,8 @@ class NativeStepper(Stepper):
             self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)
             return
         wide = self.mirrors[0].reshape(*shown.shape[:2], -1)
+        # Whether an angle is large is left open, and seen by the kernel.
+        wide[:, :, : self.plan.width] = np.nan
         wide[:, :, : values.shape[1]] = shown
 
     def _moment(self, step: int) -> Moment:
@@ -315,15 +342,16 @@ class NativeStepper(Stepper):
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
-        kept = self._read(range(begin, rows.total)).astype(np.float64)
+        kept = np.empty((len(self.places.of), rows.total - begin))
+        self._read(range(begin, rows.total), kept)
 
         def of(places: range) -> Array:
             return kept[:, places.start - begin : places.stop - begin]
 
         found = Sums(
             steps=np.array([end - first, steady]),
-            errors=of(rows.errors).T,
-            tracking=of(rows.tracking)[leaders].T,
+            errors=_whole(of(rows.errors)),
+            tracking=_whole(of(rows.tracking)[leaders]),
             outputs=of(rows.outputs)[leaders],
             effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
@@ -333,6 +361,11 @@ class NativeStepper(Stepper):
             chatter=of(rows.chatter)[:, 0],
         )
         return Sums(*(np.asarray(part, np.float64) for part in found))
+
+
+def _whole(parted: Array) -> Array:
+    """Return sums of all steps and of the steady window (2, N) from those before it and in it."""
+    return np.stack([parted.sum(axis=1), parted[:, 1]])
 
 
 @jax.jit

@@ -10,6 +10,7 @@ import scipy.sparse.csgraph as csgraph
 
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
+from echelon.engine.turns import Near
 from echelon.kernels import aligned, stride
 
 
@@ -56,6 +57,7 @@ class Places(abc.ABC):
         groups: of formations, which are stepped one after the other.
         together: whether vectors hold agents of as many formations.
         lines: whether what neighbours read lies row by row over all positions.
+        near: how far blocks reach, where leaders may be ahead of all others and that is known.
     """
 
     loop: Loop
@@ -66,6 +68,13 @@ class Places(abc.ABC):
     groups: int
     together: bool
     lines: bool
+    near: Near | None = None
+
+    @property
+    def edge_blocks(self) -> int:
+        """How many blocks the edges of a group fill."""
+        edges = len(np.asarray(self.loop.meter.edges))
+        return edges if self.together else -(-edges // self.lanes)
 
     @property
     def line(self) -> int:
@@ -99,7 +108,8 @@ _LARGE = 10_000
 def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Array]:
     """Return the agents in the order of their acting, and the first block of each level.
 
-    A level fills its last block with copies, which do what the agent does and are read by nobody.
+    A level fills its last block with copies of its last agent, which do what that does and are read
+    by nobody.
     """
     levels = [loop.followers]
     if loop.levels is not None:
@@ -112,7 +122,7 @@ def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Arra
             level[np.lexsort((degrees[level], near))]
             for level, near in zip(levels, window, strict=True)
         ]
-    filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
+    filled = [np.append(a, np.repeat(a[-1:], -len(a) % lanes)) for a in (loop.leaders, *levels)]
     segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
     return np.concatenate(filled), segments
 
@@ -162,9 +172,9 @@ class Swarm(Places):
         degrees = np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of))
         if len(loop.offsets) >= _LARGE and not self.lines and self._uneven(degrees[self.agents]):
             self._stand(degrees)
-        # Ends that are near in memory follow each other.
-        edges = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1)
-        self.edge_order = np.lexsort(edges.T[::-1])
+        # Ends that are near in memory follow each other; leaders are near to all.
+        i, j = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1).T
+        self.edge_order = np.lexsort((j, i, np.where(i < self.segments[1] * lanes, j, i)))
 
     def _uneven(self, degrees: Array) -> bool:
         """Tell whether blocks have fewer slots where those of one degree stand side by side."""
@@ -180,7 +190,7 @@ class Swarm(Places):
         self.of = _first(self.agents)
         self.heard = heard(loop, self)
         starts, positions, _ = self.heard
-        slots = _follow(positions)
+        slots = _follow(positions) & (positions[:, 0] >= self.segments[1] * lanes)
         self.smooth = (
             np.bincount(np.repeat(np.arange(self.blocks), np.diff(starts)), ~slots, self.blocks)
             == 0
@@ -205,8 +215,28 @@ class Swarm(Places):
             (self.of[nearest] * far).astype(np.int32),
             *(edges := edge_blocks(loop, self, dtype, far)),
             self.smooth.astype(np.int8),
-            np.asarray(_follow(edges[1]).all(axis=1), np.int8),
+            self._smooth_edges(edges[1]),
         )
+
+    def _smooth_edges(self, ends: Array) -> Array:
+        leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
+        return np.asarray(_follow(ends).all(axis=1) & ~leads, np.int8)
+
+    def measure(self, found: Found, bytes_: int) -> None:
+        """Find how far blocks of so many bytes reach, from what lies in lines."""
+        lanes, led = self.lanes, int(self.segments[1])
+        slots = slice(found.neighbour_starts[led], None)
+        block = np.repeat(np.arange(self.blocks), np.diff(found.neighbour_starts))[slots]
+        there = found.neighbours[slots] // lanes
+        apart = np.where(there < led, 0, np.abs(there - block[:, None]))
+        ends = found.edge_ends // lanes
+        ends = np.where(ends < led, self.blocks, ends)
+        # The last block is filled with edges from elsewhere, which nobody reads.
+        ends.swapaxes(1, 2).reshape(-1, 2)[len(self.edge_order) :] = self.blocks
+        first = np.minimum.accumulate(ends.min(axis=(1, 2))[::-1])[::-1]
+        last = np.where(ends == self.blocks, 0, ends).max(axis=(1, 2))
+        reach = max(1, apart.max(initial=0), (last - first).max(initial=0))
+        self.near = Near(int(reach), first, bytes_)
 
     def spacing(self, edges: Array) -> Array:
         """Return the sums that rows of edges hold, (E,)."""

@@ -30,7 +30,8 @@ class Rows(NamedTuple):
         tell: what it sends besides its state.
         input: what is delivered to it (m,).
         own: numbers of its law and model that are others in other formations.
-        errors, tracking, outputs, effort, limited, unsettled, inside, chatter: as in `Sums`.
+        errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
+        outputs, effort, limited, unsettled, inside, chatter: as in `Sums`.
         total: how many rows there are.
     """
 
@@ -221,9 +222,10 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
     stores = {"state": done.state, "cut": done.cut, "memory": sum(remembered, start=[])}
     if leads or loop.levels is not None:
         stores["tell"] = done.tell
-    sums = {name: getattr(done, name) for name in ("errors", "effort", "limited", "chatter")}
+    sums = {name: getattr(done, name) for name in ("effort", "limited", "chatter")}
+    sums |= {"errors": _parted(known, done.errors)}
     if leads and follows:
-        sums |= {"tracking": done.tracking, "outputs": done.outputs}
+        sums |= {"tracking": _parted(known, done.tracking), "outputs": done.outputs}
     apart = functools.partial(map, functools.partial(graph.make, "apart"))
     return Body(
         stores=_placed(rows, stores),
@@ -235,6 +237,15 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
         mirror=[*apart(done.state, known.offset), *done.saying],
         difference=_difference(loop, graph, len(known.x), len(done.said)),
     )
+
+
+def _parted(known: _Known, twice: list[Node]) -> list[Node]:
+    """Return a number of all steps and of the steady window as one before and one in it.
+
+    Only one of the two is then added to at a step.
+    """
+    all_, steady = twice
+    return [all_.graph.make("select", known.steady[()], 0.0, all_), steady]
 
 
 def _difference(loop: Loop, graph: Graph, states: int, signals: int) -> list[Node]:

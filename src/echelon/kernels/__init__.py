@@ -2,13 +2,15 @@
 
 from echelon.kernels.common import shared
 from echelon.kernels.drivers import program
-from echelon.kernels.frame import SLOTS, Body, Plan, stride
+from echelon.kernels.frame import SLOTS, TURN, Body, Plan, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
 from echelon.kernels.native import Code, aligned, is_installed, vectors
 from echelon.kernels.scalar import Graph, Node
+from echelon.kernels.winding import winds
 
 __all__ = [
     "SLOTS",
+    "TURN",
     "Body",
     "Code",
     "Graph",
@@ -23,4 +25,5 @@ __all__ = [
     "shared",
     "stride",
     "vectors",
+    "winds",
 ]
