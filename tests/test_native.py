@@ -208,7 +208,7 @@ def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkey
     whole, stepper = stepped(parts, run_settings(), (5, 0, 40), "native")
     near = stepper.places.near
     assert near.reach < 4
-    monkeypatch.setattr(turns, "_CACHE", 8 * near.reach * near.bytes)
+    monkeypatch.setattr(turns, "_CACHES", (8 * near.reach * near.bytes,))
     for threads in (1, 3):
         stepper.crew = crew.Crew(stepper.places, None, threads)
         with jax.enable_x64(True):

@@ -60,7 +60,7 @@ def _kernel(own: Own, bits: int, together: bool, lines: bool, weighted: bool) ->
         dt=loop.motion.dt,
     )
     # A leader that hears nobody, and is told nothing, waits for nobody.
-    ahead = lines and loop.levels is None and not plan.first.hears
+    ahead = not together and loop.levels is None and not plan.first.hears
     plan = plan._replace(width=plan.width + winds(plan), ahead=ahead)
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)

@@ -17,7 +17,7 @@ from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.scalars import memories_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import aligned
+from echelon.kernels import aligned, stride
 from echelon.world.disturbance import draw
 
 _AGENT_STEPS, _MORE, _ENOUGH, _FEWEST = 2_000_000, 8_000_000, 1_000, 4
@@ -101,11 +101,13 @@ class NativeStepper(Stepper):
         shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
         self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
         self.found = places.find(plan.width, plan.told if plan.ahead else plan.rows, self.dtype)
-        self.led = int(places.segments[1]) * plan.lanes
+        self.led = int(places.segments[1])
         if plan.ahead:
             assert isinstance(places, Swarm)
-            each = self.found.edges.nbytes + self.found.edge_ends.nbytes + self.blocks.nbytes
-            places.measure(self.found, (each + 2 * self.mirrors[0].nbytes) // places.blocks)
+            parts = (self.blocks, *self.mirrors, *self.found[1:3], *self.found[5:7])
+            bytes_ = sum(part.nbytes for part in parts) // places.blocks
+            far = 1 if plan.lines else stride(plan.width, plan.lanes)
+            places.measure(self.found, far, bytes_)
         self.edges, self.heavy = self.found.edges, self.found.weights
 
     def _read(self, rows: range, out: Array | None = None) -> Array:
@@ -216,7 +218,8 @@ class NativeStepper(Stepper):
         wind, shown = self.loop.motion.wind, step
         most = _TURNS // len(self.places.segments)
         if self.plan.ahead:
-            most = min(most, _KEPT // (self.led * (self.plan.width + self.plan.told)))
+            each = self.plan.mirror + self.plan.told * self.plan.lanes
+            most = min(most, _KEPT // (self.led * each))
         while steps:
             count = min(steps, _STEPS, max(1, most), self._switch(step))
             if wind is not None:
@@ -252,12 +255,12 @@ class NativeStepper(Stepper):
         """Run the kernel; each step exchanges the two mirrors."""
         places, plan, arrays = self.places, self.plan, self.found._asdict()
         if plan.ahead:
-            arrays["ahead"] = aligned((steps + 1, plan.width, self.led), self.dtype)
-            arrays["told"] = aligned((steps, plan.told, self.led), self.dtype)
-            arrays["ahead"][0] = self.mirrors[0][:, : self.led]
+            arrays["ahead"] = aligned((steps + 1, *self._led.shape), self.dtype)
+            arrays["told"] = aligned((steps, self.led, plan.told, plan.lanes), self.dtype)
+            arrays["ahead"][0] = self._led
         values = {name: array.ctypes.data for name, array in arrays.items()}
         values |= {} if table is None else {"table": table.ctypes.data}
-        values |= {"first_step": step, "steps": steps, "shown": shown, "led": self.led}
+        values |= {"first_step": step, "steps": steps, "shown": shown, "led_blocks": self.led}
         values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
         values |= {"line": places.line, "first_steady": int(self.loop.meter.first_steady)}
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
@@ -267,7 +270,14 @@ class NativeStepper(Stepper):
         if steps % 2:
             self.mirrors.reverse()
         if plan.ahead:
-            self.mirrors[0][:, : self.led] = arrays["ahead"][-1]
+            self._led[:] = arrays["ahead"][-1]
+
+    @property
+    def _led(self) -> Array:
+        """What leaders show."""
+        if self.plan.lines:
+            return self.mirrors[0][:, : self.led * self.plan.lanes]
+        return self.mirrors[0][: self.led]
 
     # ---- moments and sums ----
 

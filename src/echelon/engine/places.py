@@ -27,7 +27,8 @@ class Found(NamedTuple):
         edges: rows of the edges, for the sums of how far distances are off: the differences of the
             goals, the distances that they make, and room for the sums.
         edge_ends: (edges, 2, lanes) where the two ends of each show their numbers.
-        smooth: (blocks,) whether the k-th neighbours of a block follow each other, for all k.
+        smooth: (blocks,) whether the k-th neighbours of a block follow each other, for all k; where
+            nothing lies in lines, whether no leader is among them.
         smooth_edges: (edges,) whether both ends of a block of edges do.
     """
 
@@ -191,12 +192,16 @@ class Swarm(Places):
         self.heard = heard(loop, self)
         starts, positions, _ = self.heard
         slots = _follow(positions) & (positions[:, 0] >= self.segments[1] * lanes)
-        self.smooth = (
-            np.bincount(np.repeat(np.arange(self.blocks), np.diff(starts)), ~slots, self.blocks)
-            == 0
-        )
+        self.smooth = self._all(starts, slots)
         # A number that is gathered lane by lane costs some times what one of a line does.
         self.lines = bool(self.smooth.mean() > _MOSTLY)
+        if not self.lines:
+            self.smooth = self._all(starts, (positions >= self.segments[1] * lanes).all(axis=1))
+
+    def _all(self, starts: Array, slots: Array) -> Array:
+        """Return of which blocks something is true in all slots."""
+        block = np.repeat(np.arange(self.blocks), np.diff(starts))
+        return np.bincount(block, ~slots, self.blocks) == 0
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
@@ -222,17 +227,17 @@ class Swarm(Places):
         leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
         return np.asarray(_follow(ends).all(axis=1) & ~leads, np.int8)
 
-    def measure(self, found: Found, bytes_: int) -> None:
-        """Find how far blocks of so many bytes reach, from what lies in lines."""
-        lanes, led = self.lanes, int(self.segments[1])
+    def measure(self, found: Found, far: int, bytes_: int) -> None:
+        """Find how far blocks of so many bytes reach, whose agents show numbers `far` apart."""
+        size, led = self.lanes * far, int(self.segments[1])
         slots = slice(found.neighbour_starts[led], None)
-        block = np.repeat(np.arange(self.blocks), np.diff(found.neighbour_starts))[slots]
-        there = found.neighbours[slots] // lanes
-        apart = np.where(there < led, 0, np.abs(there - block[:, None]))
-        ends = found.edge_ends // lanes
-        ends = np.where(ends < led, self.blocks, ends)
+        block = np.repeat(np.arange(self.blocks, dtype=np.int32), np.diff(found.neighbour_starts))
+        there = found.neighbours[slots] // size
+        apart = np.where(there < led, 0, np.abs(there - block[slots, None]))
+        ends = found.edge_ends // size
         # The last block is filled with edges from elsewhere, which nobody reads.
-        ends.swapaxes(1, 2).reshape(-1, 2)[len(self.edge_order) :] = self.blocks
+        filled = np.arange(ends[:, 0].size).reshape(-1, 1, self.lanes) >= len(self.edge_order)
+        ends = np.where((ends < led) | filled, self.blocks, ends)
         first = np.minimum.accumulate(ends.min(axis=(1, 2))[::-1])[::-1]
         last = np.where(ends == self.blocks, 0, ends).max(axis=(1, 2))
         reach = max(1, apart.max(initial=0), (last - first).max(initial=0))

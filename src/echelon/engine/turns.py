@@ -13,8 +13,11 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.kernels import TURN
 
-_CACHE = 400_000
-"""Bytes of a tile and what it moves over: less than the second cache of most processors."""
+_CACHES = (400_000, 12_000_000)
+"""Bytes of a tile and what it moves over: less than the second and third cache of most processors.
+"""
+_DEEP = 4
+"""Steps of a tile that are worth to stay in the nearer of them."""
 
 
 class Near(NamedTuple):
@@ -59,13 +62,13 @@ def tile_by_tile(segments: Array, near: Near, steps: int, thread: int, threads: 
     """
     leaders = np.zeros((steps, len(TURN)), np.int64)
     leaders[:, 0], leaders[:, 3] = np.arange(steps), segments[1] * (thread == 0)
-    depth, tile = _tiles(near, steps)
+    depth, tile = tiles(near, steps)
     blocks, found, count = segments[2] - segments[1], [leaders], steps
     # One pass over all blocks after the other.
     for done in range(0, steps, depth):
         passed = np.arange(min(depth, steps - done))
-        tiles = -(-(blocks + passed[-1] * near.reach) // tile)
-        mine = np.arange(-(-tiles // threads))[:, None] * threads + thread
+        needed = -(-(blocks + passed[-1] * near.reach) // tile)
+        mine = np.arange(-(-needed // threads))[:, None] * threads + thread
         turn = count + np.arange(mine.size * len(passed)).reshape(len(mine), -1)
         part = np.zeros((*turn.shape, len(TURN)), np.int64)
         part[..., 0], part[..., 1] = done + passed, 1
@@ -81,13 +84,18 @@ def tile_by_tile(segments: Array, near: Near, steps: int, thread: int, threads: 
     return np.concatenate(found)
 
 
-def _tiles(near: Near, steps: int) -> tuple[int, int]:
+def tiles(near: Near, steps: int) -> tuple[int, int]:
     """Return how many steps a tile takes, and how many blocks it has."""
-    window = _CACHE // near.bytes
-    depth = min(steps, max(1, window // (2 * near.reach)))
+    depth, window = 1, 1
+    for cache in _CACHES:
+        if depth < _DEEP:
+            window = max(1, cache // near.bytes)
+            depth = max(1, window // (2 * near.reach))
+    depth = min(steps, depth)
     return depth, max(1, window - depth * near.reach)
 
 
 def pays(segments: Array, near: Near, steps: int) -> bool:
-    """Tell whether tiles pay: blocks do not fit the cache anyway, and do not reach as far as it."""
-    return steps > 1 and segments[2] * near.bytes > _CACHE and _tiles(near, steps)[0] > 1
+    """Tell whether tiles pay: they take several steps, and all blocks are several tiles."""
+    depth, tile = tiles(near, steps)
+    return depth > 1 and segments[2] > 3 * tile

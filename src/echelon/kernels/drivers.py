@@ -142,9 +142,10 @@ def _around(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: 
     around = Context(plan, slots | {"shown": shown}, *mirrors, step, "", common)
     if not plan.ahead:
         return around
-    size, told = (w.put(f"mul i64 {slots['led']}, {n}") for n in (plan.width, plan.told))
+    blocks, each = slots["led_blocks"], plan.told * plan.lanes
+    size, told = (w.put(f"mul i64 {blocks}, {n}") for n in (plan.mirror, each))
     ahead, told = (_part(w, slots[k], passed, n) for k, n in (("ahead", size), ("told", told)))
-    return around._replace(ahead=ahead, told=told)
+    return around._replace(ahead=ahead, told=told, led=w.put(f"mul i64 {blocks}, {plan.lanes}"))
 
 
 def _part(w: Writer, start: str, count: str, size: str) -> str:
@@ -157,8 +158,8 @@ def _lead(w: Writer, around: Context, turn: dict[str, str]) -> None:
     """Write what the leaders do in a step; those ahead leave it for the others."""
     plan, slots = around.plan, around.slots
     if plan.ahead:
-        after = _part(w, around.ahead, slots["led"], str(plan.width))
-        around = around._replace(following=after, slots=slots | {"line": slots["led"]})
+        after = _part(w, around.ahead, slots["led_blocks"], str(plan.mirror))
+        around = around._replace(following=after, slots=slots | {"line": around.led})
     with loop(w, turn["start"], turn["end"], []) as (block, _, _):
         _act(w, around, plan.first, block)
         if plan.ahead:
@@ -300,6 +301,8 @@ def _look_up(
         return load_row(w, far_block(w, places, block, start), row, plan.lanes)
     # What is told stands in rows, and what is shown agent by agent or in lines.
     offset = row * plan.lanes if which == "sources" else row
+    if plan.ahead and which == "leaders":
+        start = around.ahead
     if plan.lines and which == "leaders":
         start, offset = led(w, around, row) if plan.ahead else line(w, around, row), 0
     first = w.put(f"mul i64 {block}, {plan.lanes}")

@@ -97,7 +97,7 @@ class Plan(NamedTuple):
         table: numbers that each step has in the table.
         dt: s.
         ahead: whether the leaders may take many steps before the others take the first, since they
-            hear nobody: what they show, in lines, and tell is kept of each step.
+            hear nobody: what they show and tell is kept of each step.
     """
 
     bits: int
@@ -154,7 +154,7 @@ SLOTS = (
     "shown",
     "groups",
     "line",
-    "led",
+    "led_blocks",
     "threads",
     "thread",
 )
@@ -164,8 +164,9 @@ Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors
 those of the first of some groups, which have so many `blocks` and `edge_blocks` each. A swarm is
 one group. `common` has room for the numbers of `common.shared` at each step. `line` is how many
 numbers lie between two rows of a mirror in lines; `smooth` tells of each block, and `smooth_edges`
-of each block of edges, whether its others follow each other there. `ahead` and `told` keep what
-leaders show and tell of each step, for `led` places. Inputs are stored of the step `shown`.
+of each block of edges, whether its others follow each other there, or elsewhere whether no leader
+ahead is among them. `ahead` and `told` keep what the leaders in so many blocks show and tell of
+each step. Inputs are stored of the step `shown`.
 
 `turns` are `count` rows of `TURN`: blocks of one level and blocks of edges that take a step. Before
 it a thread waits for the others: until each before it has done as many turns as `before` says, and
@@ -194,6 +195,7 @@ class Context(NamedTuple):
     common: str
     ahead: str = ""
     told: str = ""
+    led: str = ""
 
 
 @contextlib.contextmanager

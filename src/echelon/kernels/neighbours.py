@@ -47,11 +47,15 @@ def exchange(
         totals = either(w, flag(w, slots["smooth"], block), add_up)
     elif plan.together or 0.0 in limits(plan).values():
         totals = add_up(False)
-    elif not winds(plan):
+    elif not (winds(plan) or plan.ahead):
         totals = _subtract(w, around, (start, end), first, heard)
     else:
-        *sums, large = _subtract(w, around, (start, end), first, [*heard, plan.width - 1])
-        totals = either(w, zeros(w, large), lambda small: sums if small else add_up(False))
+        last = [plan.width - 1] * winds(plan)
+        sums = _subtract(w, around, (start, end), first, [*heard, *last])
+        plain = zeros(w, sums.pop()) if last else "true"
+        if plan.ahead:
+            plain = w.put(f"and i1 {plain}, {flag(w, slots['smooth'], block)}")
+        totals = either(w, plain, lambda plain: sums if plain else add_up(False))
     return dict(zip(heard, totals, strict=True))
 
 
@@ -126,7 +130,7 @@ def _shown(
     if around.plan.lines:
         places = load_places(w, around.slots[which], first)
         return {k: gather(w, line(w, around, k), _kept(w, around, k, places), 0) for k in entries}
-    others = [_their(w, around.mirror, at, lane) for lane in range(w.lanes)]
+    others = [_their(w, around, at, lane, around.plan.ahead) for lane in range(w.lanes)]
     found = dict[int, str]()
     for piece in sorted({k // 4 for k in entries}):
         # A gather of one number a lane would cost more than turning rows about, four by four.
@@ -137,7 +141,7 @@ def _shown(
 
 def led(w: Writer, around: Context, row: int) -> str:
     """Write the address of a row of what leaders ahead show."""
-    far = w.put(f"mul i64 {around.slots['led']}, {row}")
+    far = w.put(f"mul i64 {around.led}, {row}")
     return w.put(f"getelementptr {w.scalar}, ptr {around.ahead}, i64 {far}")
 
 
@@ -157,7 +161,7 @@ def _kept(w: Writer, around: Context, row: int, places: str) -> str:
         zeros = f"<{w.lanes} x i32> zeroinitializer"
         return w.put(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
 
-    leads = w.put(f"icmp slt {kind} {places}, {spread(around.slots['led'])}")
+    leads = w.put(f"icmp slt {kind} {places}, {spread(around.led)}")
     moved = w.put(f"add {kind} {places}, {spread(far)}")
     return w.put(f"select {w.kind(True, False)} {leads}, {kind} {moved}, {kind} {places}")
 
@@ -225,7 +229,7 @@ def _subtract_some(
         at = w.put(f"getelementptr i32, ptr {around.slots['neighbours']}, i64 {place}")
         heavy = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
         lanes = dict.fromkeys(lane for lane, _ in places)
-        others = {lane: _their(w, around.mirror, at, lane) for lane in lanes}
+        others = {lane: _their(w, around, at, lane) for lane in lanes}
         weighted = around.plan.weighted
         weights = {lane: _weight(w, heavy, lane) for lane in lanes if weighted}
         for k, (lane, piece) in enumerate(places):
@@ -237,9 +241,16 @@ def _subtract_some(
     return totals
 
 
-def _their(w: Writer, mirror: str, places: str, lane: int) -> str:
-    """Write the address of what a lane's neighbour shows."""
-    return far_block(w, places, str(lane), mirror)
+def _their(w: Writer, around: Context, places: str, lane: int, ahead: bool = False) -> str:
+    """Write the address of what a lane's neighbour shows, who may be a leader ahead."""
+    start = around.mirror
+    if ahead:
+        at = w.put(f"getelementptr i32, ptr {places}, i64 {lane}")
+        place = w.put(f"sext i32 {w.put(f'load i32, ptr {at}, align 4')} to i64")
+        end = w.put(f"mul i64 {around.led}, {stride(around.plan.width, w.lanes)}")
+        leads = w.put(f"icmp slt i64 {place}, {end}")
+        start = w.put(f"select i1 {leads}, ptr {around.ahead}, ptr {start}")
+    return far_block(w, places, str(lane), start)
 
 
 def _weight(w: Writer, weights: str, lane: int) -> str:
