@@ -20,14 +20,12 @@ from echelon.engine.sums import ALWAYS, Sums
 from echelon.kernels import aligned, stride
 from echelon.world.disturbance import draw
 
-_AGENT_STEPS, _MORE, _ENOUGH, _FEWEST = 2_000_000, 8_000_000, 1_000, 4
+_AGENT_STEPS, _MORE, _ENOUGH, _FEWEST = 2_000_000, 16_000_000, 1_000, 4
 """Of a chunk, and of one with no more steps than enough: some tenths of a second."""
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-_AT_A_TIME = 256
-"""Blocks that are read together."""
 _STEPS, _TURNS, _KEPT = 2_048, 200_000, 10_000_000
 """Of a call: what all agents have in common is kept for each of them, and each level has a turn.
 
@@ -112,14 +110,12 @@ class NativeStepper(Stepper):
 
     def _read(self, rows: range, out: Array | None = None) -> Array:
         """Return rows of all agents, (N, rows), in an array that is given or new."""
-        agents, lanes = self.places.agents, self.plan.lanes
-        out = np.empty((len(self.places.of), len(rows)), self.dtype) if out is None else out
-        # So many at once that they are turned about within a cache; copies are all alike.
-        for first in range(0, len(self.blocks), _AT_A_TIME):
-            part = self.blocks[first : first + _AT_A_TIME, rows.start : rows.stop]
-            who = agents[first * lanes : (first + len(part)) * lanes]
-            out[who] = part.transpose(0, 2, 1).reshape(len(who), -1)
-        return out
+        part = self.blocks[:, rows.start : rows.stop].transpose(0, 2, 1)
+        turned = np.empty(part.shape, self.dtype if out is None else out.dtype)
+        turned[:] = part
+        flat = turned.reshape(len(self.places.agents), -1)
+        # Places are right, and to look at each would take a copy.
+        return np.take(flat, self.places.of, axis=0, out=out, mode="clip")
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
@@ -165,7 +161,7 @@ class NativeStepper(Stepper):
         """Store frames and take steps; what happens on the way is seen afterwards."""
         if now is not self._held:
             self._load(now)
-        made = self._fly(int(now.step), counts, reference)
+        made = self._fly(now, counts, reference)
         if self.far is None or not beyond(made.states, self.bits).any():
             return made
         self._held = None
@@ -180,13 +176,17 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._held = None
 
-    def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
+    def _fly(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
+        first = int(now.step)
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
         step, agents = first, len(self.places.of)
         x, u = (np.empty((len(counts), agents, len(r))) for r in (self.rows.state, self.rows.input))
         for k, count in enumerate(counts.tolist()):
-            self._read(self.rows.state, x[k])
+            if step == first:
+                x[k] = now.states
+            else:
+                self._read(self.rows.state, x[k])
             if count:
                 self._run(step, count, first, table)
                 self._read(self.rows.input, u[k])
@@ -352,17 +352,21 @@ class NativeStepper(Stepper):
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
-        kept = np.empty((len(self.places.of), rows.total - begin))
-        self._read(range(begin, rows.total), kept)
+        kept = np.empty((len(self.places.of), rows.tracking.start - begin))
+        self._read(range(begin, rows.tracking.start), kept)
 
         def of(places: range) -> Array:
             return kept[:, places.start - begin : places.stop - begin]
 
+        def led(places: range) -> Array:
+            block, lane = np.divmod(self.places.of[leaders], self.plan.lanes)
+            return self.blocks[block, places.start : places.stop, lane].astype(np.float64)
+
         found = Sums(
             steps=np.array([end - first, steady]),
             errors=_whole(of(rows.errors)),
-            tracking=_whole(of(rows.tracking)[leaders]),
-            outputs=of(rows.outputs)[leaders],
+            tracking=_whole(led(rows.tracking)),
+            outputs=led(rows.outputs),
             effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
             limited=of(rows.limited)[:, 0],

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import scipy.sparse as sp
@@ -100,7 +100,7 @@ class Places(abc.ABC):
 
 _MOSTLY = 0.75
 """Of the blocks: how many find their neighbours one after the other where they lie in lines."""
-_WINDOW = 1_024
+_WINDOW = 256
 """Agents among which those of one degree are brought together: so few stay near each other."""
 _LARGE = 10_000
 """Agents whose numbers no longer stay in a processor's own memory from one to the next."""
@@ -142,10 +142,21 @@ def _nearby(loop: Loop) -> Array:
     # Both ways, as the order wants a symmetric pattern, and directed edges have none.
     both = np.concatenate([i, j]), np.concatenate([j, i])
     links = sp.csr_array((np.ones(2 * len(i), np.int8), both), shape=(agents, agents))
-    order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
+    order = _from_an_end(links)
+    if len(order) < agents:
+        order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
     rank = np.empty(agents, int)
     rank[order] = own
     return rank if np.abs(rank[i] - rank[j]).sum() < np.abs(i - j).sum() else own
+
+
+def _from_an_end(links: Any) -> Array:
+    """Return the agents that one reaches from another, by how far they are from one at an end.
+
+    Neighbours are then at most about two layers apart, which are small where they begin at an end.
+    """
+    reached = csgraph.breadth_first_order(links, 0, return_predecessors=False)
+    return csgraph.breadth_first_order(links, reached[-1], return_predecessors=False)
 
 
 def _first(agents: Array) -> Array:

@@ -31,7 +31,7 @@ class Rows(NamedTuple):
         input: what is delivered to it (m,).
         own: numbers of its law and model that are others in other formations.
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
-        outputs, effort, limited, unsettled, inside, chatter: as in `Sums`.
+        effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
         total: how many rows there are.
     """
 
@@ -45,13 +45,13 @@ class Rows(NamedTuple):
     input: range
     own: range
     errors: range
-    tracking: range
-    outputs: range
     effort: range
     limited: range
     unsettled: range
     inside: range
     chatter: range
+    tracking: range
+    outputs: range
     total: int
 
     @classmethod
@@ -66,7 +66,7 @@ class Rows(NamedTuple):
         noisy = wind is not None and wind.noise is not None
         memory = max(memory_size(law) for law in (loop.leader, loop.follower))
         sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, told_by(loop), m, own]
-        sizes += [2, 2, q, 1, 1, 1, len(loop.meter.charted), 1]
+        sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q]
         ends = np.cumsum([0, *sizes]).tolist()
         rows: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
         return cls(*rows)
