@@ -34,18 +34,23 @@ def exchange(
     at = w.put(f"getelementptr i64, ptr {slots['neighbour_starts']}, i64 {block}")
     after = w.put(f"getelementptr i64, ptr {at}, i64 1")
     start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
-    wanted = [body.difference[k] for k in heard]
-    leaves = [n for n in needed(wanted) if n.op == "leaf"]
-    own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
     first = w.put(f"mul i64 {block}, {plan.lanes}")
+    alone = 0.0 not in limits(plan).values()
+    some = _AT_ONCE if alone else len(heard)
 
     def add_up(smooth: bool) -> list[str]:
-        mine = _own(w, around, own, block, load)
-        return _sums(w, around, (start, end), wanted, mine, smooth)
+        found = list[str]()
+        for part in (heard[k : k + some] for k in range(0, len(heard), some)):
+            wanted = [body.difference[k] for k in part]
+            leaves = [n for n in needed(wanted) if n.op == "leaf" and n.value[0] == "own"]
+            own = {leaf: body.now[leaf.value[1]] for leaf in leaves}
+            mine = _own(w, around, own, block, load)
+            found += _sums(w, around, (start, end), wanted, mine, smooth)
+        return found
 
     if plan.lines:
         totals = either(w, flag(w, slots["smooth"], block), add_up)
-    elif plan.together or 0.0 in limits(plan).values():
+    elif plan.together or not alone:
         totals = add_up(False)
     elif not (winds(plan) or plan.ahead):
         totals = _subtract(w, around, (start, end), first, heard)
@@ -57,6 +62,10 @@ def exchange(
             plain = w.put(f"and i1 {plain}, {flag(w, slots['smooth'], block)}")
         totals = either(w, plain, lambda plain: sums if plain else add_up(False))
     return dict(zip(heard, totals, strict=True))
+
+
+_AT_ONCE = 6
+"""Entries that are added up at once, where none rests on another: so many stay in registers."""
 
 
 def _sums(
