@@ -17,11 +17,13 @@ from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.scalars import memories_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import aligned, stride
+from echelon.kernels import aligned, needed, stride
 from echelon.world.disturbance import draw
 
-_AGENT_STEPS, _MORE, _ENOUGH, _FEWEST = 2_000_000, 16_000_000, 1_000, 4
-"""Of a chunk, and of one with no more steps than enough: some tenths of a second."""
+_AGENT_STEPS, _FEWEST = 2_000_000, 4
+"""Of a chunk: some hundredths of a second."""
+_OPERATIONS, _ENOUGH = {64: 2e10, 32: 4e10}, 1_000
+"""Of a chunk with no more steps than enough: about a second of one thread."""
 _AHEAD, _AT_ONCE = 64, 50_000
 """Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
@@ -84,6 +86,7 @@ class NativeStepper(Stepper):
         lines, turned = self.places.lines, unlike is not None
         made = (kernels or Kernels()).of(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
+        self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
@@ -108,11 +111,14 @@ class NativeStepper(Stepper):
             places.measure(self.found, far, bytes_)
         self.edges, self.heavy = self.found.edges, self.found.weights
 
-    def _read(self, rows: range, out: Array | None = None) -> Array:
-        """Return rows of all agents, (N, rows), in an array that is given or new."""
-        part = self.blocks[:, rows.start : rows.stop].transpose(0, 2, 1)
-        turned = np.empty(part.shape, self.dtype if out is None else out.dtype)
-        turned[:] = part
+    def _read(self, *parts: range, out: Array | None = None) -> Array:
+        """Return parts of the rows of all agents, (N, rows), in an array that is given or new."""
+        ends = np.cumsum([len(rows) for rows in parts]).tolist()
+        dtype = self.dtype if out is None else out.dtype
+        turned = np.empty((len(self.blocks), self.plan.lanes, ends[-1]), dtype)
+        for rows, end in zip(parts, ends, strict=True):
+            part = self.blocks[:, rows.start : rows.stop]
+            turned[..., end - len(rows) : end] = part.transpose(0, 2, 1)
         flat = turned.reshape(len(self.places.agents), -1)
         # Places are right, and to look at each would take a copy.
         return np.take(flat, self.places.of, axis=0, out=out, mode="clip")
@@ -144,7 +150,8 @@ class NativeStepper(Stepper):
     def longest(self) -> int:
         """Steps that take some tenths of a second, or a few of very many agents."""
         agents = len(self.states) // len(self.loops)
-        return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, _MORE // agents))
+        more = int(_OPERATIONS[self.bits] / (self._work * agents))
+        return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
@@ -186,24 +193,24 @@ class NativeStepper(Stepper):
             if step == first:
                 x[k] = now.states
             else:
-                self._read(self.rows.state, x[k])
+                self._read(self.rows.state, out=x[k])
             if count:
                 self._run(step, count, first, table)
-                self._read(self.rows.input, u[k])
+                self._read(self.rows.input, out=u[k])
                 step += count
             elif step == first or counts[k - 1]:
                 self._look(step, first, table, u[k])
             else:
                 u[k] = u[k - 1]
-        self._held = self._moment(step)
-        return Chunk(self._held, x, u, self._sums(first, step))
+        self._held, sums = self._leave(first, step)
+        return Chunk(self._held, x, u, sums)
 
     def _look(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
         changed = (self.blocks, self.edges, *self.mirrors)
         kept, drawn = [array.copy() for array in changed], self._drawn
         self._run(step, 1, first, table)
-        self._read(self.rows.input, out)
+        self._read(self.rows.input, out=out)
         self.mirrors.reverse()
         for array, before in zip(changed, kept, strict=True):
             array[:] = before
@@ -328,17 +335,22 @@ class NativeStepper(Stepper):
         wide[:, :, : self.plan.width] = np.nan
         wide[:, :, : values.shape[1]] = shown
 
-    def _moment(self, step: int) -> Moment:
-        """Return what is in the blocks as a moment."""
-        loop, flat = self.loop, self._read(self.rows.memory)
+    def _leave(self, first: int, step: int) -> tuple[Moment, Sums]:
+        """Return what is in the blocks as a moment, and the sums from one step to another."""
+        loop, rows = self.loop, self.rows
+        sums = range(rows.errors.start, rows.tracking.start)
+        parts = (rows.state, rows.memory, rows.cut, sums)
+        # All at once, since each reads the memory of all agents in another order.
+        found = np.split(self._read(*parts), np.cumsum([len(r) for r in parts[:-1]]), axis=1)
+        x, memory, cut, kept = found
         now: Any = [
             np.asarray(step, np.int32),
-            self._read(self.rows.state),
-            memories_of(loop.leader, flat[self.leaders]),
-            memories_of(loop.follower, flat[self.followers]),
-            self._read(self.rows.cut).astype(np.int8),
+            np.ascontiguousarray(x),
+            memories_of(loop.leader, memory[self.leaders]),
+            memories_of(loop.follower, memory[self.followers]),
+            cut.astype(np.int8),
         ]
-        return Moment._make(now)
+        return Moment._make(now), self._sums(first, step, kept)
 
     def _clear_sums(self) -> None:
         first = self.rows.errors.start
@@ -347,13 +359,11 @@ class NativeStepper(Stepper):
         self.blocks[:, self.rows.inside.start : self.rows.inside.stop] = ALWAYS
         self.edges[..., -1, :] = 0.0
 
-    def _sums(self, first: int, end: int) -> Sums:
-        """Return the sums over the steps from one to another."""
+    def _sums(self, first: int, end: int, kept: Array) -> Sums:
+        """Return the sums over the steps from one to another, of which agents keep theirs."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
-        kept = np.empty((len(self.places.of), rows.tracking.start - begin))
-        self._read(range(begin, rows.tracking.start), kept)
 
         def of(places: range) -> Array:
             return kept[:, places.start - begin : places.stop - begin]

@@ -13,7 +13,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.kernels import TURN
 
-_CACHES = (600_000, 12_000_000)
+_CACHES = (600_000, 8_000_000)
 """Bytes of a tile and what it moves over: less than the second and third cache of most processors.
 """
 _DEEP = 4

@@ -5,7 +5,7 @@ from echelon.kernels.drivers import program
 from echelon.kernels.frame import SLOTS, TURN, Body, Plan, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
 from echelon.kernels.native import Code, aligned, is_installed, vectors
-from echelon.kernels.scalar import Graph, Node
+from echelon.kernels.scalar import Graph, Node, needed
 from echelon.kernels.winding import winds
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "aligned",
     "is_installed",
     "lower",
+    "needed",
     "nodes",
     "program",
     "shared",
