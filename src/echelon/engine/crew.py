@@ -3,9 +3,10 @@
 import ctypes
 import os
 import sys
-from collections.abc import Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from functools import cache
+from threading import Event
 from typing import Any, final
 
 import numpy as np
@@ -80,7 +81,7 @@ class Crew:
             fly(groups)
             return
         # More parts than threads, since another process may take a processor from one of them.
-        list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
+        share(self.pool, fly, np.array_split(groups, min(len(groups), 8)))
 
     def _swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
@@ -99,7 +100,7 @@ class Crew:
             _call(code, values | told | {"count": len(turns)}, firsts | parts)
 
         # A thread each, since they wait for each other.
-        list(self._own.map(fly, range(self.threads)))
+        share(self._own, fly, range(self.threads))
 
     def _turns(self, steps: int, thread: int) -> Array:
         """Return the turns of a thread."""
@@ -114,6 +115,31 @@ class Crew:
                 found = step_by_step(segments, edges, steps, thread, self.threads)
             self._known[steps, thread] = found
         return self._known[steps, thread]
+
+
+def share(pool: Executor, act: Callable[[Any], None], parts: Iterable[Any]) -> None:
+    """Let threads act on a part each, all of them or, where Ctrl-C falls between, none.
+
+    Those that began would else wait for ever for those that did not.
+    """
+    gate, whole, begun = Event(), list[bool](), list[Future[None]]()
+
+    def begin(part: Any) -> None:
+        gate.wait()
+        if whole:
+            act(part)
+
+    try:
+        begun += [pool.submit(begin, part) for part in parts]
+        whole.append(True)
+        gate.set()
+        wait(begun)
+    finally:
+        gate.set()
+        # The memory that they write to must live until they end, also after Ctrl-C.
+        wait(begun)
+    for each in begun:
+        each.result()
 
 
 def _call(code: Code, values: dict[str, int], arrays: Mapping[str, Array]) -> None:
