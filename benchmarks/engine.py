@@ -103,7 +103,8 @@ def measure_ring(
 ) -> Row:
     """Return the rates of a ring beside the yardstick's."""
     side = made.steppers(flock(ech.Graph.ring(agents), model), bits)
-    steps = max(4, 2 * _MILLION // agents)
+    # As many as a run takes between two looks at it.
+    steps = side.native.longest
     name = "a newcomer's model" if model is not None else f"ring of {agents:,}"
     return turns(
         f"{name}, float{bits}",
@@ -123,7 +124,7 @@ def _in_c(
 
 def measure_degree(bits: int, yardstick: Yardstick | None) -> Row:
     """Return the rates of a graph of 10,000 agents with six neighbours each."""
-    agents, steps = 10_000, 100
+    agents = 10_000
     if yardstick is None:
         return {}
     table = yardstick.problem.rand_regular(agents, 6)
@@ -131,6 +132,7 @@ def measure_degree(bits: int, yardstick: Yardstick | None) -> Row:
     # Where two of its cycles share an edge, the kernel in C hears it twice.
     edges = np.unique(np.sort(pairs, axis=1), axis=0)
     side = made.steppers(flock(ech.Graph.from_edges(edges, agents=agents)), bits)
+    steps = 100
     return turns(
         f"degree 6, 10,000, float{bits}",
         {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
@@ -229,7 +231,7 @@ def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     Swarm(side.native.loop, side.native.places.lanes)
     built += time.process_time() - begin
     crews = {n: Crew(side.native.places, None, n) for n in (1, 2)}
-    rates, steps = list[float](), 4
+    rates, steps = list[float](), side.native.longest
 
     def fly(threads: int) -> float:
         side.native.crew = crews[threads]
