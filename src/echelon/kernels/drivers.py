@@ -132,14 +132,14 @@ def _around(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: 
     """Write where a step finds what changes from step to step."""
     step = w.put(f"add i64 {slots['first_step']}, {passed}")
     odd = w.put(f"trunc i64 {passed} to i1")
-    mirrors = [
+    now, later = (
         w.put(f"select i1 {odd}, ptr {slots[a]}, ptr {slots[b]}")
         for a, b in (("next_mirror", "mirror"), ("mirror", "next_mirror"))
-    ]
+    )
     shown = w.put(f"icmp eq i64 {step}, {slots['shown']}")
     shown = w.put(f"zext i1 {shown} to i64")
     common = _part(w, slots["common"], passed, str(numbers))
-    around = Context(plan, slots | {"shown": shown}, *mirrors, step, "", common)
+    around = Context(plan, slots | {"shown": shown}, now, later, step, "", common)
     if not plan.ahead:
         return around
     blocks, each = slots["led_blocks"], plan.told * plan.lanes
