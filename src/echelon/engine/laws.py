@@ -146,28 +146,28 @@ class Laws(Drive):
             return NativeStepper([loop], problem.states, int(settings.precision[5:]), by_jax)
         except (Unsupported, MissingExtraError) as error:
             if settings.engine == "native":
-                raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
-            return JaxStepper(loop, problem.states, _in_words(error))
+                raise SimulationError(f"`engine` is `native`, and {in_words(error)}.") from error
+            return JaxStepper(loop, problem.states, in_words(error))
 
 
 _WORTH = 100_000
 """Steps of one agent from which on native code saves more than the second that it takes to make."""
 
 
-def worth_native(settings: Settings, agents: int) -> bool:
+def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
     """Tell whether agents are to be stepped by native code: it is asked for, or pays.
 
-    It computes on processors alone.
+    It computes on processors alone, and `least` is from how many steps of one agent on it pays.
     """
     if settings.engine != "auto":
         return settings.engine == "native"
     if settings.devices > 1:
         return False
-    long = settings.steps * agents >= _WORTH
+    long = settings.steps * agents >= least
     return long and is_installed() and jax.default_backend() == "cpu"
 
 
-def _in_words(error: EchelonError) -> str:
+def in_words(error: EchelonError) -> str:
     """Return why there is no native code."""
     if isinstance(error, Unsupported):
         return f"there is no native code for {error}"

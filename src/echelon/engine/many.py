@@ -16,6 +16,7 @@ import numpy as np
 from echelon.core.errors import EchelonError, MissingExtraError, Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.engine.code import Kernels
 from echelon.engine.crew import processors
 from echelon.engine.drive import Chunk
 from echelon.engine.family import Families
@@ -24,7 +25,7 @@ from echelon.engine.initial import Starts
 from echelon.engine.laws import Laws, worth_native
 from echelon.engine.loop import Loop, assemble
 from echelon.engine.motion import Motion
-from echelon.engine.native import Kernels, NativeStepper, beyond
+from echelon.engine.native import NativeStepper, beyond
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, check_memory, prepare
 from echelon.engine.record import Recorder, Stretch

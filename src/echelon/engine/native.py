@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.code import LANES, Kernels, follows
+from echelon.engine.code import LANES, Kernels, Make, follows
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
@@ -26,7 +26,7 @@ _AHEAD, _AT_ONCE = 64, 50_000
 """Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-_STEPS = 2_048
+STEPS = 2_048
 """Of a call: what all agents have in common is kept for each of them."""
 
 
@@ -46,10 +46,11 @@ class NativeStepper(Stepper):
         far: what goes on where a state is beyond the range of the kernels' sines; None where the
             caller looks.
         pool: threads that step formations; None for the caller's alone.
-        kernels: those that were made before.
+        make: makes the kernel, or has made it before.
         unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
             weights of edges anyway; None where nothing is turned.
         threads: that share the steps of one formation; by its size when left out.
+        places: of the agents, where they are known.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -62,9 +63,10 @@ class NativeStepper(Stepper):
         bits: int,
         far: Stepper | None,
         pool: Executor | None = None,
-        kernels: Kernels | None = None,
+        make: Make | None = None,
         unlike: Loop | None = None,
         threads: int | None = None,
+        places: Places | None = None,
     ) -> None:
         """Write and compile the step."""
         self.own = Own(loops, unlike)
@@ -72,19 +74,21 @@ class NativeStepper(Stepper):
         self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
-        self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
+        known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
+        self.places: Places = known
         self.crew = Crew(self.places, pool, threads)
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
         lines, turned = self.places.lines, unlike is not None
-        made = (kernels or Kernels()).of(self.own, bits, together, lines, turned)
+        made = (make or Kernels().of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
         self._drawn, self._left = -1, -1
+        self._tape: Array | None = None
         self._ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
 
     # ---- memory ----
@@ -161,6 +165,10 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._held = None
 
+    def record(self, tape: Array | None, first: int) -> None:
+        """Keep what derivatives need of the steps from one on: (steps, blocks, taped, lanes)."""
+        self._tape, self._taped_from = tape, first
+
     def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
@@ -197,7 +205,7 @@ class NativeStepper(Stepper):
         """Take steps under one draw of the wind, and one stretch of the graph, after the other."""
         wind = self.loop.motion.wind
         while steps:
-            count = min(steps, _STEPS, self._switch(step))
+            count = min(steps, STEPS, self._switch(step))
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
@@ -235,6 +243,9 @@ class NativeStepper(Stepper):
         values |= {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
         # The inputs of single steps are read afterwards; those of many would be stored for nothing.
         values |= {"edge_blocks": len(self.found.edge_ends), "shown": int(steps == 1)}
+        if self._tape is not None:
+            now = self._tape[step - self._taped_from]
+            values |= {"tape": now.ctypes.data, "tape_step": now.size}
         values["line"] = self.places.line
         values["first_steady"] = int(self.loop.meter.first_steady)
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}

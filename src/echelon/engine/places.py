@@ -11,6 +11,7 @@ import scipy.sparse.csgraph as csgraph
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
 from echelon.kernels import aligned, stride
+from echelon.network.exchange import Exchange
 
 
 class Found(NamedTuple):
@@ -142,7 +143,7 @@ def _first(agents: Array) -> Array:
     return np.unique(agents, return_index=True)[1]
 
 
-def _senders(loop: Loop) -> Array:
+def senders_of(loop: Loop) -> Array:
     """Return who tells each agent what it is told, (N,)."""
     if loop.parents is None:
         return np.asarray(loop.meter.nearest)
@@ -180,13 +181,7 @@ class Swarm(Places):
         self.of = _first(self.agents)
         self.heard = heard(loop, self)
         starts, positions, _ = self.heard
-        slots = _follow(positions)
-        self.smooth = (
-            np.bincount(np.repeat(np.arange(self.blocks), np.diff(starts)), ~slots, self.blocks)
-            == 0
-        )
-        # A number that is gathered lane by lane costs some times what one of a line does.
-        self.lines = bool(self.smooth.mean() > _MOSTLY)
+        self.smooth, self.lines = smooth_blocks(starts, positions)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
@@ -195,7 +190,7 @@ class Swarm(Places):
         starts, positions, weights = self.heard
         heavy = aligned(weights.shape, dtype)
         heavy[:] = weights
-        held = self.of[_senders(loop)[self.agents]]
+        held = self.of[senders_of(loop)[self.agents]]
         nearest = np.asarray(loop.meter.nearest)[self.agents]
         return Found(
             starts,
@@ -245,7 +240,7 @@ class Formations(Places):
             starts,
             (positions * far).astype(np.int32),
             heavy,
-            (of[_senders(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
+            (of[senders_of(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
             (of[np.asarray(loop.meter.nearest)[self.alone.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
@@ -271,19 +266,31 @@ class Formations(Places):
         return each[: len(self.loops)].reshape(-1)
 
 
+def smooth_blocks(starts: Array, positions: Array) -> tuple[Array, bool]:
+    """Return whose neighbours follow each other, slot by slot, and whether lines pay for it."""
+    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    smooth = np.bincount(block, ~_follow(positions), len(starts) - 1) == 0
+    # A number that is gathered lane by lane costs some times what one of a line does.
+    return smooth, bool(smooth.mean() > _MOSTLY)
+
+
 def _follow(positions: Array) -> Array:
     """Return which of some lists of positions (..., lanes) are each one more than the last."""
     return (np.diff(positions, axis=-1) == 1).all(axis=-1)
 
 
-def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
+def heard(
+    loop: Loop, places: Places, exchange: Exchange | None = None
+) -> tuple[Array, Array, Array]:
     """Return whom each agent hears, slot by slot: the k-th neighbour of each of a block.
+
+    It is by the loop's edges, or by others where they are given.
 
     Returns:
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, agents = loop.exchange, places.agents.reshape(-1, places.lanes)
+    exchange, agents = exchange or loop.exchange, places.agents.reshape(-1, places.lanes)
     order = np.argsort(np.asarray(exchange.receivers), kind="stable")
     senders = np.asarray(exchange.senders)[order]
     weights = np.atleast_2d(np.asarray(exchange.weights))[:, order]

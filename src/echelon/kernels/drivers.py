@@ -11,6 +11,7 @@ next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.kernels.adjoint import record, taken, tape_at, tape_of
 from echelon.kernels.arms import choices
 from echelon.kernels.common import apart, shared
 from echelon.kernels.frame import (
@@ -105,19 +106,36 @@ def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str, numbers: int
     mirrors = [("ptr", slots["mirror"]), ("ptr", slots["next_mirror"])]
     with loop(w, slots["first_step"], last, mirrors) as (step, carried, following):
         passed = w.put(f"sub i64 {step}, {slots['first_step']}")
+        if plan.backward:
+            passed = w.put(f"sub i64 {w.put(f'sub i64 {last}, {step}')}, 1")
+            step = w.put(f"add i64 {slots['first_step']}, {passed}")
         row = w.put(f"mul i64 {passed}, {numbers}")
         common = w.put(f"getelementptr {w.scalar}, ptr {slots['common']}, i64 {row}")
-        around = Context(plan, slots, carried[0], carried[1], step, "", common)
+        tape = tape_at(w, slots, passed) if plan.taped else ""
+        around = Context(plan, slots, carried[0], carried[1], step, "", common, tape)
         if plan.edges:
             measure_edges(w, around)
-        with _blocks(w, around, "0") as block:
-            _act(w, around, plan.first, block)
-        _meet(w, around, passed, "0")
-        with loop(w, "1", slots["levels"], []) as (level, _, _):
-            with _blocks(w, around, level) as block:
-                _act(w, around, plan.others, block)
-            _meet(w, around, passed, level)
+        _levels(w, around, passed)
         following[:] = [carried[1], carried[0]]
+
+
+def _levels(w: Writer, around: Context, passed: str) -> None:
+    """Write what all agents do in a step: leaders first, or on the way back last."""
+    plan, levels = around.plan, around.slots["levels"]
+    if not plan.backward:
+        _level(w, around, plan.first, passed, "0")
+    with loop(w, "1", levels, []) as (k, _, _):
+        level = w.put(f"sub i64 {levels}, {k}") if plan.backward else k
+        _level(w, around, plan.others, passed, level)
+    if plan.backward:
+        _level(w, around, plan.first, passed, "0")
+
+
+def _level(w: Writer, around: Context, body: Body, passed: str, level: str) -> None:
+    """Write what the agents of a level do, and that threads wait for each other after it."""
+    with _blocks(w, around, level) as block:
+        _act(w, around, body, block)
+    _meet(w, around, passed, level)
 
 
 @contextlib.contextmanager
@@ -187,10 +205,13 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
         return load_row(w, base, leaf.value[1], plan.lanes)
 
     z = exchange(w, around, complete, block, heard, row) if heard else {}
+    fed = taken(w, around, complete, block)
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        return z[rest[0]] if kind == "z" else _load(w, around, block, base, kind, rest)
+        if kind in ("z", "fed"):
+            return (z if kind == "z" else fed)[rest[0]]
+        return _load(w, around, block, base, kind, rest)
 
     usually = usual(all_, choices(body.results()))
     done, otherwise = w.fresh("done"), w.fresh("otherwise")
@@ -217,6 +238,8 @@ def _load(w: Writer, around: Context, block: str, base: str, kind: str, rest: Se
     if kind == "told":
         start, row = around.slots["rows"], plan.tell + rest[0]
         return _look_up(w, around, "sources", start, row, block, plan.one_source)
+    if kind == "tape":
+        return load_row(w, tape_of(w, around, block), rest[0], plan.lanes)
     if kind == "leader":
         return _look_up(w, around, "leaders", around.mirror, rest[0], block, plan.one_leader)
     return _same_for_all(w, around, kind, rest)
@@ -226,6 +249,7 @@ def _write(w: Writer, around: Context, body: Body, emitter: Emitter, base: str, 
     """Write what a body leaves: in the rows of its block, and for its neighbours."""
     _write_rows(w, around, body, emitter, base)
     write_mirror(w, around, [emitter.value(node) for node in body.mirror], block)
+    record(w, around, body, emitter, block)
 
 
 def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: str) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from echelon.kernels.scalar import Node
@@ -11,8 +12,9 @@ from echelon.kernels.vector_ir import Writer
 class Body(NamedTuple):
     """What some of the agents do in a step; the same code for all of them.
 
-    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), or, the
-    same for all, ("time",), ("step",), ("steady",), ("table", c).
+    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), on the way
+    back ("tape", r) and ("fed", k), or, the same for all, ("time",), ("step",), ("steady",),
+    ("table", c).
 
     Attributes:
         stores: row -> what it becomes.
@@ -24,6 +26,10 @@ class Body(NamedTuple):
         mirror: what they read after it.
         difference: of what stands in the leaves `own` and `their`, entry by entry; z_k is the
             weighted sum of entry k over the neighbours.
+        tape: row of the tape -> what is kept there of each step, where it is asked for.
+        totals: place -> what is added up there over all agents and steps.
+        to_sources: what is added to the `fed` of who told an agent what it was told, from 0 on.
+        to_leaders: what is added to the `fed` of its leader, behind that.
     """
 
     stores: dict[int, Node]
@@ -34,11 +40,17 @@ class Body(NamedTuple):
     now: Sequence[Node]
     mirror: Sequence[Node]
     difference: Sequence[Node]
+    tape: Mapping[int, Node] = MappingProxyType({})
+    totals: Mapping[int, Node] = MappingProxyType({})
+    to_sources: Sequence[Node] = ()
+    to_leaders: Sequence[Node] = ()
 
     def results(self) -> list[Node]:
         """Return all that is written."""
         rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
-        return [*(node for row in rows for node in row.values()), *self.mirror]
+        listed = (*self.mirror, *self.to_sources, *self.to_leaders)
+        kept = (*self.tape.values(), *self.totals.values())
+        return [*(node for row in rows for node in row.values()), *listed, *kept]
 
     def all(self) -> list[Node]:
         """Return all that is written, and what of it is made of what neighbours read."""
@@ -47,7 +59,7 @@ class Body(NamedTuple):
     def become(self, made: Mapping[Node, Node]) -> "Body":
         """Return the body whose nodes have become others, where they have."""
 
-        def rows(of: dict[int, Node]) -> dict[int, Node]:
+        def rows(of: Mapping[int, Node]) -> dict[int, Node]:
             return {row: made.get(node, node) for row, node in of.items()}
 
         def listed(of: Sequence[Node]) -> list[Node]:
@@ -62,6 +74,10 @@ class Body(NamedTuple):
             now=listed(self.now),
             mirror=listed(self.mirror),
             difference=listed(self.difference),
+            tape=rows(self.tape),
+            totals=rows(self.totals),
+            to_sources=listed(self.to_sources),
+            to_leaders=listed(self.to_leaders),
         )
 
 
@@ -87,6 +103,9 @@ class Plan(NamedTuple):
         edges: which of the numbers that neighbours read make a distance; none for none.
         table: numbers that each step has in the table.
         dt: s.
+        taped: rows that the tape has of a block at each step.
+        backward: whether the steps are taken from the last to the first, the followers before the
+            leaders, the deepest level first: for derivatives.
     """
 
     bits: int
@@ -105,6 +124,8 @@ class Plan(NamedTuple):
     edges: tuple[int, ...]
     table: int
     dt: float
+    taped: int = 0
+    backward: bool = False
 
     @property
     def mirror(self) -> int:
@@ -133,6 +154,9 @@ SLOTS = (
     "ends",
     "met",
     "rest",
+    "tape",
+    "totals",
+    "fed",
     "first_step",
     "steps",
     "levels",
@@ -143,8 +167,9 @@ SLOTS = (
     "line",
     "threads",
     "first_edge",
+    "tape_step",
 )
-"""What a kernel is called with: 19 addresses and 10 whole numbers of 64 bits.
+"""What a kernel is called with: 22 addresses and 11 whole numbers of 64 bits.
 
 Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
 those of the first of some groups. A swarm is one group. `common` has room for the numbers of
@@ -152,9 +177,11 @@ those of the first of some groups. A swarm is one group. `common` has room for t
 `smooth` tells of each block, and `smooth_edges` of each block of edges, whether its others follow
 each other there. A thread steps the blocks of each level from `starts` to `ends`, and its blocks of
 edges, and waits for the others after each level: `met` counts how many came, and `rest` is a
-function that leaves the processor to others.
+function that leaves the processor to others. `tape` is 0 where none is kept, and `tape_step` how
+many numbers lie between its steps; `totals` has a vector for each, and `fed` what was added for
+each agent.
 """
-ADDRESSES = 19
+ADDRESSES = 22
 
 
 def stride(width: int, lanes: int) -> int:
@@ -172,6 +199,7 @@ class Context(NamedTuple):
     step: str
     table: str
     common: str
+    tape: str = ""
 
 
 @contextlib.contextmanager

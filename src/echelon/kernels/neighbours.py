@@ -124,7 +124,7 @@ def _shown(
     for piece in sorted({k // w.lanes for k in entries}):
         # A gather of one number a lane would cost more than turning whole rows about.
         rows = [_load_at(w, other, piece * w.lanes) for other in others]
-        found |= enumerate(_transposed(w, rows), piece * w.lanes)
+        found |= enumerate(transposed(w, rows), piece * w.lanes)
     return found
 
 
@@ -168,7 +168,7 @@ def _subtract(
     found = dict[int, str]()
     for piece in pieces:
         rows = [totals[k] for k, (_, p) in enumerate(places) if p == piece]
-        found |= enumerate(_transposed(w, rows), piece * lanes)
+        found |= enumerate(transposed(w, rows), piece * lanes)
     return found
 
 
@@ -204,12 +204,12 @@ def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) 
         return
     padded = [*values, *["zeroinitializer"] * (far - len(values))]
     for piece in range(0, far, lanes):
-        for lane, column in enumerate(_transposed(w, padded[piece : piece + lanes])):
+        for lane, column in enumerate(transposed(w, padded[piece : piece + lanes])):
             at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + piece}")
             w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * bytes_of(w)}")
 
 
-def _transposed(w: Writer, rows: Sequence[str]) -> list[str]:
+def transposed(w: Writer, rows: Sequence[str]) -> list[str]:
     """Write the transpose of as many vectors as a vector has lanes, in log2 of them stages."""
     lanes, rows = w.lanes, list(rows)
     distance = 1
