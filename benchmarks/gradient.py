@@ -62,13 +62,14 @@ def measure(agents: int) -> dict[str, float]:
         asked = settings._replace(engine=engine)
         return lambda: ech.gradient(parts, asked, squares, ("P", "R", "coupling"))
 
-    work = {"forwards": forwards(parts, settings), "whole run": lambda: ech.simulate(parts, settings._replace(engine="native", store_every=_STEPS))}
+    whole = settings._replace(engine="native", store_every=_STEPS)
+    work = {"forwards": forwards(parts, settings), "whole run": lambda: ech.simulate(parts, whole)}
     work |= {"native": pull("native"), "JAX": pull("jax")}
     first = {name: seconds(each) for name, each in work.items()}
     best = dict.fromkeys(work, np.inf)
     for _ in range(_TURNS):
         best |= {name: min(best[name], seconds(each)) for name, each in work.items()}
-    row = {f"{name}, ms": round(1e3 * took, 2) for name, took in best.items()}
+    row: dict[str, float] = {f"{name}, ms": round(1e3 * took, 2) for name, took in best.items()}
     row |= {f"{name}, the first time, s": round(took, 2) for name, took in first.items()}
     row["native to forwards"] = round(best["native"] / best["forwards"], 2)
     row["native to a whole run"] = round(best["native"] / best["whole run"], 2)

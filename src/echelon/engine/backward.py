@@ -26,10 +26,17 @@ from echelon.kernels import SLOTS, Body, Unsupported, aligned, fed_widths, strid
 from echelon.network.exchange import Exchange
 
 BITS = 64
-_TAPE = 32 * 2**20
-"""Bytes of a tape that stay near the processor."""
+_TAPE = 256 * 2**20
+"""Bytes of a tape, unless steps are so many that it takes the root of what all would."""
 _KEPT = 8
 """Pairs of kernels that are kept for other runs."""
+
+
+class Wants(NamedTuple):
+    """Whether slopes come along the sums of distances, and are wanted along goals' offsets."""
+
+    spaced: bool
+    moved: bool
 
 
 class _Pair(NamedTuple):
@@ -43,20 +50,21 @@ class _Pair(NamedTuple):
 _pairs: dict[Hashable, _Pair] = {}
 
 
-def _pair(own: Own, lines: tuple[bool, bool], spaced: bool) -> _Pair:
+def _pair(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
     """Return the kernels for loops alike but for their own numbers, made once."""
-    rows = Rows.of(own.loop)
-    key = (own.signature, rows, lines, spaced)
-    if own.signature is None or key not in _pairs:
+    wind, signature = own.loop.motion.wind, own.signature
+    # The signature is of all but the wind's numbers, which have rows where there is one.
+    key = (signature, wind is None, wind is None or wind.noise is None, lines, wants)
+    if signature is None or key not in _pairs:
         while len(_pairs) >= _KEPT:
             _pairs.pop(next(iter(_pairs)))
-        _pairs[key] = _made(own, rows, lines, spaced)
+        _pairs[key] = _made(own, lines, wants)
     return _pairs[key]
 
 
-def _made(own: Own, rows: Rows, lines: tuple[bool, bool], spaced: bool) -> _Pair:
-    loop = own.loop
-    felt, wanted = Felt.of(loop, rows, spaced), follows(loop)
+def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
+    loop, rows = own.loop, Rows.of(own.loop)
+    felt, wanted = Felt.of(loop, rows, *wants), follows(loop)
     plan = plan_of(own, rows, BITS, False, lines[0], False, True)
     ways = [Transpose(own, BITS, rows, felt, leads, wanted).made() for leads in (True, False)]
     taped = max(1, *(len(way.kept) for way in ways))
@@ -98,34 +106,34 @@ class Slopes(NamedTuple):
 
 @final
 class Backward:
-    """A run of laws that is taken forwards and then back.
+    """A run of laws that is taken forwards and then back, once.
 
     Args:
         own: the loop, and its numbers along which there are slopes.
         states: (N, n) at the beginning.
         reference: (steps, n) what the leaders follow, or None.
         steps: of the run.
-        spaced: whether there may be slopes along the sums of distances.
+        wants: what more than the least is wanted.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
     """
 
     def __init__(
-        self, own: Own, states: Array, reference: Array | None, steps: int, spaced: bool
+        self, own: Own, states: Array, reference: Array | None, steps: int, wants: Wants
     ) -> None:
         """Write and compile the step and its transpose."""
         self.own, self.loop, self.steps, self.states = own, own.loop, steps, states
         self.places = Swarm(own.loop, LANES[BITS])
-        if spaced:
+        if wants.spaced:
             _check_pairs(own.loop)
-        self.reach = _reach(own.loop, self.places, spaced)
-        self.pair = _pair(own, (self.places.lines, self.reach.lines), spaced)
-        kernel = self.pair.forward
+        turned = _turned(own.loop, self.places)
+        self.pair = _pair(own, (self.places.lines, turned.lines), wants)
+        self.reach, kernel = _reach(own.loop, self.places, turned, self.pair), self.pair.forward
         self.stepper = NativeStepper(
             [own.loop], states, BITS, None, make=lambda *_: kernel, places=self.places
         )
-        self.reference, self.spaced = reference, spaced
+        self.reference, self.wants = reference, wants
         self._reserve()
 
     def _reserve(self) -> None:
@@ -152,13 +160,18 @@ class Backward:
         """Return the sums of the run; None where a state is beyond the range of the kernels."""
         now, self.moments = self.stepper.start(), list[Moment]()
         sums: Sums | None = None
-        for first in range(0, self.steps, self.stretch):
+        for first in self._firsts():
             self.moments.append(now)
+            # The last stretch is the first that is taken back.
+            self.stepper.record(self.tape if first + self.stretch >= self.steps else None, first)
             made = self._advance(now, first)
             now, sums = made.now, made.sums if sums is None else sums.plus(made.sums)
             if beyond(now.states, BITS).any():
                 return None
         return sums
+
+    def _firsts(self) -> range:
+        return range(0, self.steps, self.stretch)
 
     def _advance(self, now: Moment, first: int) -> Any:
         """Take the steps of the stretch that begins with one."""
@@ -178,13 +191,13 @@ class Backward:
         if np.ptp(slopes.spacing):
             raise Unsupported("slopes along distances that are not the same for all edges")
         self._begin(slopes)
-        for first in reversed(range(0, self.steps, self.stretch)):
-            self.stepper.record(self.tape, first)
-            self._advance(self.moments[first // self.stretch], first)
+        for first in reversed(self._firsts()):
+            if first + self.stretch < self.steps:
+                self.stepper.record(self.tape, first)
+                self._advance(self.moments[first // self.stretch], first)
             self._back(first, min(self.steps, first + self.stretch))
-        self.stepper.record(None, 0)
         found = self._ended()
-        if not self.spaced:
+        if not self.wants.spaced:
             return found
         # The transpose of a step adds what distances were after it; this is before the first.
         _, pull = jax.vjp(self.loop.meter.spacing, jnp.asarray(self.states))
@@ -241,19 +254,14 @@ class Backward:
             "next_mirror": self.mirrors[1],
             "table": self.table[start - first :],
             "segments": segments,
-            "neighbour_starts": reach.starts,
-            "neighbours": reach.neighbours,
-            "weights": reach.weights[row],
-            "sources": reach.sources,
-            "leaders": reach.leaders,
             "common": common,
-            "smooth": reach.smooth,
             "starts": firsts,
             "ends": ends,
             "tape": tape,
             "totals": self.totals,
             "fed": self.fed,
         }
+        arrays |= reach._asdict() | {"weights": reach.weights[row]}
         told = {name: array.ctypes.data for name, array in arrays.items()}
         told |= {"first_step": start, "steps": steps, "levels": len(segments) - 1}
         told |= {"groups": 1, "threads": 1, "line": places.line, "tape_step": self.tape[0].size}
@@ -272,7 +280,8 @@ class Backward:
         leaves = np.split(self.totals.sum(axis=1)[: sum(self.sizes)], ends) if self.sizes else []
         leaves = [s.reshape(leaf.shape) for s, leaf in zip(leaves, self._leaves(), strict=True)]
         heard = _heard_back(loop, self._shown()[:, : heard_by(loop)])
-        states, offsets = found[:, felt.state], found[:, felt.offset]
+        states = found[:, felt.state]
+        offsets = found[:, felt.offset] if self.wants.moved else np.zeros_like(states)
         if not (len(felt.memory) or signals_of(loop)):
             return Slopes(leaves, states + heard, offsets - heard)
         more = self._begun(found[:, felt.memory], heard)
@@ -313,14 +322,23 @@ class Backward:
 # ---- the transposed graph ------------------------------------------------------------------------
 
 
-class _Reach(NamedTuple):
-    """Who heard each agent, as a kernel reads it, and whom it feeds: `Found` turned about."""
+class _Turned(NamedTuple):
+    """Who heard each agent, as `places.heard` has whom it hears; whose positions are in lines."""
 
     starts: Array
-    neighbours: Array
+    positions: Array
     weights: Array
     smooth: Array
     lines: bool
+
+
+class _Reach(NamedTuple):
+    """The same as a kernel reads it, and whom each agent feeds: `places.Found` turned about."""
+
+    neighbour_starts: Array
+    neighbours: Array
+    weights: Array
+    smooth: Array
     sources: Array
     leaders: Array
 
@@ -337,8 +355,8 @@ def _check_pairs(loop: Loop) -> None:
         raise Unsupported("slopes along distances of edges that are not all heard both ways alike")
 
 
-def _reach(loop: Loop, places: Swarm, spaced: bool) -> _Reach:
-    exchange, tell = loop.exchange, len(Rows.of(loop).tell)
+def _turned(loop: Loop, places: Swarm) -> _Turned:
+    exchange = loop.exchange
     turned = Exchange(exchange.senders, exchange.receivers, exchange.weights)
     starts, positions, weights = heard(loop, places, turned)
     agents = places.agents.reshape(-1, places.lanes)
@@ -347,19 +365,19 @@ def _reach(loop: Loop, places: Swarm, spaced: bool) -> _Reach:
     # A copy feels nothing, so that what is added up over all lanes counts each agent once.
     once = (places.of[agents] == own)[block]
     positions, weights = np.where(once, positions, own[block]), np.where(once, weights, 0.0)
-    smooth, lines = smooth_blocks(starts, positions)
-    heavy = aligned(weights.shape, np.float64)
-    heavy[:] = weights
-    width = heard_by(loop) + 2 * spaced * len(loop.meter.measured)
-    far = 1 if lines else stride(width, places.lanes)
-    fed = sum(stride(size, places.lanes) for size in (tell, len(loop.meter.measured)))
-    nearest = np.asarray(loop.meter.nearest)
+    return _Turned(starts, positions, weights, *smooth_blocks(starts, positions))
+
+
+def _reach(loop: Loop, places: Swarm, turned: _Turned, pair: _Pair) -> _Reach:
+    plan, nearest = pair.backward.plan, np.asarray(loop.meter.nearest)
+    heavy = aligned(turned.weights.shape, np.float64)
+    heavy[:] = turned.weights
+    far, (_, fed) = 1 if plan.lines else stride(plan.width, plan.lanes), fed_widths(plan)
     return _Reach(
-        starts,
-        np.ascontiguousarray(positions * far, np.int32),
+        turned.starts,
+        np.ascontiguousarray(turned.positions * far, np.int32),
         heavy,
-        smooth.astype(np.int8),
-        lines,
+        turned.smooth.astype(np.int8),
         (places.of[senders_of(loop)[places.agents]] * fed).astype(np.int32),
         (places.of[nearest[places.agents]] * fed).astype(np.int32),
     )

@@ -13,7 +13,7 @@ from echelon.core.errors import MissingExtraError, SimulationError, did_you_mean
 from echelon.core.jaxpr import read_by
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.engine.backward import Backward
+from echelon.engine.backward import Backward, Wants
 from echelon.engine.laws import Laws, in_words, worth_native
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
 from echelon.engine.own import Own, bare
@@ -119,7 +119,7 @@ def _natively(run: _Run, steps: int, cost: Cost) -> Gradient:
     names = [part for name in run.values for part in _PARTS.get(name, ())]
     own, order = _own(run.loop, names)
     spaced = Sums(*read_by(cost, run.loop.meter.nothing())).spacing
-    back = Backward(own, run.states, run.reference, steps, spaced)
+    back = Backward(own, run.states, run.reference, steps, Wants(spaced, "offsets" in run.values))
     sums = back.run()
     if sums is None:
         raise Unsupported("states beyond the range of its sines")

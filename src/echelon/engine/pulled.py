@@ -37,7 +37,7 @@ class Felt(NamedTuple):
 
     Attributes:
         state, memory: the slopes along what the step before made of it.
-        offset: along its goal's offset, added up.
+        offset: along its goal's offset, added up, where that is wanted.
         heard: along its disagreement at the step after this, where it is asked for again.
         place: its position then and that of its goal, where slopes along distances are wanted.
         lean: by how much weight it then heard more than it was heard, where some do.
@@ -59,10 +59,11 @@ class Felt(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop, rows: Rows, spaced: bool) -> "Felt":
-        """Return the rows of a loop whose steps have other rows, `spaced` with `place`."""
+    def of(cls, loop: Loop, rows: Rows, spaced: bool, moved: bool) -> "Felt":
+        """Return the rows of a loop of such rows, `spaced` with `place`, `moved` with `offset`."""
         leaning, n, q = leans(loop), len(rows.state), len(loop.meter.measured)
-        sizes = [n, len(rows.memory), n, heard_by(loop) * (leaning or spaced), 2 * q * spaced]
+        heard = heard_by(loop) * (leaning or spaced)
+        sizes = [n, len(rows.memory), n * moved, heard, 2 * q * spaced]
         sizes += [int(leaning), 1, 2, 2, len(rows.outputs), 1]
         ends = np.cumsum([0, *sizes]).tolist()
         found: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
@@ -260,7 +261,7 @@ class Transpose:
         stores |= zip(felt.heard, back.z, strict=False)
         return Body(
             stores=stores | dict(zip(felt.place, place, strict=True)),
-            sums=dict(zip(felt.offset, offset, strict=True)),
+            sums=dict(zip(felt.offset, offset, strict=False)),
             greatest={},
             least={},
             shown={},
