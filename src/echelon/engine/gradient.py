@@ -72,21 +72,21 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     assert isinstance(drive, Laws)
     with precision("float64"):
         loop = assemble(prepared.problem, drive.leader, drive.follower)
-        run = _Run(
+        run = Run(
             loop, values, prepared.problem.states, sample_reference(prepared, 0, settings.steps)
         )
         if not worth_native(settings, len(run.states), _WORTH):
-            return _by_jax(run, settings.steps, cost)
+            return by_jax(run, settings.steps, cost)
         try:
-            return _natively(run, settings.steps, cost)
+            return natively(run, settings.steps, cost)
         except (Unsupported, MissingExtraError) as error:
             if settings.engine == "native":
                 raise SimulationError(f"`engine` is `native`, and {in_words(error)}.") from error
             told = (f"JAX takes the steps back, since {in_words(error)}.",)
-            return _by_jax(run, settings.steps, cost)._replace(warnings=told)
+            return by_jax(run, settings.steps, cost)._replace(warnings=told)
 
 
-class _Run(NamedTuple):
+class Run(NamedTuple):
     """A loop, what the cost is differentiated by, the starts (N, n), what the leaders follow."""
 
     loop: Loop
@@ -95,7 +95,7 @@ class _Run(NamedTuple):
     reference: Array | None
 
 
-def _by_jax(run: _Run, steps: int, cost: Cost) -> Gradient:
+def by_jax(run: Run, steps: int, cost: Cost) -> Gradient:
     """Return the gradient by JAX's reverse mode over steps of JAX."""
     (value, sums), slopes = _differentiate(*run, steps, cost)
     found = {name: _symmetric(name, np.asarray(slope)) for name, slope in slopes.items()}
@@ -109,7 +109,7 @@ _PARTS = {"P": ("P",), "R": ("R", "R_inverse"), "coupling": ("coupling",)}
 """What of a gain changes with a variable."""
 
 
-def _natively(run: _Run, steps: int, cost: Cost) -> Gradient:
+def natively(run: Run, steps: int, cost: Cost) -> Gradient:
     """Return the gradient by native code.
 
     Raises:
