@@ -193,7 +193,7 @@ class Transpose:
         if not len(self.felt.lean):
             return found
         # What is gathered has as many of one's own as one was heard by, and not as one heard.
-        return found + self._leaf(self.felt.lean)[0] * self._leaf(self.felt.heard)
+        return found + self._leaf(self.felt.lean) * self._leaf(self.felt.heard)
 
     def _now(self, heard: int) -> list[Node]:
         """Return what neighbours read of an agent at hand."""
@@ -226,9 +226,9 @@ class Transpose:
         reads = self.leads and self.follows
         state = self._leaf(felt.state)
         if len(felt.place):
-            [along], heard = self._leaf(felt.spacing), heard_by(self.loop)
+            heard = heard_by(self.loop)
             apart = self._leaf(range(heard, heard + len(self.measured)), "heard")
-            state[list(self.measured)] += along * apart
+            state[list(self.measured)] += self._leaf(felt.spacing) * apart
         return (
             state if self.signals else state + after,
             shaped(self._leaf(felt.memory[: memory_size(self.law)]), self.law.init()),
