@@ -87,7 +87,7 @@ def test_where_two_agents_meet_the_distance_between_them_takes_no_slope_away():
 @pytest.mark.parametrize(
     ("wrt", "told"),
     [
-        (("Q",), "`wrt` names `Q`, allowed are `P`, `R`, `coupling`, `initial`."),
+        (("Q",), "`wrt` names `Q`, allowed are `P`, `R`, `coupling`, `initial`, `offsets`."),
         (("couplin",), "allowed are .* \\(did you mean `coupling`\\?\\)"),
     ],
 )

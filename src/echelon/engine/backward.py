@@ -127,6 +127,8 @@ class Backward:
         self.places = Swarm(own.loop, LANES[BITS])
         if wants.spaced:
             _check_pairs(own.loop)
+        if all(wants):
+            raise Unsupported("slopes of distances along the goals' offsets")
         turned = _turned(own.loop, self.places)
         self.pair = _pair(own, (self.places.lines, turned.lines), wants)
         self.reach, kernel = _reach(own.loop, self.places, turned, self.pair), self.pair.forward

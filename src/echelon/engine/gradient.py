@@ -21,7 +21,7 @@ from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.settings import Settings
 from echelon.engine.simulate import sample_reference
-from echelon.engine.sums import Sums, reference_at
+from echelon.engine.sums import Sums, distance_of, reference_at
 from echelon.kernels import Unsupported
 
 Cost: TypeAlias = Callable[[Sums], jax.Array]
@@ -30,8 +30,12 @@ Cost: TypeAlias = Callable[[Sums], jax.Array]
 _WORTH = 10_000
 """Steps of one agent from which on native code saves more than it takes to make."""
 
-VARIABLES = ("P", "R", "coupling", "initial")
-"""What a cost can be differentiated by: of the followers' gain, and the starts (N, n)."""
+VARIABLES = ("P", "R", "coupling", "initial", "offsets")
+"""What a cost can be differentiated by.
+
+P, R and the coupling of the followers' gain; the starts (N, n); the goals' offsets (N, n), where
+the starts are held.
+"""
 
 
 class Gradient(NamedTuple):
@@ -125,7 +129,8 @@ def natively(run: Run, steps: int, cost: Cost) -> Gradient:
         raise Unsupported("states beyond the range of its sines")
     value, along = _slopes_of(cost, sums)
     found = back.pull(along)
-    parts = dict(zip(order, found.leaves, strict=True)) | {"initial": found.states}
+    parts = dict(zip(order, found.leaves, strict=True))
+    parts |= {"initial": found.states, "offsets": found.offsets}
     if "R" in parts:
         inverse = run.loop.follower.gain.R_inverse  # type: ignore[attr-defined]
         parts["R"] = parts["R"] - inverse.T @ parts["R_inverse"] @ inverse.T
@@ -167,7 +172,8 @@ def _values(prepared: Prepared, wrt: Sequence[str]) -> dict[str, Array]:
         raise SimulationError(
             f"a run driven by `{type(drive).__name__}` cannot be differentiated, one by `Laws` can."
         )
-    known: dict[str, Array] = {"initial": np.asarray(prepared.problem.states)}
+    problem = prepared.problem
+    known = {"initial": np.asarray(problem.states), "offsets": problem.formation.offsets}
     if gain is not None:
         known |= {"P": gain.P, "R": gain.R, "coupling": np.asarray(gain.coupling)}
     for name in wrt:
@@ -199,7 +205,8 @@ def _differentiate(
 
     def whole(values: dict[str, Any]) -> tuple[jax.Array, Sums]:
         start = jnp.asarray(values.get("initial", states))
-        sums = _sums(_with_gain(loop, values), start, reference, steps)
+        changed = _with_offsets(_with_gain(loop, values), values)
+        sums = _sums(changed, start, reference, steps)
         return cost(sums), sums
 
     return jax.value_and_grad(whole, has_aux=True)(jax.tree.map(jnp.asarray, values))
@@ -216,6 +223,20 @@ def _with_gain(loop: Loop, values: Mapping[str, Any]) -> Loop:
         return [getattr(gain.gain, name) for name in given]
 
     return eqx.tree_at(places, loop, [*given.values()]) if given else loop
+
+
+def _with_offsets(loop: Loop, values: Mapping[str, Any]) -> Loop:
+    """Return the loop with other offsets of the goals."""
+    if "offsets" not in values:
+        return loop
+    offsets, meter = values["offsets"], loop.meter
+    i, j = (offsets[ends][:, np.array(meter.measured)] for ends in meter.edges.T)
+    wanted = distance_of(((i - j) ** 2).sum(axis=1))
+
+    def places(loop: Loop) -> list[Any]:
+        return [loop.offsets, loop.meter.offsets, loop.meter.spacings]
+
+    return eqx.tree_at(places, loop, [offsets, offsets, wanted])
 
 
 def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) -> Sums:

@@ -253,10 +253,14 @@ class Meter(eqx.Module):
 
 def spacing_error(square: jax.Array, wanted: jax.Array) -> jax.Array:
     """Return how far distances, given by their squares, are from those that are wanted, squared."""
-    # A root has no slope at 0, where two agents meet, and one choice alone would still ask it.
+    return (distance_of(square) - wanted) ** 2
+
+
+def distance_of(square: jax.Array) -> jax.Array:
+    """Return the root of a square, with a slope of 1 where two agents meet."""
+    # A root has no slope at 0, and one choice alone would still ask it.
     apart = square > 0.0
-    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
-    return (distance - wanted) ** 2
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
 
 
 def outside(bounded: Any, low: Any, high: Any) -> Any:
