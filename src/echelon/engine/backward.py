@@ -81,7 +81,7 @@ def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
         taped=taped,
         backward=True,
     )
-    return _Pair(compiled(rows, forward), compiled(rows, backward), felt)
+    return _Pair(compiled(rows, forward, {}), compiled(rows, backward, {}), felt)
 
 
 def _onto_tape(body: Body, way: Pulled) -> Body:

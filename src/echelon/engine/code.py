@@ -1,8 +1,9 @@
 """The code that steps loops, made once for those that are alike but for their numbers."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, MutableMapping
 from pathlib import Path
 from typing import NamedTuple, TypeAlias, final
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -63,11 +64,16 @@ def plan_of(
     )
 
 
-def compiled(rows: Rows, plan: Plan) -> Kernel:
-    """Return the code of a plan, and with it what is known of it."""
+def compiled(rows: Rows, plan: Plan, codes: MutableMapping[str, Code]) -> Kernel:
+    """Return the code of a plan, and with it what is known of it.
+
+    `codes` are those that were made, by their texts: other graphs are other numbers in the same.
+    """
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    code = Code(program(plan), Path(cache) if cache else None)
+    text = program(plan)
+    code = codes.get(text) or Code(text, Path(cache) if cache else None)
+    codes[text] = code
     return Kernel(code, rows, plan, len(shared(plan)))
 
 
@@ -82,6 +88,7 @@ class Kernels:
     def __init__(self) -> None:
         """Begin with none."""
         self._made: dict[Hashable, Kernel] = {}
+        self._codes: MutableMapping[str, Code] = WeakValueDictionary()
 
     def of(
         self, own: Own, bits: int, together: bool, lines: bool = False, weighted: bool = False
@@ -91,13 +98,14 @@ class Kernels:
         Raises:
             Unsupported: a law or the model uses what has no scalar operations.
         """
-        # The rows too: those of wind and noise are there only where these are.
-        key = (own.signature, Rows.of(own.loop, own.count), bits, together, lines, weighted)
+        # Of wind and noise too: their rows are there only where these are.
+        wind = jax.tree.structure(own.loop.motion.wind)
+        key = (own.signature, wind, bits, together, lines, weighted)
         if key not in self._made:
             # The oldest goes: a sweep over models has one after the other.
             while len(self._made) >= _KEPT:
                 self._made.pop(next(iter(self._made)))
             rows = Rows.of(own.loop, own.count)
             plan = plan_of(own, rows, bits, together, lines, weighted, False)
-            self._made[key] = compiled(rows, plan)
+            self._made[key] = compiled(rows, plan, self._codes)
         return self._made[key]

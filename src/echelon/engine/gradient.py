@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import MissingExtraError, SimulationError, did_you_mean, listing
+from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.jaxpr import read_by
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.engine.backward import Backward, Wants
-from echelon.engine.laws import Laws, in_words, worth_native
+from echelon.engine.laws import Laws, choose_engine
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
 from echelon.engine.own import Own, bare
 from echelon.engine.parts import Parts
@@ -79,15 +79,13 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
         run = Run(
             loop, values, prepared.problem.states, sample_reference(prepared, 0, settings.steps)
         )
-        if not worth_native(settings, len(run.states), _WORTH):
-            return by_jax(run, settings.steps, cost)
-        try:
-            return natively(run, settings.steps, cost)
-        except (Unsupported, MissingExtraError) as error:
-            if settings.engine == "native":
-                raise SimulationError(f"`engine` is `native`, and {in_words(error)}.") from error
-            told = (f"JAX takes the steps back, since {in_words(error)}.",)
-            return by_jax(run, settings.steps, cost)._replace(warnings=told)
+        return choose_engine(
+            settings,
+            len(run.states),
+            lambda: natively(run, settings.steps, cost),
+            lambda why: by_jax(run, settings.steps, cost, why),
+            _WORTH,
+        )
 
 
 class Run(NamedTuple):
@@ -99,11 +97,12 @@ class Run(NamedTuple):
     reference: Array | None
 
 
-def by_jax(run: Run, steps: int, cost: Cost) -> Gradient:
-    """Return the gradient by JAX's reverse mode over steps of JAX."""
+def by_jax(run: Run, steps: int, cost: Cost, instead: str = "") -> Gradient:
+    """Return the gradient by JAX's reverse mode over steps of JAX, `instead` of native code."""
     (value, sums), slopes = _differentiate(*run, steps, cost)
     found = {name: _symmetric(name, np.asarray(slope)) for name, slope in slopes.items()}
-    return Gradient(float(value), found, jax.tree.map(np.asarray, sums))
+    told = (f"JAX takes the steps back, since {instead}.",) * bool(instead)
+    return Gradient(float(value), found, jax.tree.map(np.asarray, sums), warnings=told)
 
 
 # ---- by native code ------------------------------------------------------------------------------

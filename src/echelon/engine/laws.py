@@ -1,6 +1,7 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
-from typing import TYPE_CHECKING, final
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, TypeVar, final
 
 import jax
 
@@ -94,13 +95,18 @@ class Laws(Drive):
         Raises:
             LawError: one is refused.
         """
-        graph = problem.graph
+        refused = self.refusals(problem.model, problem.graph, problem.states[None])
+        for _, agent, text in refused:
+            raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")
+
+    def refusals(
+        self, model: ControlAffine, graph: Graph, states: Array
+    ) -> Iterator[tuple[int, int, str]]:
+        """Yield which of many starts (K, N, n) a law cannot take: which, the agent, and why."""
         for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
-            refused = law.refusals(problem.model, problem.states[list(agents)])
-            for place, text in refused:
-                raise LawError(
-                    f"agent {agents[place]} starts where its law has no meaning: {text}."
-                )
+            starts = states[:, list(agents)].reshape(-1, states.shape[2])
+            for place, text in law.refusals(model, starts):
+                yield place // len(agents), agents[place % len(agents)], text
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and what of the reference the leaders cannot do."""
@@ -139,19 +145,49 @@ class Laws(Drive):
             SimulationError: native code is asked for, and cannot be made.
         """
         loop, settings = assemble(problem, self.leader, self.follower), problem.settings
-        by_jax = JaxStepper(loop, problem.states, devices=settings.devices)
-        if not worth_native(settings, len(problem.states)):
-            return by_jax
-        try:
-            return NativeStepper([loop], problem.states, int(settings.precision[5:]), by_jax)
-        except (Unsupported, MissingExtraError) as error:
-            if settings.engine == "native":
-                raise SimulationError(f"`engine` is `native`, and {in_words(error)}.") from error
-            return JaxStepper(loop, problem.states, in_words(error))
+        states, devices = problem.states, settings.devices
+
+        def native() -> Stepper:
+            bits = int(settings.precision[5:])
+            return NativeStepper([loop], states, bits, JaxStepper(loop, states))
+
+        return choose_engine(
+            settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
+        )
 
 
 _WORTH = 100_000
 """Steps of one agent from which on native code saves more than the second that it takes to make."""
+_Made = TypeVar("_Made")
+
+
+def choose_engine(
+    settings: Settings,
+    agents: int,
+    native: Callable[[], _Made],
+    by_jax: Callable[[str], _Made],
+    least: int = _WORTH,
+) -> _Made:
+    """Return what one of the engines makes for so many agents.
+
+    Args:
+        settings: of the run.
+        agents: how many.
+        native: makes it by native code.
+        by_jax: takes why there is none, in words; empty where none is wanted.
+        least: from how many steps of one agent on native code pays.
+
+    Raises:
+        SimulationError: native code is asked for, and cannot be made.
+    """
+    if not worth_native(settings, agents, least):
+        return by_jax("")
+    try:
+        return native()
+    except (Unsupported, MissingExtraError) as error:
+        if settings.engine == "native":
+            raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
+        return by_jax(_in_words(error))
 
 
 def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
@@ -161,13 +197,17 @@ def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1:
+    if settings.devices > 1 or not is_long(settings, agents, least):
         return False
-    long = settings.steps * agents >= least
-    return long and is_installed() and jax.default_backend() == "cpu"
+    return is_installed() and jax.default_backend() == "cpu"
 
 
-def in_words(error: EchelonError) -> str:
+def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+    """Tell whether it pays to compile something else than the steps of a run alone."""
+    return settings.engine == "native" or settings.steps * agents >= least
+
+
+def _in_words(error: EchelonError) -> str:
     """Return why there is no native code."""
     if isinstance(error, Unsupported):
         return f"there is no native code for {error}"
