@@ -214,8 +214,8 @@ class Backward:
         rows[:, felt.errors] = slopes.errors.T
         rows[:, felt.effort] = slopes.effort[:, None]
         rows[:, felt.spacing] = slopes.spacing[0]
-        rows[np.ix_(loop.leaders, felt.tracking)] = slopes.tracking.T
-        rows[np.ix_(loop.leaders, felt.outputs)] = slopes.outputs
+        rows[loop.leaders, felt.tracking.start : felt.tracking.stop] = slopes.tracking.T
+        rows[loop.leaders, felt.outputs.start : felt.outputs.stop] = slopes.outputs
         once = places.of[places.agents] == np.arange(len(places.agents))
         shaped = (rows[places.agents] * once[:, None]).reshape(places.blocks, places.lanes, -1)
         self.felt[:] = shaped.transpose(0, 2, 1)
