@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.code import LANES, Kernels, follows
+from echelon.engine.code import LANES, Kernels, Make, follows
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
@@ -17,18 +17,16 @@ from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.scalars import memories_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
+from echelon.engine.winds import draw_holds, holds_at_once
 from echelon.kernels import aligned, needed, stride
-from echelon.world.disturbance import draw
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some hundredths of a second."""
 _OPERATIONS, _ENOUGH = {64: 2e10, 32: 4e10}, 1_000
 """Of a chunk with no more steps than enough: about a second of one thread."""
-_AHEAD, _AT_ONCE = 64, 50_000
-"""Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-_STEPS, _TURNS, _KEPT = 2_048, 200_000, 10_000_000
+STEPS, _TURNS, _KEPT = 2_048, 200_000, 10_000_000
 """Of a call: what all agents have in common is kept for each of them, and each level has a turn.
 
 And the numbers of leaders ahead that are kept.
@@ -51,10 +49,11 @@ class NativeStepper(Stepper):
         far: what goes on where a state is beyond the range of the kernels' sines; None where the
             caller looks.
         pool: threads that step formations; None for the caller's alone.
-        kernels: those that were made before.
+        make: makes the kernel, or has made it before.
         unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
             weights of edges anyway; None where nothing is turned.
         threads: that share the steps of one formation; by its size when left out.
+        places: of the agents, where they are known.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -67,9 +66,10 @@ class NativeStepper(Stepper):
         bits: int,
         far: Stepper | None,
         pool: Executor | None = None,
-        kernels: Kernels | None = None,
+        make: Make | None = None,
         unlike: Loop | None = None,
         threads: int | None = None,
+        places: Places | None = None,
     ) -> None:
         """Write and compile the step."""
         self.own = Own(loops, unlike)
@@ -77,21 +77,23 @@ class NativeStepper(Stepper):
         self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
-        self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
+        known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
+        self.places: Places = known
         self.crew = Crew(self.places, pool, threads)
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
         lines, turned = self.places.lines, unlike is not None
-        made = (kernels or Kernels()).of(self.own, bits, together, lines, turned)
+        made = (make or Kernels().of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
         self._drawn, self._left = -1, -1
-        self._ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
+        self._tape: Array | None = None
+        self._ahead = holds_at_once(len(states))
 
     # ---- memory ----
 
@@ -183,6 +185,10 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._held = None
 
+    def record(self, tape: Array | None, first: int) -> None:
+        """Keep what derivatives need of the steps from one on: (steps, blocks, taped, lanes)."""
+        self._tape, self._taped_from = tape, first
+
     def _fly(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         first = int(now.step)
@@ -228,7 +234,7 @@ class NativeStepper(Stepper):
             each = self.plan.mirror + self.plan.told * self.plan.lanes
             most = min(most, _KEPT // (self.led * each))
         while steps:
-            count = min(steps, _STEPS, max(1, most), self._switch(step))
+            count = min(steps, STEPS, max(1, most), self._switch(step))
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
@@ -248,11 +254,7 @@ class NativeStepper(Stepper):
             return
         first, at = number - number % self._ahead, number % self._ahead
         if first != self._drawn - self._drawn % self._ahead or self._drawn < 0:
-            # What is beyond the end of the run may wrap: nobody asks for it.
-            steps = ((first + np.arange(self._ahead)) * hold).astype(np.int32)
-            agents = np.arange(len(self.loop.offsets))
-            drawn = _drawn([loop.motion.wind for loop in self.loops], steps, agents)
-            self._winds = [part if part is None else np.asarray(part) for part in drawn]
+            self._winds = draw_holds(self.loops, first + np.arange(self._ahead), hold)
         self._drawn = number
         for rows, part in zip((self.rows.push, self.rows.noise), self._winds, strict=True):
             if part is not None:
@@ -270,6 +272,9 @@ class NativeStepper(Stepper):
         values |= {"first_step": step, "steps": steps, "shown": shown, "led_blocks": self.led}
         values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
         values |= {"line": places.line, "first_steady": int(self.loop.meter.first_steady)}
+        if self._tape is not None:
+            now = self._tape[step - self._taped_from]
+            values |= {"tape": now.ctypes.data, "tape_step": now.size}
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
         firsts["edges"] = self.edges
         common = np.empty(steps * self.common, self.dtype)
@@ -390,11 +395,3 @@ class NativeStepper(Stepper):
 def _whole(parted: Array) -> Array:
     """Return sums of all steps and of the steady window (2, N) from those before it and in it."""
     return np.stack([parted.sum(axis=1), parted[:, 1]])
-
-
-@jax.jit
-def _drawn(winds: Sequence[Any], steps: jax.Array, agents: jax.Array) -> Any:
-    """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
-    many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
-    one = jax.vmap(draw, (None, None, 0))
-    return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)

@@ -12,6 +12,7 @@ from echelon.core.types import Array
 from echelon.engine.loop import Loop
 from echelon.engine.turns import Near
 from echelon.kernels import aligned, stride
+from echelon.network.exchange import Exchange
 
 
 class Found(NamedTuple):
@@ -164,7 +165,7 @@ def _first(agents: Array) -> Array:
     return np.unique(agents, return_index=True)[1]
 
 
-def _senders(loop: Loop) -> Array:
+def senders_of(loop: Loop) -> Array:
     """Return who tells each agent what it is told, (N,)."""
     if loop.parents is None:
         return np.asarray(loop.meter.nearest)
@@ -202,17 +203,8 @@ class Swarm(Places):
         self.of = _first(self.agents)
         self.heard = heard(loop, self)
         starts, positions, _ = self.heard
-        slots = _follow(positions) & (positions[:, 0] >= self.segments[1] * lanes)
-        self.smooth = self._all(starts, slots)
-        # A number that is gathered lane by lane costs some times what one of a line does.
-        self.lines = bool(self.smooth.mean() > _MOSTLY)
-        if not self.lines:
-            self.smooth = self._all(starts, (positions >= self.segments[1] * lanes).all(axis=1))
-
-    def _all(self, starts: Array, slots: Array) -> Array:
-        """Return of which blocks something is true in all slots."""
-        block = np.repeat(np.arange(self.blocks), np.diff(starts))
-        return np.bincount(block, ~slots, self.blocks) == 0
+        led = int(self.segments[1]) * lanes
+        self.smooth, self.lines = smooth_blocks(starts, positions, led)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
@@ -221,7 +213,7 @@ class Swarm(Places):
         starts, positions, weights = self.heard
         heavy = aligned(weights.shape, dtype)
         heavy[:] = weights
-        held = self.of[_senders(loop)[self.agents]]
+        held = self.of[senders_of(loop)[self.agents]]
         nearest = np.asarray(loop.meter.nearest)[self.agents]
         return Found(
             starts,
@@ -291,7 +283,7 @@ class Formations(Places):
             starts,
             (positions * far).astype(np.int32),
             heavy,
-            (of[_senders(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
+            (of[senders_of(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
             (of[np.asarray(loop.meter.nearest)[self.alone.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
@@ -321,19 +313,39 @@ class Formations(Places):
         return each[: len(self.loops)].reshape(-1)
 
 
+def smooth_blocks(starts: Array, positions: Array, led: int = 0) -> tuple[Array, bool]:
+    """Return whose neighbours follow each other, slot by slot, and whether lines pay for it.
+
+    Where they do not, it is whose neighbours are none of the leaders, of so many positions.
+    """
+    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+
+    def all_(slots: Array) -> Array:
+        return np.bincount(block, ~slots, len(starts) - 1) == 0
+
+    smooth = all_(np.logical_and(_follow(positions), positions[:, 0] >= led))
+    # A number that is gathered lane by lane costs some times what one of a line does.
+    lines = bool(smooth.mean() > _MOSTLY)
+    return (smooth if lines else all_(np.asarray((positions >= led).all(axis=1)))), lines
+
+
 def _follow(positions: Array) -> Array:
     """Return which of some lists of positions (..., lanes) are each one more than the last."""
     return (np.diff(positions, axis=-1) == 1).all(axis=-1)
 
 
-def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
+def heard(
+    loop: Loop, places: Places, exchange: Exchange | None = None
+) -> tuple[Array, Array, Array]:
     """Return whom each agent hears, slot by slot: the k-th neighbour of each of a block.
+
+    It is by the loop's edges, or by others where they are given.
 
     Returns:
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, agents = loop.exchange, places.agents.reshape(-1, places.lanes)
+    exchange, agents = exchange or loop.exchange, places.agents.reshape(-1, places.lanes)
     order = np.argsort(np.asarray(exchange.receivers), kind="stable")
     senders = np.asarray(exchange.senders)[order]
     weights = np.atleast_2d(np.asarray(exchange.weights))[:, order]

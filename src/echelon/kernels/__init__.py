@@ -1,5 +1,6 @@
 """Code for this machine: from a trace to scalars, to vectors, to the loops about them."""
 
+from echelon.kernels.adjoint import fed_widths, from_tape
 from echelon.kernels.common import shared
 from echelon.kernels.drivers import program
 from echelon.kernels.entries import Unsupported, nodes
@@ -19,6 +20,8 @@ __all__ = [
     "Plan",
     "Unsupported",
     "aligned",
+    "fed_widths",
+    "from_tape",
     "is_installed",
     "lower",
     "needed",

@@ -11,6 +11,7 @@ next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.kernels.adjoint import record, taken, tape_at, tape_of
 from echelon.kernels.arms import choices
 from echelon.kernels.common import apart, shared
 from echelon.kernels.frame import (
@@ -131,7 +132,11 @@ def _turns(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
 def _around(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
     """Write where a step finds what changes from step to step."""
     step = w.put(f"add i64 {slots['first_step']}, {passed}")
-    odd = w.put(f"trunc i64 {passed} to i1")
+    turned = passed
+    if plan.backward:
+        last = w.put(f"sub i64 {slots['steps']}, 1")
+        turned = w.put(f"sub i64 {last}, {passed}")
+    odd = w.put(f"trunc i64 {turned} to i1")
     now, later = (
         w.put(f"select i1 {odd}, ptr {slots[a]}, ptr {slots[b]}")
         for a, b in (("next_mirror", "mirror"), ("mirror", "next_mirror"))
@@ -139,7 +144,8 @@ def _around(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: 
     shown = w.put(f"icmp eq i64 {step}, {slots['shown']}")
     shown = w.put(f"zext i1 {shown} to i64")
     common = _part(w, slots["common"], passed, str(numbers))
-    around = Context(plan, slots | {"shown": shown}, now, later, step, "", common)
+    tape = tape_at(w, slots, passed) if plan.taped else ""
+    around = Context(plan, slots | {"shown": shown}, now, later, step, "", common, tape=tape)
     if not plan.ahead:
         return around
     blocks, each = slots["led_blocks"], plan.told * plan.lanes
@@ -188,10 +194,13 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
         return load_row(w, base, leaf.value[1], plan.lanes)
 
     z = exchange(w, around, complete, block, heard, row) if heard else {}
+    fed = taken(w, around, complete, block)
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        return z[rest[0]] if kind == "z" else _load(w, around, block, base, kind, rest)
+        if kind in ("z", "fed"):
+            return (z if kind == "z" else fed)[rest[0]]
+        return _load(w, around, block, base, kind, rest)
 
     usually = usual(all_, [*choices(body.results()), *_news(body)])
     done, otherwise = w.fresh("done"), w.fresh("otherwise")
@@ -232,6 +241,8 @@ def _load(w: Writer, around: Context, block: str, base: str, kind: str, rest: Se
         if plan.ahead:
             start, row = around.told, rest[0]
         return _look_up(w, around, "sources", start, row, block, plan.one_source)
+    if kind == "tape":
+        return load_row(w, tape_of(w, around, block), rest[0], plan.lanes)
     if kind == "leader":
         return _look_up(w, around, "leaders", around.mirror, rest[0], block, plan.one_leader)
     return _same_for_all(w, around, kind, rest)
@@ -241,6 +252,7 @@ def _write(w: Writer, around: Context, body: Body, emitter: Emitter, base: str, 
     """Write what a body leaves: in the rows of its block, and for its neighbours."""
     _write_rows(w, around, body, emitter, base)
     write_mirror(w, around, [emitter.value(node) for node in body.mirror], block)
+    record(w, around, body, emitter, block)
 
 
 def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: str) -> None:

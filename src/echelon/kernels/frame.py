@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from echelon.kernels.scalar import Node, needed
@@ -14,8 +15,9 @@ NO_NEWS = 2**31 - 1
 class Body(NamedTuple):
     """What some of the agents do in a step; the same code for all of them.
 
-    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), or, the
-    same for all, ("time",), ("step",), ("steady",), ("table", c).
+    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), on the way
+    back ("tape", r) and ("fed", k), or, the same for all, ("time",), ("step",), ("steady",),
+    ("table", c).
 
     Attributes:
         stores: row -> what it becomes.
@@ -27,6 +29,10 @@ class Body(NamedTuple):
         mirror: what they read after it.
         difference: of what stands in the leaves `own` and `their`, entry by entry; z_k is the
             weighted sum of entry k over the neighbours.
+        tape: row of the tape -> what is kept there of each step, where it is asked for.
+        totals: place -> what is added up there over all agents and steps.
+        to_sources: what is added to the `fed` of who told an agent what it was told, from 0 on.
+        to_leaders: what is added to the `fed` of its leader, behind that.
     """
 
     stores: dict[int, Node]
@@ -37,11 +43,17 @@ class Body(NamedTuple):
     now: Sequence[Node]
     mirror: Sequence[Node]
     difference: Sequence[Node]
+    tape: Mapping[int, Node] = MappingProxyType({})
+    totals: Mapping[int, Node] = MappingProxyType({})
+    to_sources: Sequence[Node] = ()
+    to_leaders: Sequence[Node] = ()
 
     def results(self) -> list[Node]:
         """Return all that is written."""
         rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
-        return [*(node for row in rows for node in row.values()), *self.mirror]
+        listed = (*self.mirror, *self.to_sources, *self.to_leaders)
+        kept = (*self.tape.values(), *self.totals.values())
+        return [*(node for row in rows for node in row.values()), *listed, *kept]
 
     def all(self) -> list[Node]:
         """Return all that is written, and what of it is made of what neighbours read."""
@@ -55,7 +67,7 @@ class Body(NamedTuple):
     def become(self, made: Mapping[Node, Node]) -> "Body":
         """Return the body whose nodes have become others, where they have."""
 
-        def rows(of: dict[int, Node]) -> dict[int, Node]:
+        def rows(of: Mapping[int, Node]) -> dict[int, Node]:
             return {row: made.get(node, node) for row, node in of.items()}
 
         def listed(of: Sequence[Node]) -> list[Node]:
@@ -70,6 +82,10 @@ class Body(NamedTuple):
             now=listed(self.now),
             mirror=listed(self.mirror),
             difference=listed(self.difference),
+            tape=rows(self.tape),
+            totals=rows(self.totals),
+            to_sources=listed(self.to_sources),
+            to_leaders=listed(self.to_leaders),
         )
 
 
@@ -98,6 +114,9 @@ class Plan(NamedTuple):
         dt: s.
         ahead: whether the leaders may take many steps before the others take the first, since they
             hear nobody: what they show and tell is kept of each step.
+        taped: rows that the tape has of a block at each step.
+        backward: whether the steps are taken from the last to the first, the followers before the
+            leaders, the deepest level first: for derivatives.
     """
 
     bits: int
@@ -117,6 +136,8 @@ class Plan(NamedTuple):
     table: int
     dt: float
     ahead: bool = False
+    taped: int = 0
+    backward: bool = False
 
     @property
     def mirror(self) -> int:
@@ -145,6 +166,9 @@ SLOTS = (
     "told",
     "done",
     "rest",
+    "tape",
+    "totals",
+    "fed",
     "first_step",
     "steps",
     "count",
@@ -157,8 +181,9 @@ SLOTS = (
     "led_blocks",
     "threads",
     "thread",
+    "tape_step",
 )
-"""What a kernel is called with: 19 addresses and 12 whole numbers of 64 bits.
+"""What a kernel is called with: 22 addresses and 13 whole numbers of 64 bits.
 
 Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
 those of the first of some groups, which have so many `blocks` and `edge_blocks` each. A swarm is
@@ -172,10 +197,13 @@ each step. Inputs are stored of the step `shown`.
 it a thread waits for the others: until each before it has done as many turns as `before` says, and
 each behind it as many as `after`. `done` counts the turns of each, a line of memory apart, and
 `rest` is a function that leaves the processor to others.
+
+`tape` is 0 where none is kept, and `tape_step` how many numbers lie between its steps; `totals` has
+a vector for each, and `fed` what was added for each agent.
 """
 TURN = ("passed", "level", "start", "end", "first_edge", "last_edge", "before", "after")
 """Of a turn: the steps before it in this call, the level, and where its blocks begin and end."""
-ADDRESSES = 19
+ADDRESSES = 22
 
 
 def stride(width: int, lanes: int) -> int:
@@ -196,6 +224,7 @@ class Context(NamedTuple):
     ahead: str = ""
     told: str = ""
     led: str = ""
+    tape: str = ""
 
 
 @contextlib.contextmanager
