@@ -219,7 +219,7 @@ class Graph:
             GraphError: the graph switches.
         """
         edges, weights = outward_edges(self)
-        return Graph(edges, self.leaders, self.agents, True, weights)
+        return Graph(edges, self.leaders, self.agents, True, weights.tolist())
 
     def adjacency(self) -> sp.csr_array:
         """Return the adjacency matrix (N, N), sparse: A_ij weighs what i hears of j.
