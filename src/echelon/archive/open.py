@@ -1,5 +1,6 @@
 """A run's folder, read again: the recording of its `run.nc`, or of what was computed of it."""
 
+import json
 from pathlib import Path
 
 from echelon.archive.chunks import Chunks
@@ -54,5 +55,18 @@ def promise_file(place: PathLike) -> Path:
     if (path / GAIN).is_file() or not (path / SUMMARY).is_file():
         return path / GAIN
     if read_tube(path / SUMMARY) is None:
+        _check_json(path / SUMMARY)
         raise OutputError(f"the law of `{path}` left neither a gain nor a tube to verify.")
     return path / SUMMARY
+
+
+def _check_json(file: Path) -> None:
+    """Check that a file is whole.
+
+    Raises:
+        OutputError: it is not.
+    """
+    try:
+        json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"`{file}` cannot be read, or is damaged: {error}.") from error

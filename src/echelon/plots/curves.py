@@ -256,6 +256,7 @@ def distances(run: Recording) -> "Figure | None":
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.linalg.norm(places[keep][:, i] - places[keep][:, j], axis=2)
         wanted = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
+    apart[~np.stack([run.linked(t) for t in run.times[keep]])] = np.nan
     figure, (linked, nearest) = _panels(run, 2, 1.9)
     _edges(linked, run, run.times[keep], apart, wanted)
     linked.set_ylabel(draw.label("between linked", "m"))

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 _NUMBERED = 60
 """With more agents than this, numbers would cover each other."""
+_STRETCHES = 6
+"""Of a graph that switches, drawn beside each other."""
 
 
 def modes(run: Recording) -> "Figure | None":
@@ -93,19 +95,43 @@ def _label_bar(bar: Any, values: Array) -> None:
 def network(run: Recording) -> "Figure":
     """Return who hears whom: agents where the formation puts them, or around a circle.
 
-    An arrow goes to who hears: in directed graphs, and from leaders; a line without one is heard
-    both ways.
+    An arrow goes to who hears; a line without one is heard both ways, a dotted one by nobody. A
+    graph that switches has a panel for each stretch of time, six at most.
     """
     from matplotlib.figure import Figure
 
     places, units = _places(run)
     size = np.ptp(places, axis=0)
-    width = draw.page().width * (1.0 if draw.page().narrow else 0.75)
+    stretches = _stretches(run)
+    columns = min(len(stretches), 2 if draw.page().narrow else 3)
+    rows = -(-len(stretches) // columns)
+    width = draw.page().width * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
     tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
-    figure = Figure((width, 0.75 + 0.85 * width * tall), layout="constrained")
-    ax = figure.add_subplot()
-    small = draw.crowding(run.agents) ** 0.3
-    _links(ax, run, places, small)
+    height = rows * (0.75 + 0.85 * width / columns * tall)
+    figure = Figure((width, height), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, (title, weights) in zip(panels, stretches, strict=False):
+        _agents_and_links(ax, run, places, weights, columns)
+        _finish_network(ax, places, units)
+        ax.set_title(title, size=draw.page().letters)
+    for ax in panels[len(stretches) :]:
+        ax.axis("off")
+    return figure
+
+
+def _stretches(run: Recording) -> list[tuple[str, Array]]:
+    """Return the weights (E,) of each stretch of time, with when that is."""
+    if run.schedule is None:
+        return [("", run.weights)]
+    spans = list(run.schedule.spans())[:_STRETCHES]
+    if len(run.schedule.starts) > _STRETCHES:
+        spans[-1] += f", of {len(run.schedule.starts)} stretches"
+    return list(zip(spans, run.schedule.weights, strict=False))
+
+
+def _agents_and_links(ax: Any, run: Recording, places: Array, weights: Array, columns: int) -> None:
+    small = draw.crowding(run.agents) ** 0.3 / columns**0.4
+    _links(ax, run, places, weights, small)
     for agent in range(run.agents):
         leads = agent in run.leaders
         look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
@@ -113,8 +139,6 @@ def network(run: Recording) -> "Figure":
     for agent in range(run.agents if run.agents <= _NUMBERED else 0):
         text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
         ax.annotate(str(agent), places[agent], ha="center", va="center", **text)
-    _finish_network(ax, places, units)
-    return figure
 
 
 def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
@@ -131,22 +155,33 @@ def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
     return np.column_stack([np.sin(turn), np.cos(turn)]), ()
 
 
-def _links(ax: Any, run: Recording, places: Array, small: float) -> None:
+def _links(ax: Any, run: Recording, places: Array, weights: Array, small: float) -> None:
     """Draw the edges, thicker where they weigh more."""
-    from matplotlib.collections import LineCollection
+    from matplotlib.collections import LineCollection, PolyCollection
 
-    heavy = np.sqrt(run.weights / run.weights.max())
-    wide = np.clip(1.6 * heavy, 0.3, 1.6) * small
-    pairs = places[run.edges]
-    ax.add_collection(LineCollection(list(pairs), linewidths=wide, colors="0.55", zorder=1))
-    leads = {*run.leaders}
-    if run.agents > _NUMBERED or (run.mutual and not run.directed):
+    wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
+    there, unheard = weights > 0.0, ~run.heard.any(axis=1)
+    for kept, dash in ((there & ~unheard, "-"), (there & unheard, (0, (1.0, 2.0)))):
+        lines = list(places[run.edges[kept]])
+        look = {"linewidths": wide[kept], "colors": "0.55", "linestyles": [dash], "zorder": 1}
+        ax.add_collection(LineCollection(lines, **look))
+    one = run.heard.sum(axis=1) == 1
+    arrows, pens = run.arrows[there[one]], wide[one & there]
+    if run.agents > _NUMBERED:
+        heads = PolyCollection(_heads(places[arrows]), facecolors="0.35", zorder=2)
+        ax.add_collection(heads)
         return
-    for (i, j), line in zip(run.edges, wide, strict=True):
-        first, second = (i, j) if i in leads or run.directed else (j, i)
-        if run.directed or (first in leads and second not in leads):
-            arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0}
-            ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+    for (first, second), line in zip(arrows, pens, strict=True):
+        arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0 * small}
+        ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+
+
+def _heads(ends: Array) -> list[Array]:
+    """Return triangles on the way between ends (K, 2, 2), a little nearer to the second."""
+    way = ends[:, 1] - ends[:, 0]
+    aside = np.stack([-way[:, 1], way[:, 0]], axis=1)
+    tip, back = ends[:, 0] + 0.72 * way, ends[:, 0] + 0.5 * way
+    return list(np.stack([tip, back + 0.1 * aside, back - 0.1 * aside], axis=1))
 
 
 def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:

@@ -95,6 +95,7 @@ def _graph(ax: Any, run: Recording, places: Array, times: Array) -> None:
     # NaN lifts the pen, so that all edges of a time are one line and not thousands.
     gaps = np.full_like(ends[:, :, :1], np.nan)
     links = np.concatenate([ends, gaps], axis=2)
+    links[~np.stack([run.linked(t) for t in times])] = np.nan
     text = "graph" if len(times) < 3 else f"graph, every {times[1] - times[0]:.3g} s"
     crowd = draw.crowding(run.agents)
     look = {"linewidth": 0.9 * crowd**0.18, "rasterized": run.agents > 100, "zorder": 3}

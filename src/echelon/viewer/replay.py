@@ -117,7 +117,8 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "leaders": list(run.leaders),
         "nearest": run.nearest.tolist(),
         "edges": run.edges.tolist(),
-        "mutual": run.mutual,
+        "heard": heard_by(run.heard),
+        "schedule": _schedule(run),
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
         "space": {
             "kind": space.kind,
@@ -132,6 +133,20 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "thrust": False,
         "duration": float(run.times[-1]) if len(run.times) else run.horizon,
     }
+
+
+def heard_by(heard: Array) -> list[int]:
+    """Return who hears along each edge: 1 its second end, 2 its first, 3 both, 0 nobody."""
+    return (heard @ (2, 1)).tolist()
+
+
+def _schedule(run: Recording) -> dict[str, Any] | None:
+    """Return when which edges are there, each stretch as a text of 1 and 0."""
+    if run.schedule is None:
+        return None
+    starts, weights, period = run.schedule
+    rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
+    return {"starts": starts.tolist(), "rows": rows, "period": period}
 
 
 def facts(run: Recording) -> list[str]:
