@@ -131,11 +131,11 @@ def test_arrows_go_to_who_hears_and_a_graph_that_switches_has_the_links_of_the_t
         assert heard == [[], [], [1, 3], [2]]
         # The head of the arrow from 1 to 2 is wide where its line is not.
         first, second = (np.array(page.evaluate(f"echelon.whereOnScreen({k})")) for k in (1, 2))
-        way = (second - first) / np.linalg.norm(second - first)
-        aside = 3.5 * np.array([-way[1], way[0]])
-        near = [darkest(page, *(second - back * way + aside), 1) for back in range(10, 50, 2)]
-        far = [darkest(page, *(first + along * way + aside), 1) for along in range(30, 60, 4)]
-        assert min(near) < 140 and min(far) > 140
+        way = second - first
+        aside = 4.0 * np.array([-way[1], way[0]]) / np.linalg.norm(way)
+        parts = {k: darkest(page, *(first + k * way + aside), 1) for k in np.arange(0.4, 0.9, 0.04)}
+        assert min(x for k, x in parts.items() if k > 0.55) < 140
+        assert all(x > 140 for k, x in parts.items() if k < 0.5)
 
 
 def darkest(page, x, y, reach=4):

@@ -174,7 +174,12 @@ def drop_runaways(values: Array, *anchors: Array) -> tuple[Array, bool]:
 def label(name: str, unit: str) -> str:
     """Return the text of an axis: the name, with the unit where there is one."""
     name = name.replace("_", " ")
-    return f"{name} ({unit})" if unit else name
+    return f"{name} ({raised(unit)})" if unit else name
+
+
+def raised(unit: str) -> str:
+    """Return a unit with its powers as print has them, m/s\u00b2 for m/s^2."""
+    return unit.replace("^2", "\u00b2").replace("^3", "\u00b3")
 
 
 def panels(times: Array, horizon: float, rows: int, height: float) -> "tuple[Figure, list[Any]]":

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.plots.style import FLOOR
+from echelon.plots import style as draw
 from echelon.results.metrics import SETTLED
 from echelon.results.recording import Recording
 from echelon.viewer.pack import Group
@@ -31,7 +31,12 @@ class _Sheet:
         self.columns: list[Array] = []
 
     def line(
-        self, name: str | None, values: Array, colour: int | str, log: bool, floor: float = FLOOR
+        self,
+        name: str | None,
+        values: Array,
+        colour: int | str,
+        log: bool,
+        floor: float = draw.FLOOR,
     ) -> dict[str, Any]:
         shown = np.asarray(values, np.float64)[self.keep]
         if log:
@@ -92,7 +97,7 @@ def _lyapunov(run: Recording, sheet: _Sheet) -> list[dict[str, Any]]:
     if run.lyapunov is None:
         return []
     # V is a square, and so is what is its rounding.
-    lines = [sheet.line("V", run.lyapunov, 0, True, FLOOR**2)]
+    lines = [sheet.line("V", run.lyapunov, 0, True, draw.FLOOR**2)]
     lines += _slope(run, float(run.lyapunov[0]), 2.0)
     return [_chart("Lyapunov function V", "", True, lines, [])]
 
@@ -115,12 +120,14 @@ def _inputs(run: Recording, sheet: _Sheet) -> dict[str, Any]:
         sheet.line(_named(run, k, len(units) > 1), sizes[:, k], place, False)
         for place, k in enumerate(range(min(NAMED, sizes.shape[1])))
     ]
-    return _chart("largest |input|", units.pop() if len(units) == 1 else "", False, lines, [])
+    return _chart(
+        "largest |input|", draw.raised(units.pop()) if len(units) == 1 else "", False, lines, []
+    )
 
 
 def _named(run: Recording, k: int, mixed: bool) -> str:
     name, unit = run.input_names[k].replace("_", " "), run.input_units[k]
-    return f"{name} ({unit})" if mixed and unit else name
+    return draw.label(name, unit) if mixed else name
 
 
 def _chart(

@@ -8,6 +8,7 @@ import numpy as np
 from echelon.core.errors import OutputError
 from echelon.core.types import Array
 from echelon.plots.space import Space, body_width, clipped_places, space_of
+from echelon.plots.style import raised
 from echelon.results.recording import Recording
 from echelon.viewer.charts import charts_of
 from echelon.viewer.pack import BYTE, COARSE, Group, pack
@@ -123,7 +124,7 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "space": {
             "kind": space.kind,
             "names": list(space.names),
-            "units": list(space.units),
+            "units": [raised(unit) for unit in space.units],
             "stretch": list(space.stretch),
         },
         "box": {"low": space.low.tolist(), "high": space.high.tolist()},
