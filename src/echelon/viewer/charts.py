@@ -6,6 +6,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.plots import style as draw
+from echelon.plots.style import FLOOR
 from echelon.results.metrics import SETTLED
 from echelon.results.recording import Recording
 from echelon.viewer.pack import Group
@@ -36,7 +37,7 @@ class _Sheet:
         values: Array,
         colour: int | str,
         log: bool,
-        floor: float = draw.FLOOR,
+        floor: float = FLOOR,
     ) -> dict[str, Any]:
         shown = np.asarray(values, np.float64)[self.keep]
         if log:
@@ -97,7 +98,7 @@ def _lyapunov(run: Recording, sheet: _Sheet) -> list[dict[str, Any]]:
     if run.lyapunov is None:
         return []
     # V is a square, and so is what is its rounding.
-    lines = [sheet.line("V", run.lyapunov, 0, True, draw.FLOOR**2)]
+    lines = [sheet.line("V", run.lyapunov, 0, True, FLOOR**2)]
     lines += _slope(run, float(run.lyapunov[0]), 2.0)
     return [_chart("Lyapunov function V", "", True, lines, [])]
 
