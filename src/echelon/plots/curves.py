@@ -77,7 +77,7 @@ def formation(run: Recording) -> "Figure":
     return draw.finish(figure)
 
 
-def _bands(ax: Any, times: Array, values: Array) -> None:
+def _bands(ax: Any, times: Array, values: Array, of: str = "follower") -> None:
     """Draw where nine in ten and half of a flock are, (T, N), and the median."""
     with np.errstate(invalid="ignore"):
         # Where all agree to the bit there is nothing to draw, and nothing to warn of.
@@ -87,7 +87,7 @@ def _bands(ax: Any, times: Array, values: Array) -> None:
     look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
     ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 % of them", **look)
     ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)
-    draw.plot(ax, times, ends[2], label="median follower", color=draw.COLOURS[0])
+    draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
 
 
 def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) -> None:
@@ -258,8 +258,8 @@ def distances(run: Recording) -> "Figure | None":
         wanted = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
     apart[~np.stack([run.linked(t) for t in run.times[keep]])] = np.nan
     figure, (linked, nearest) = _panels(run, 2, 1.9)
-    _edges(linked, run, run.times[keep], apart, wanted)
     linked.set_ylabel(draw.label("between linked", "m"))
+    _edges(linked, run, run.times[keep], apart, wanted)
     few = draw.thin(len(run.times), run.agents)
     draw.plot(nearest, run.times[few], _least(places[few]), color=draw.LEADER, label="any two")
     nearest.set_ylabel(draw.label("least distance", "m"))
@@ -271,8 +271,8 @@ def _edges(ax: Any, run: Recording, times: Array, apart: Array, wanted: Array) -
     """Draw the distance of each edge, or of many how far they are off."""
     if len(run.edges) > draw.NAMED:
         off = np.abs(apart - wanted)
-        _bands(ax, times, draw.above_zero(off))
-        ax.set_ylabel("off the wanted (m)")
+        _bands(ax, times, draw.above_zero(off), "link")
+        ax.set_ylabel("links off wanted (m)")
         draw.logarithmic(ax, off)
         return
     for place, (i, j) in enumerate(run.edges):

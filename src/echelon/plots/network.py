@@ -47,29 +47,39 @@ def poles(found: Modes) -> "Figure":
     ax.set_xlabel("real part (1/s)")
     ax.set_ylabel("imaginary part (rad/s)")
     _name_slowest(ax, slowest)
-    bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
-    bar.set_label("eigenvalue \u03bb of the graph")
-    _label_bar(bar, values)
+    # One eigenvalue has no scale.
+    if len(np.unique(values)) > 1:
+        bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
+        bar.set_label("eigenvalue \u03bb of the graph")
+        _label_bar(bar, values)
     return figure
 
 
 def _name_slowest(ax: Any, slowest: float) -> None:
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
     near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
-    look = {"va": "top", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
-    ax.annotate(f"slowest: {slowest:.3g} 1/s", (slowest, 1.0), (4, -4), **look, **near)
+    look = {"va": "bottom", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
+    # Above the poles and the axis, and within the paper on whichever side there is room.
+    place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
+    side = {"ha": "right" if place > 0.5 else "left"}
+    text = f"slowest: {slowest:.3g} 1/s".replace("-", "\u2212")
+    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near, **side)
 
 
 def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
     """Use scales that show slow and fast poles alike, and end a little right of the axis."""
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FixedLocator, FuncFormatter
 
     sizes, heights = np.abs(real), np.abs(imaginary)
     least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
     right = max(0.0, float(real.max()))
     if most > 30.0 * least:
         ax.set_xscale("symlog", linthresh=least, linscale=0.6)
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        told = FuncFormatter(lambda x, _: f"{x:g}".replace("-", "\u2212"))
+        ax.xaxis.set_major_formatter(told)
+        powers = 10.0 ** np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1.0)
+        # Nearer to 0 their numbers would cover each other.
+        ax.xaxis.set_major_locator(FixedLocator([*-powers[powers > 1.6 * least][::-1], 0.0]))
         ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
     else:
         ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
@@ -168,7 +178,8 @@ def _links(ax: Any, run: Recording, places: Array, weights: Array, small: float)
     one = run.heard.sum(axis=1) == 1
     arrows, pens = run.arrows[there[one]], wide[one & there]
     if run.agents > _NUMBERED:
-        heads = PolyCollection(_heads(places[arrows]), facecolors="0.35", zorder=2)
+        tall = 0.4 * float(np.sqrt(np.ptp(places, axis=0).prod() / run.agents))
+        heads = PolyCollection(_heads(places[arrows], tall), facecolors="0.35", zorder=2)
         ax.add_collection(heads)
         return
     for (first, second), line in zip(arrows, pens, strict=True):
@@ -176,12 +187,15 @@ def _links(ax: Any, run: Recording, places: Array, weights: Array, small: float)
         ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
 
 
-def _heads(ends: Array) -> list[Array]:
+def _heads(ends: Array, tall: float) -> list[Array]:
     """Return triangles on the way between ends (K, 2, 2), a little nearer to the second."""
     way = ends[:, 1] - ends[:, 0]
-    aside = np.stack([-way[:, 1], way[:, 0]], axis=1)
-    tip, back = ends[:, 0] + 0.72 * way, ends[:, 0] + 0.5 * way
-    return list(np.stack([tip, back + 0.1 * aside, back - 0.1 * aside], axis=1))
+    whole = np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+    aside = np.stack([-way[:, 1], way[:, 0]], axis=1) / whole
+    tall_each = np.minimum(tall, 0.3 * whole)
+    tip = ends[:, 0] + 0.7 * way
+    back, out = tip - tall_each * way / whole, 0.4 * tall_each * aside
+    return list(np.stack([tip, back + out, back - out], axis=1))
 
 
 def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:

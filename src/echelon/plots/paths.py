@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SNAPSHOTS = 6  # times at which the graph of a few agents is drawn
+_DENSE = 60  # With more edges than this, so many times would hide each other.
 _EDGES = 5000  # A graph with more edges than this would be a black patch.
 
 
@@ -39,7 +40,7 @@ def leader(run: Recording) -> "Figure":
             look = draw.dots(shape, draw.LEADER, hollow=name == "start")
             draw.plot(ax, place, label=name if named else None, **look)
     shown = np.concatenate([*paths, *known])
-    draw.frame(ax, shown, alike=bool(run.position))
+    draw.frame(ax, shown, alike=len(run.position) > 1)
     return draw.finish(figure, cut)
 
 
@@ -64,7 +65,7 @@ def _paths(run: Recording, axes: list[int]) -> "Figure":
         look = pen_of(run, agent)
         draw.plot(ax, paths[keep, agent], label=name_of(run, agent, short=True), **look)
     _snapshots(ax, run, paths)
-    draw.frame(ax, paths, alike=bool(run.position))
+    draw.frame(ax, paths, alike=len(run.position) > 1)
     return draw.finish(figure, cut)
 
 
@@ -72,7 +73,7 @@ def _snapshots(ax: Any, run: Recording, paths: Array) -> None:
     """Draw the graph at a few times, agents hollow at the start and square at the end."""
     crowd, last = run.agents, len(paths) - 1
     # More snapshots of a swarm would hide each other.
-    count = 2 if crowd > 50 else _SNAPSHOTS
+    count = 2 if crowd > 50 or len(run.edges) > _DENSE else _SNAPSHOTS
     frames = np.unique(np.linspace(0, last, count).round().astype(int))
     if len(run.edges) <= _EDGES:
         _graph(ax, run, paths[frames], run.times[frames])
@@ -99,6 +100,7 @@ def _graph(ax: Any, run: Recording, places: Array, times: Array) -> None:
     text = "graph" if len(times) < 3 else f"graph, every {times[1] - times[0]:.3g} s"
     crowd = draw.crowding(run.agents)
     look = {"linewidth": 0.9 * crowd**0.18, "rasterized": run.agents > 100, "zorder": 3}
+    look |= {"alpha": min(1.0, (_DENSE / len(run.edges)) ** 0.5)}
     for k, shade in enumerate(np.linspace(0.65, float(draw.EDGE), len(times))):
         name = text if k == len(times) - 1 else None
         draw.plot(ax, _flatten(links[k]), label=name, color=str(shade), **look)
