@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from echelon.archive.chunks import Chunks
 from echelon.archive.folder import DATA, GAIN, SUMMARY
@@ -55,18 +56,24 @@ def promise_file(place: PathLike) -> Path:
     if (path / GAIN).is_file() or not (path / SUMMARY).is_file():
         return path / GAIN
     if read_tube(path / SUMMARY) is None:
-        _check_json(path / SUMMARY)
+        if _summary(path / SUMMARY).get("gain") is not None:
+            raise OutputError(
+                f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` makes it again."
+            )
         raise OutputError(f"the law of `{path}` left neither a gain nor a tube to verify.")
     return path / SUMMARY
 
 
-def _check_json(file: Path) -> None:
-    """Check that a file is whole.
+def _summary(file: Path) -> dict[str, Any]:
+    """Return the summary in a file.
 
     Raises:
-        OutputError: it is not.
+        OutputError: the file is damaged.
     """
     try:
-        json.loads(file.read_text("utf-8"))
+        told = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise OutputError(f"`{file}` cannot be read, or is damaged: {error}.") from error
+    if not isinstance(told, dict):
+        raise OutputError(f"`{file}` is damaged: it holds no mapping.")
+    return told
