@@ -7,13 +7,22 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.plots import style as draw
-from echelon.plots.agents import REFERENCE, label, leaders_first, name_of, pen_of, reference_of
+from echelon.plots.agents import (
+    REFERENCE,
+    drawn,
+    label,
+    leaders_first,
+    name_of,
+    pen_of,
+    reference_of,
+)
 from echelon.results.metrics import SETTLED
 from echelon.results.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_LINKS = 20_000  # of which the distances of many are taken, evenly spread
 _PANELS = 12  # what fits above each other on a page
 _START = 3.0
 """Seconds of a run in which inputs are quick."""
@@ -217,7 +226,7 @@ def _agents_over(ax: Any, run: Recording, times: Array, values: Array) -> None:
 
 def states(run: Recording) -> "Figure":
     """Return every state over time, twelve at most."""
-    return states_over_time(run, range(run.agents))
+    return states_over_time(run, drawn(run))
 
 
 def states_over_time(run: Recording, chosen: Iterable[int]) -> "Figure":
@@ -251,12 +260,13 @@ def distances(run: Recording) -> "Figure | None":
     if not run.position:
         return None
     places, columns = run.states[:, :, list(run.position)], list(run.position)
-    keep = draw.thin(len(run.times), max(1, len(run.edges)))
-    i, j = run.edges.T
+    chosen = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
+    i, j = run.edges[chosen].T
+    keep = draw.thin(len(run.times), max(1, len(i)))
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.linalg.norm(places[keep][:, i] - places[keep][:, j], axis=2)
         wanted = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
-    apart[~np.stack([run.linked(t) for t in run.times[keep]])] = np.nan
+    apart[~np.stack([run.linked(t)[chosen] for t in run.times[keep]])] = np.nan
     figure, (linked, nearest) = _panels(run, 2, 1.9)
     linked.set_ylabel(draw.label("between linked", "m"))
     _edges(linked, run, run.times[keep], apart, wanted)

@@ -1,12 +1,13 @@
 """Who hears whom, and the poles into which the disagreement splits."""
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from echelon.core.types import Array
 from echelon.plots import style as draw
-from echelon.plots.agents import pen_of
+from echelon.plots.agents import MOST, pen_of, told_of
 from echelon.results.recording import Modes, Recording
 
 if TYPE_CHECKING:
@@ -106,10 +107,12 @@ def network(run: Recording) -> "Figure":
     """Return who hears whom: agents where the formation puts them, or around a circle.
 
     An arrow goes to who hears; a line without one is heard both ways, a dotted one by nobody. A
-    graph that switches has a panel for each stretch of time, six at most.
+    graph that switches has a panel for each stretch of time, six at most; of a huge swarm it is
+    those about the leaders.
     """
     from matplotlib.figure import Figure
 
+    whole, run = run, _about_leaders(run)
     places, units = _places(run)
     size = np.ptp(places, axis=0)
     stretches = _stretches(run)
@@ -123,10 +126,38 @@ def network(run: Recording) -> "Figure":
     for ax, (title, weights) in zip(panels, stretches, strict=False):
         _agents_and_links(ax, run, places, weights, columns)
         _finish_network(ax, places, units)
-        ax.set_title(title, size=draw.page().letters)
+        told = ", ".join(filter(None, [title, told_of(whole, run.agents)]))
+        ax.set_title(told, size=draw.page().letters)
     for ax in panels[len(stretches) :]:
         ax.axis("off")
     return figure
+
+
+def _about_leaders(run: Recording) -> Recording:
+    """Return a recording of the agents that the fewest links part from a leader."""
+    if run.agents <= MOST:
+        return run
+    from scipy import sparse
+
+    (i, j), ones = run.edges.T, np.ones(len(run.edges), np.int8)
+    links = sparse.csr_array(sparse.coo_array((ones, (i, j)), (run.agents, run.agents)))
+    far = sparse.csgraph.dijkstra(
+        links, directed=False, indices=run.leaders, unweighted=True, min_only=True
+    )
+    kept = np.sort(np.argsort(far, kind="stable")[:MOST])
+    there = np.isin(run.edges, kept).all(axis=1)
+    schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, there])
+    return dataclasses.replace(
+        run,
+        **{name: getattr(run, name)[:, kept] for name in ("states", "inputs", "errors")},
+        **{name: getattr(run, name)[kept] for name in ("offsets", "limited")},
+        leaders=tuple(np.flatnonzero(np.isin(kept, run.leaders)).tolist()),
+        nearest=np.zeros(len(kept), int),
+        edges=np.searchsorted(kept, run.edges[there]),
+        weights=run.weights[there],
+        heard=run.heard[there],
+        schedule=schedule,
+    )
 
 
 def _stretches(run: Recording) -> list[tuple[str, Array]]:

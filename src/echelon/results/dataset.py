@@ -4,8 +4,9 @@ The dataset is one netCDF file, the summary is JSON.
 """
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -15,11 +16,22 @@ from echelon.models.model import ControlAffine
 from echelon.promises.promise import promise
 from echelon.results.foreseen import heard_in
 from echelon.results.lyapunov import lyapunov
-from echelon.results.metrics import Metrics, metrics, output_errors
+from echelon.results.metrics import (
+    EdgeMetrics,
+    Metrics,
+    metrics,
+    output_errors,
+    representatives,
+    steady_error,
+)
 from echelon.results.recording import FORMAT
 
 if TYPE_CHECKING:
     import xarray as xr
+
+_LISTED = 5_000
+"""Rows of a list in the summary. The dataset has what all of them are made of."""
+_Row = TypeVar("_Row")
 
 
 def dataset(result: Result) -> "xr.Dataset":
@@ -198,9 +210,12 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         **result.world.describe(result.model),
         "leader": numbers.leader._asdict(),
         "leaders": [each._asdict() for each in numbers.leaders],
-        "followers": [_follower(each._asdict()) for each in numbers.followers],
+        "followers": [
+            _follower(each._asdict()) for each in _listed(numbers.followers, steady_error)
+        ],
         "edges": [
-            {"edge": list(each.edge), "distance_rmse": each.distance_rmse} for each in numbers.edges
+            {"edge": list(each.edge), "distance_rmse": each.distance_rmse}
+            for each in _listed(numbers.edges, _distance_error)
         ],
         "gain": None
         if gain is None
@@ -224,6 +239,15 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
             key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
         },
     }
+
+
+def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:
+    """Return all rows; of more than a person's tools read, the best, the median and the worst."""
+    return rows if len(rows) <= _LISTED else representatives(rows, error)
+
+
+def _distance_error(edge: EdgeMetrics) -> float:
+    return np.inf if edge.distance_rmse is None else edge.distance_rmse
 
 
 def _follower(entry: dict[str, Any]) -> dict[str, Any]:
