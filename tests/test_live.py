@@ -186,6 +186,17 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
         np.testing.assert_allclose(flown(swarm, 30), wanted.states[1:], atol=1e-11)
 
 
+def test_a_page_that_comes_before_the_first_picture_is_sent_none(session):
+    sent = []
+
+    def send(block):
+        sent.append(block)
+        session.ended = True
+
+    session.watch(send)
+    assert sent and all(len(block) > 4 for block in sent)
+
+
 def test_another_method_brings_its_gain_and_its_coupling(session):
     session.ask({"name": "method", "value": "inner-loop"})
     session.settle()

@@ -3,11 +3,11 @@
 import importlib
 from typing import Any, Final
 
-PAGES: Final[dict[str, str]] = {}
-"""What makes the HTML of each kind of value, as `module:function`."""
+# By name, since what a notebook shows is drawn high above where values are made.
+_PAGES: Final = {"result": "echelon.archive.notebook:result_page"}
 
 
 def page_of(kind: str, value: Any) -> str:
     """Return a value as HTML."""
-    module, _, name = PAGES[kind].partition(":")
+    module, _, name = _PAGES[kind].partition(":")
     return getattr(importlib.import_module(module), name)(value)

@@ -186,7 +186,8 @@ class Session:
         """Send each latest picture and all words, until sending fails or the session ends."""
         with self.changed:
             self.watchers += 1
-            seen, heard = -1, len(self.words)
+            # The first picture has number 1, and there may be none yet.
+            seen, heard = 0, len(self.words)
         # A page that comes later hears how things stand.
         self.promiser.ask(self.panel, self.knobs)
         if self.panel is not self.first:

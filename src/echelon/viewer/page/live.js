@@ -233,8 +233,11 @@ class Live {
     try {
       for await (const block of blocksOf(await fetch("/stream"))) this.take(block);
       this.note = "The loop has ended.";
-    } catch {
+    } catch (fault) {
       this.note = "The server has ended.";
+      this.tellNotes();
+      // A stream that breaks is a TypeError, and anything else is a fault of the page.
+      if (!(fault instanceof TypeError)) throw fault;
     }
     this.tellNotes();
   }

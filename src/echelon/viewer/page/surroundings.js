@@ -209,7 +209,9 @@ class Backdrop {
     this.pen.fillStyle = themeColour("--ink");
     const at = view.project(x, y, last);
     const name = names[2] + (units[2] ? `, ${units[2]}` : ""), half = this.pen.measureText(name).width / 2 + 4;
-    if (at) this.text(name, Math.max(half, Math.min(this.w - half, at[0])), Math.max(8, at[1] - 10), "center");
+    // At the top of the picture it stands beside the highest number, and not above it.
+    if (at && at[1] < 18) this.text(name, at[0] - 26, Math.max(8, at[1]), "right");
+    else if (at) this.text(name, Math.min(this.w - half, at[0]), at[1] - 10, "center");
   }
 }
 
