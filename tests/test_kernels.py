@@ -38,6 +38,12 @@ FUNCTIONS = {
     "arccos": (jnp.arccos, np.arccos, rng.uniform(-1.0, 1.0, 4000), 3.5),
     "cbrt": (jnp.cbrt, np.cbrt, WIDE, 1.0),
     "erf": (jax.lax.erf, erf, rng.normal(size=4000), 6.0),
+    "rsqrt": (
+        jax.lax.rsqrt,
+        lambda x: 1.0 / np.sqrt(x),
+        10.0 ** rng.uniform(-30.0, 30.0, 4000),
+        2.0,
+    ),
     "sqrt": (jnp.sqrt, np.sqrt, rng.uniform(0.0, 9.0, 4000), 0.5),
     "sigmoid": (jax.nn.sigmoid, lambda x: 1.0 / (1.0 + np.exp(-x)), WIDE, 2.5),
 }
@@ -72,7 +78,21 @@ def test_the_angle_of_a_point_is_right_in_all_quarters(bits):
 
 
 @pytest.mark.parametrize(
-    "name", ["sin", "cos", "exp", "expm1", "log", "log1p", "tanh", "sinh", "arctan", "cbrt", "erf"]
+    "name",
+    [
+        "sin",
+        "cos",
+        "exp",
+        "expm1",
+        "log",
+        "log1p",
+        "tanh",
+        "sinh",
+        "arctan",
+        "cbrt",
+        "erf",
+        "rsqrt",
+    ],
 )
 def test_what_is_no_number_stays_none_and_what_is_infinite_goes_where_it_must(name):
     function, wanted, *_ = FUNCTIONS[name]

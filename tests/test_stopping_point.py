@@ -512,13 +512,6 @@ def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
     assert 0.9 * most < 29 * long.prepared(QUADROTOR, ech.Graph.path(30)).speed_of(z) < most
 
 
-def test_a_model_that_does_not_say_where_it_ends_is_promised_nothing():
-    model, graph = ech.models.Unicycle(), ech.Graph.path(3)
-    drive = ech.Laws(StoppingLeader(reference=CIRCLE), StoppingPoint())
-    found = promised(ech.Parts(model, graph, ech.Formation(np.zeros((3, 3))), drive))
-    assert "does not say where its flat coordinates end" in found.sentence()
-
-
 # ---- bad input -----------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.loop import Loop, act_alone, what_limits_did
 from echelon.engine.own import Own
-from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes
+from echelon.kernels import Body, Graph, Node, Unsupported, inverses_shared, lower, nodes
 from echelon.laws.law import Law, LocalView, Memory
 
 
@@ -225,7 +225,7 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
     if leads and follows:
         sums |= {"tracking": done.tracking, "outputs": done.outputs}
     apart = functools.partial(map, functools.partial(graph.make, "apart"))
-    return Body(
+    body = Body(
         stores=_placed(rows, stores),
         sums=_placed(rows, sums),
         greatest=_placed(rows, {"unsettled": done.unsettled}),
@@ -235,6 +235,7 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
         mirror=[*apart(done.state, known.offset), *done.saying],
         difference=_difference(loop, graph, len(known.x), len(done.said)),
     )
+    return body.become(inverses_shared(body.all()))
 
 
 def _difference(loop: Loop, graph: Graph, states: int, signals: int) -> list[Node]:

@@ -5,7 +5,8 @@ from echelon.kernels.drivers import program
 from echelon.kernels.frame import SLOTS, Body, Plan, stride
 from echelon.kernels.lowering import Unsupported, lower, nodes
 from echelon.kernels.native import Code, aligned, is_installed, vectors
-from echelon.kernels.scalar import Graph, Node
+from echelon.kernels.quotients import inverses_shared
+from echelon.kernels.scalar import Graph, Node, needed
 
 __all__ = [
     "SLOTS",
@@ -16,8 +17,10 @@ __all__ = [
     "Plan",
     "Unsupported",
     "aligned",
+    "inverses_shared",
     "is_installed",
     "lower",
+    "needed",
     "nodes",
     "program",
     "shared",

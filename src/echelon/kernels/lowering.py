@@ -144,7 +144,6 @@ def _rules(graph: Graph) -> dict[str, Rule]:
         "ge": lambda a, b: graph.make("le", _entry(b), _entry(a)),
         "rem": function(elementary.remainder),
         "pow": function(elementary.power),
-        "rsqrt": lambda a: 1.0 / graph.make("sqrt", a),
         "exp2": lambda a: elementary.exp(_node(graph, a) * float(np.log(2.0))),
         "clamp": lambda low, x, high: graph.make(
             "min", graph.make("max", _entry(low), _entry(x)), _entry(high)
@@ -174,7 +173,7 @@ _SAME = ("div", "abs", "sqrt", "floor", "ceil", "max", "min", "lt", "le", "eq", 
 _SAME += ("and", "or", "xor", "not")
 _ELEMENTARY = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
 _ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "logistic", "erf")
-_ELEMENTARY += ("cbrt", "sign")
+_ELEMENTARY += ("cbrt", "rsqrt", "sign")
 
 
 def _entry(value: Any) -> Entry:

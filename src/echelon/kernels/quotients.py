@@ -1,0 +1,22 @@
+"""Quotients by the same number share its inverse: of all operations they take the longest."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from echelon.kernels.scalar import Node, needed
+from echelon.kernels.usual import rewritten
+
+
+def inverses_shared(results: Sequence[Node]) -> Mapping[Node, Node]:
+    """Return what nodes become where quotients by one number are products with its inverse.
+
+    They may differ by a unit of the last place from what they were.
+    """
+    found = [n for n in needed(results) if n.op == "div" and not n.uniform]
+    by = Counter(node.args[1] for node in found)
+    shared = {node for node in found if by[node.args[1]] > 1 or node.args[1].uniform}
+
+    def product(node: Node, args: Sequence[Node]) -> Node | None:
+        return args[0] * node.graph.make("div", 1.0, args[1]) if node in shared else None
+
+    return rewritten(results, product)
