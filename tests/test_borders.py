@@ -107,7 +107,6 @@ def test_a_unicycle_is_promised_while_it_drives(tmp_path):
     [
         ({"headings": (1.2, 0.0, 0.0)}, "is not proved to stay above 0"),
         ({"speed": 1.2}, "lower the `speed` of `x`, `y` below 0.9"),
-        ({"reference": ech.references.Lemniscate(), "speed": 0.1}, "is not proved to stay above 0"),
     ],
 )
 def test_a_unicycle_that_might_stop_is_told_what_would_help(change, text):
@@ -120,6 +119,7 @@ def test_a_path_that_stands_still_has_no_direction():
         prepare(driven(reference=ech.references.Hover()), ech.Settings(horizon=1.0, dt=0.01))
 
 
+@pytest.mark.slow
 def test_unicycles_come_together_from_afar_and_never_stop():
     draw = np.random.default_rng(1)
     headings = draw.uniform(-0.95, 0.95, 6)
@@ -127,8 +127,8 @@ def test_unicycles_come_together_from_afar_and_never_stop():
     states = np.array(parts.initial)
     states[1:, :2] += draw.uniform(-10.0, 10.0, (6, 2))
     parts = parts.replace(initial=states)
-    found = promised(parts, 60.0)
-    result = ech.simulate(parts, ech.Settings(horizon=60.0, dt=0.01))
+    found = promised(parts, 40.0)
+    result = ech.simulate(parts, ech.Settings(horizon=40.0, dt=0.01))
     assert found.promised and result.inputs[:, :, 0].min() >= found.tube.left
     off = np.linalg.norm(result.errors[:, 1:, :2], axis=2)
     assert off[-1].max() <= 1e-9

@@ -15,7 +15,7 @@ from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
-from echelon.engine.scalars import memories_of, signals_of
+from echelon.engine.scalars import memories_of
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.kernels import aligned
 from echelon.world.disturbance import draw
@@ -265,7 +265,7 @@ class NativeStepper(Stepper):
 
     def _signals(self, now: Moment, offsets: Array) -> list[Array]:
         """Return what neighbours hear of all agents beside their states, (N, s), if anything."""
-        if not signals_of(self.loop):
+        if self.plan.width == len(self.rows.state):
             return []
         counts = [len(self.loop.offsets), len(self.loop.leaders), len(self.loop.followers)]
         found = list[Array]()
