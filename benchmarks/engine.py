@@ -1,297 +1,425 @@
-"""How fast agents are stepped: native code beside JAX, and beside a yardstick in C if one is given.
+"""How fast agents are stepped: native code beside a yardstick in C, C++ of the same, and peers.
 
-Run `python benchmarks/engine.py`, or with `--yardstick FOLDER`, a folder whose `limit.py` has
-classes `Ring(x0, d, dtype, mode)` and `Batch(x0, d, dtype)`, of formations of 4, with `run(steps)`,
-and a function `rate(kernel, agents, steps)`, and whose `problem.py` makes their starts. All are
-timed in one process, turn by turn, in CPU time of one core (of threads in wall time), and the best
-of several is taken: what counts are the ratios. With a yardstick it ends with 1 where a number of
-`_ASKED` is missed.
+Run `python3 benchmarks/engine.py --yardstick FOLDER` (`steppers.Yardstick` says what is in it).
+What is compared is timed in one process, turn by turn, in CPU time of one core (threads, and what
+says so, in wall time), and the best of several turns is taken: what counts are the ratios. Groups
+of measurements have a process each. It ends with 1 where a number is not as asked; what needs a
+yardstick is left out without one. Environments of peers are made by pip where they are not there.
 """
 
 import argparse
-import importlib
 import json
+import os
 import resource
+import statistics
+import subprocess
 import sys
+import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import equinox as eqx
-import jax
-import numpy as np
+try:
+    import numpy as np
+    import steppers as made
+except ImportError:
+    # Not in the environment that `dev.py setup` makes.
+    _PYTHON = Path(__file__).resolve().parents[1] / ".venv" / "bin" / "python"
+    if not _PYTHON.exists() or _PYTHON == Path(sys.executable):
+        raise
+    os.execv(_PYTHON, [str(_PYTHON), *sys.argv])
+
+from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
-from echelon.core.numerics import precision
-from echelon.engine.by_jax import JaxStepper
 from echelon.engine.crew import Crew
-from echelon.engine.drive import Stepper
-from echelon.engine.loop import Loop, assemble
 from echelon.engine.many import Fleet
-from echelon.engine.native import NativeStepper
-from echelon.engine.prepare import prepare
+from echelon.kernels import Code, program
 
-_DT, _TURNS = 0.005, 5
-_ASKED: dict[str, float] = {
-    "ring of 10000, float32, to C": 0.85,
-    "ring of 10000, float64, to C": 0.85,
-    "ring of 1000000, float32, to C": 0.75,
-    "ring of 1000000, float64, to C": 0.75,
-    "formations of 4, float32, shared gains to C": 0.8,
-    "formations of 4, float64, shared gains to C": 0.8,
+Row: TypeAlias = dict[str, float]
+_TURNS = 5
+_BITS = (32, 64)
+_MILLION = 1_000_000
+
+_AT_LEAST: Row = {
+    **{f"ring of 10,000, float{bits}, to C": 0.85 for bits in _BITS},
+    "a newcomer's model, float32, to C": 0.55,
+    "a newcomer's model, float64, to C": 0.5,
+    **{
+        f"step of {name}, float{bits}, to the same in C++": 0.9
+        for name in ("quadrotor", "newcomer's model")
+        for bits in _BITS
+    },
+    **{f"formations of 4, float{bits}, shared gains to C": 0.8 for bits in _BITS},
     "formations of 4, float32, own gains to C": 0.5,
     "formations of 4, float64, own gains to C": 0.6,
-    "formations of 4, float32, two threads to one": 1.6,
-    "degree 6, float32, M/s": 25.0,
-    "degree 6, float32, two threads to one": 1.6,
+    "degree 6, 10,000, float32, to C": 1.5,
+    "degree 6, 10,000, float64, to C": 1.0,
+    **{f"ring of 1,000,000, float{bits}, to C": 0.75 for bits in _BITS},
+    "echelon to crazyflow, bare plant": 8.0,
+    "echelon to crazyflow, its controller": 35.0,
+    "geometric graph of 1,000,000, float32, M/s": 25.0,
+    "geometric graph of 1,000,000, float32, two threads to one": 1.6,
+    **{f"formations of 4, float{bits}, two threads to one": 1.6 for bits in _BITS},
 }
 """What each number must reach."""
-_AT_MOST: dict[str, float] = {
-    "degree 6, float32, graph, CPU s": 5.0,
-    "peak GB": 3.0,
+_AT_MOST: Row = {
+    "geometric graph of 1,000,000, float32, built and ordered, CPU s": 5.0,
+    "geometric graph of 1,000,000, float32, peak GB": 3.0,
     "10,000 formations, 1,000 steps, cold, CPU s": 10.0,
     "10,000 formations, 1,000 steps, compiled, CPU s": 1.5,
+    "10,000 runs of `paper` with dataset, reckoned, wall s": 180.0,
+    **{f"every 20th state stored, float{bits}, to none": 1.15 for bits in _BITS},
+    "a model traced and compiled, the slowest, CPU s": 1.0,
+    "code of a model from the cache, the slowest, ms": 10.0,
+    "`echelon run paper` warm, without figures, wall s": 3.0,
+    "gradient of 200 steps, to forward": 10.0,
+    "gradient of 200 steps, to JAX": 0.2,
 }
 """What each must not exceed."""
 
 
-def flock(graph: ech.Graph) -> ech.Parts:
-    """Return quadrotors behind a leader on a circle, by a gain that the step bears."""
-    model = ech.models.Quadrotor()
-    gain = ech.synthesize(model, ech.Graph.ring(20), ech.gains.Riccati(coupling=0.25))
-    drive = ech.Laws(
-        ech.laws.Tracking(ech.references.Circle(radius=1.0, rate=0.3)),
-        ech.laws.Consensus(gain, feedforward="relay"),
-    )
-    formation = ech.Formation(np.zeros((graph.agents, 12)))
-    return ech.Parts(model, graph, formation, drive, initial={"position": 0.02})
+def turns(name: str, ways: dict[str, Callable[[], float]]) -> Row:
+    """Return the rates of some ways, taken in turn, in millions a second, and ratios to the first.
 
-
-def steppers(graph: ech.Graph, bits: int) -> tuple[Stepper, Stepper, np.ndarray]:
-    """Return the native stepper, JAX's and the reference of 10,000 steps."""
-    chosen = ech.Settings(horizon=50.0, dt=_DT, precision=f"float{bits}")  # type: ignore[arg-type]
-    prepared = prepare(flock(graph), chosen)
-    problem, drive = prepared.problem, prepared.parts.drive
-    with precision("float64"):
-        loop = assemble(problem, drive.leader, drive.follower)
-        by_jax = JaxStepper(loop, problem.states)
-        native = NativeStepper([loop], problem.states, bits, by_jax)
-        times = _DT * jax.numpy.arange(10_001)
-        reference = np.asarray(drive.reference_states(prepared.parts.model, times))
-    return native, by_jax, reference
-
-
-def rate(stepper: Stepper, agents: int, steps: int, reference: np.ndarray, bits: int) -> float:
-    """Return agent-steps per second of CPU time, of one turn."""
-    with precision(f"float{bits}"):  # type: ignore[arg-type]
-        # From within a run: what is written once at its beginning is no step.
-        now = stepper.advance(stepper.start(), np.array([1], np.int32), reference[:2]).now
-        begin = time.process_time()
-        stepper.advance(now, np.array([steps], np.int32), reference[: steps + 1])
-        return agents * steps / (time.process_time() - begin)
-
-
-def measure(agents: int, bits: int, yardstick: Path | None) -> dict[str, float]:
-    """Return the rates of a ring, in millions of agent-steps a second, and their ratios."""
-    native, by_jax, reference = steppers(ech.Graph.ring(agents), bits)
-    few = agents <= 10_000
-    steps, fewer = max(4, 2_000_000 // agents), max(2, 100_000 // agents)
-    found: dict[str, list[float]] = {"native": [], **({"JAX": []} if few else {}), "C": []}
-    limit: Any = None
-    kernel: Any = None
-    if yardstick is not None:
-        limit, problem = yardstick_of(yardstick)
-        starts = problem.problem(agents, problem.ring(agents))
-        kernel = limit.Ring(*starts, np.float64 if bits == 64 else np.float32, mode=0)
-    if few:
-        rate(by_jax, agents, fewer, reference, bits)  # compiles
+    Args:
+        name: of what is stepped.
+        ways: each returns the rate of one turn; the first is native code.
+    """
+    found = {way: list[float]() for way in ways}
     for _ in range(_TURNS):
-        if kernel is not None:
-            found["C"].append(limit.rate(kernel, agents, steps, 1)[0])
-        found["native"].append(rate(native, agents, steps, reference, bits))
-        if few:
-            found["JAX"].append(rate(by_jax, agents, fewer, reference, bits))
-    best = {name: max(rates) for name, rates in found.items() if rates}
-    name = f"ring of {agents}, float{bits}"
-    row = {f"{name}, {kind}, M/s": round(value / 1e6, 3) for kind, value in best.items()}
-    others = [kind for kind in best if kind != "native"]
-    return row | {f"{name}, to {kind}": round(best["native"] / best[kind], 3) for kind in others}
+        for way, measure in ways.items():
+            found[way].append(measure())
+    best = {way: max(rates) for way, rates in found.items()}
+    first, *others = best
+    row = {f"{name}, {way}, M/s": round(value / 1e6, 2) for way, value in best.items()}
+    return row | {f"{name}, to {way}": round(best[first] / best[way], 3) for way in others}
 
 
-def yardstick_of(folder: Path) -> tuple[Any, Any]:
-    """Return the yardstick's modules `limit` and `problem`."""
-    if str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
-    return importlib.import_module("limit"), importlib.import_module("problem")
+def measure_ring(
+    agents: int, bits: int, yardstick: Yardstick | None, model: ech.ControlAffine | None = None
+) -> Row:
+    """Return the rates of a ring beside the yardstick's."""
+    side = made.steppers(flock(ech.Graph.ring(agents), model), bits)
+    steps = max(4, 2 * _MILLION // agents)
+    name = "a newcomer's model" if model is not None else f"ring of {agents:,}"
+    return turns(
+        f"{name}, float{bits}",
+        {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
+        | _in_c(yardstick, agents, steps, lambda c: c.ring(agents, bits)),
+    )
+
+
+def _in_c(
+    yardstick: Yardstick | None, agents: int, steps: int, make: Callable[[Yardstick], Any]
+) -> dict[str, Callable[[], float]]:
+    """Return the yardstick as a way to step, where there is one."""
+    if yardstick is None:
+        return {}
+    return {"C": partial(yardstick.rate, make(yardstick), agents, steps)}
+
+
+def measure_degree(bits: int, yardstick: Yardstick | None) -> Row:
+    """Return the rates of a graph of 10,000 agents with six neighbours each."""
+    agents, steps = 10_000, 100
+    if yardstick is None:
+        return {}
+    table = yardstick.problem.rand_regular(agents, 6)
+    pairs = np.stack([np.repeat(np.arange(agents), 6), table.ravel()], axis=1)
+    # Where two of its cycles share an edge, the kernel in C hears it twice.
+    edges = np.unique(np.sort(pairs, axis=1), axis=0)
+    side = made.steppers(flock(ech.Graph.from_edges(edges, agents=agents)), bits)
+    return turns(
+        f"degree 6, 10,000, float{bits}",
+        {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
+        | _in_c(yardstick, agents, steps, lambda c: c.neighbours(agents, 6, bits)),
+    )
+
+
+def measure_stored(bits: int, _: Yardstick | None) -> Row:
+    """Return what it costs to store every 20th state."""
+    agents, some, never = 10_000, [20] * 10, [200]
+    side = made.steppers(flock(ech.Graph.ring(agents)), bits)
+    ways = {
+        way: partial(rate, side.native, agents, counts, side.reference, bits)
+        for way, counts in (("none", never), ("every 20th", some))
+    }
+    found = turns("", ways)[", to every 20th"]
+    return {f"every 20th state stored, float{bits}, to none": found}
+
+
+def measure_same(bits: int, _: Yardstick | None) -> Row:
+    """Return how fast a follower's step is beside the same operations in C++."""
+    from same_in_cpp import Follower
+
+    row: Row = {}
+    for name, model in (("quadrotor", None), ("newcomer's model", made.Newcomer())):
+        side = made.steppers(flock(ech.Graph.ring(16), model), bits)
+        follower = Follower(side.native, bits)
+        ways = {"native": follower.native(), "the same in C++": follower.cpp()}
+        start = follower.memory()
+        ends = [follower.after(run, start, 20) for run in ways.values()]
+        assert np.allclose(*ends, rtol=1e-3 if bits == 32 else 1e-9, atol=1e-6), "not the same"
+        timed = {way: partial(follower.rate, run, start, 400) for way, run in ways.items()}
+        row |= turns(f"step of {name}, float{bits}", timed)
+    return row
+
+
+def measure_formations(bits: int, yardstick: Yardstick | None) -> Row:
+    """Return the rates of formations of 4, beside the yardstick's and on two threads."""
+    agents, row = 4 * FORMATIONS, Row()
+    shared, reference = made.formations(bits, False)
+    own = made.formations(bits, True)[0]
+    ways = {
+        name: partial(rate, stepper, agents, [STEPS], reference, bits)
+        for name, stepper in (("shared gains", shared), ("own gains", own))
+    }
+    ways |= _in_c(yardstick, agents, STEPS, lambda c: c.formations(bits))
+    kind = f"formations of 4, float{bits}"
+    found = turns(kind, ways)
+    row |= {name: value for name, value in found.items() if name.endswith("M/s")}
+    if yardstick is not None:
+        for way in ("shared gains", "own gains"):
+            rates = found[f"{kind}, {way}, M/s"], found[f"{kind}, C, M/s"]
+            row[f"{kind}, {way} to C"] = round(rates[0] / rates[1], 3)
+    both = {n: made.formations(bits, False, n)[0] for n in (1, 2)}
+    flown = {n: partial(rate, s, agents, [STEPS], reference, bits) for n, s in both.items()}
+    return row | {f"{kind}, two threads to one": _walls(flown[1], flown[2])}
+
+
+def _walls(one: Callable[[], float], other: Callable[[], float]) -> float:
+    """Return the wall time of one way over that of another."""
+    walls = ([], [])
+    for _ in range(_TURNS):
+        for way, found in zip((one, other), walls, strict=True):
+            begin = time.perf_counter()
+            way()
+            found.append(time.perf_counter() - begin)
+    return round(min(walls[0]) / min(walls[1]), 2)
 
 
 def scattered(agents: int) -> np.ndarray:
-    """Return the edges between points of a plane that are near, six for each in the mean."""
+    """Return edges between points of a plane that are near, six for each in the mean, connected."""
+    import scipy.sparse as sp
+    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     points = np.random.default_rng(0).uniform(0.0, np.sqrt(agents), (agents, 2))
-    return cKDTree(points).query_pairs(np.sqrt(6.0 / np.pi), output_type="ndarray")
-
-
-def measure_degree(agents: int, bits: int) -> dict[str, float]:
-    """Return the rate of a large graph of mean degree 6, what it takes to build, and of threads."""
-    import scipy.sparse as sp
-    from scipy.sparse.csgraph import connected_components
-
-    edges = scattered(agents)
+    edges = cKDTree(points).query_pairs(np.sqrt(6.0 / np.pi), output_type="ndarray")
     links = sp.coo_array((np.ones(len(edges), np.int8), edges.T), (agents, agents))
     label = connected_components(links.tocsr(), directed=False)[1]
     most = np.flatnonzero(label == np.bincount(label).argmax())
     place = np.full(agents, -1)
     place[most] = np.arange(len(most))
-    edges, agents = place[edges[label[edges[:, 0]] == label[most[0]]]], len(most)
-    begin = time.process_time()
+    return place[edges[label[edges[:, 0]] == label[most[0]]]]
+
+
+def measure_geometric(bits: int, _: Yardstick | None) -> Row:
+    """Return the rate of a large geometric graph, what it takes to build, and two threads."""
+    from echelon.engine.places import Swarm
+
+    edges = scattered(_MILLION)
+    agents, begin = int(edges.max()) + 1, time.process_time()
     graph = ech.Graph.from_edges(edges, agents=agents)
     built = time.process_time() - begin
-    native, _, reference = steppers(graph, bits)
-    walls, rates = dict[int, float](), list[float]()
-    for threads in (1, 2) * _TURNS:
-        native.crew = Crew(native.places, None, threads)  # type: ignore[attr-defined]
-        begin = time.perf_counter()
-        found = rate(native, agents, 4, reference, bits)
-        walls[threads] = min(walls.get(threads, np.inf), time.perf_counter() - begin)
-        rates += [found] * (threads == 1)
-    name = f"degree 6, float{bits}"
+    side = made.steppers(flock(graph), bits)
+    begin = time.process_time()
+    Swarm(side.native.loop, side.native.places.lanes)
+    built += time.process_time() - begin
+    crews = {n: Crew(side.native.places, None, n) for n in (1, 2)}
+    rates, steps = list[float](), 4
+
+    def fly(threads: int) -> float:
+        side.native.crew = crews[threads]
+        found = rate(side.native, agents, [steps], side.reference, bits)
+        rates.extend([found] * (threads == 1))
+        return found
+
+    gained = _walls(partial(fly, 1), partial(fly, 2))
+    name = f"geometric graph of 1,000,000, float{bits}"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return {
         f"{name}, M/s": round(max(rates) / 1e6, 1),
-        f"{name}, two threads to one": round(walls[1] / walls[2], 2),
-        f"{name}, graph, CPU s": round(built, 2),
-        "peak GB": round(peak, 2),
+        f"{name}, two threads to one": gained,
+        f"{name}, built and ordered, CPU s": round(built, 2),
+        f"{name}, peak GB": round(peak, 2),
     }
 
 
-# ---- many formations ---------------------------------------------------------------------------
-
-_FORMATIONS, _STEPS = 2_560, 300
+# ---- whole runs ----------------------------------------------------------------------------------
 
 
-def formations(
-    bits: int, own: bool, threads: int = 1, integrator: Any = "rk4"
-) -> tuple[NativeStepper, np.ndarray]:
-    """Return what steps 2,560 formations of 4 that all hear each other, and the reference.
-
-    Each has a gain of its own where `own` is true: other numbers in P, R and c.
-    """
-    kind: Any = f"float{bits}"
-    chosen = ech.Settings(horizon=50.0, dt=_DT, precision=kind, integrator=integrator)
-    prepared = prepare(flock(ech.Graph.complete(4)), chosen)
-    drive, draws = prepared.parts.drive, np.random.default_rng(0)
-    with precision("float64"):
-        loop = assemble(prepared.problem, drive.leader, drive.follower)
-        states = prepared.problem.states + 0.02 * draws.uniform(-1, 1, (_FORMATIONS, 4, 12))
-        times = _DT * jax.numpy.arange(_STEPS + 1)
-        reference = np.asarray(drive.reference_states(prepared.parts.model, times))
-        loops = [_regained(loop, draws) for _ in range(_FORMATIONS)] if own else None
-    pool = ThreadPoolExecutor(threads) if threads > 1 else None
-    with precision(f"float{bits}"):  # type: ignore[arg-type]
-        loops = loops or [loop] * _FORMATIONS
-        return NativeStepper(loops, states.reshape(-1, 12), bits, None, pool), reference
-
-
-def _regained(loop: Loop, draws: np.random.Generator) -> Loop:
-    """Return a loop with a gain a little other."""
-
-    def numbers(loop: Loop) -> tuple[Any, ...]:
-        gain = loop.follower.gain
-        return gain.P, gain.R_inverse, gain.coupling
-
-    P, R_inverse, coupling = numbers(loop)
-    more = 1.0 + 0.01 * draws.uniform(-1, 1, P.shape)
-    scales = draws.uniform(0.9, 1.1, 2)
-    other = P * (more + more.T) / 2, R_inverse * scales[0], coupling * scales[1]
-    return eqx.tree_at(numbers, loop, other)
-
-
-def measure_formations(bits: int, yardstick: Path | None) -> dict[str, float]:
-    """Return the rates of formations of 4, in millions of agent-steps a second, and ratios."""
-    agents = 4 * _FORMATIONS
-    steppers = {"shared gains": formations(bits, False), "own gains": formations(bits, True)}
-    threads = {count: formations(bits, False, count)[0] for count in (1, 2)}
-    reference = steppers["shared gains"][1]
-    found: dict[str, list[float]] = {name: [] for name in ("C", *steppers)}
-    walls: dict[int, list[float]] = {1: [], 2: []}
-    limit: Any = None
-    if yardstick is not None:
-        limit, problem = yardstick_of(yardstick)
-        starts = problem.problem(agents, problem.complete_blocks(_FORMATIONS))
-        kernel = limit.Batch(*starts, np.float64 if bits == 64 else np.float32)
-    for _ in range(_TURNS):
-        if limit is not None:
-            found["C"].append(limit.rate(kernel, agents, _STEPS, 1)[0])
-        for name, (stepper, _) in steppers.items():
-            found[name].append(rate(stepper, agents, _STEPS, reference, bits))
-        for count, stepper in threads.items():
-            begin = time.perf_counter()
-            rate(stepper, agents, _STEPS, reference, bits)
-            walls[count].append(time.perf_counter() - begin)
-    best = {name: max(rates) for name, rates in found.items() if rates}
-    kind = f"formations of 4, float{bits}"
-    row = {f"{kind}, {name}, M/s": round(value / 1e6, 1) for name, value in best.items()}
-    row[f"{kind}, two threads to one"] = round(min(walls[1]) / min(walls[2]), 2)
-    if "C" in best:
-        row |= {f"{kind}, {name} to C": round(best[name] / best["C"], 3) for name in steppers}
-    return row
-
-
-def measure_sweep(runs: int) -> dict[str, float]:
-    """Return the CPU seconds of 10,000 formations for 1,000 steps, and of a sweep of `paper`."""
+def measure_fleet(_: Yardstick | None) -> Row:
+    """Return the CPU seconds of 10,000 formations of `paper` for 1,000 steps."""
     scenario = ech.load_scenario("paper", ["simulation.horizon=5", "report.steady_window=1"])
     parts, chosen = ech.build(scenario)
     chosen = chosen._replace(precision="float32", store_every=1_000)
-    fleet, row = Fleet(1), dict[str, float]()
+    fleet, row = Fleet(1), Row()
     for name in ("cold", "compiled"):
         begin = time.process_time()
         for first in range(0, 10_000, 2_500):
             seeds = range(first, first + 2_500)
             flights = fleet.fly([(parts, chosen._replace(seed=k)) for k in seeds])
-            assert all(each.outcome.reached for each in flights)
-        row[f"10,000 formations, 1,000 steps, {name}, CPU s"] = round(
-            time.process_time() - begin, 2
-        )
-    if runs:
-        began, begin = time.perf_counter(), time.process_time()
-        ech.sweep(ech.load_scenario("paper"), {"seed": range(runs)})
-        row |= {f"{runs} runs of `paper`, CPU s": round(time.process_time() - begin, 1)}
-        row |= {f"{runs} runs of `paper`, wall s": round(time.perf_counter() - began, 1)}
+            assert all(isinstance(each, ech.Result) and each.outcome.reached for each in flights)
+        told = f"10,000 formations, 1,000 steps, {name}, CPU s"
+        row[told] = round(time.process_time() - begin, 2)
     return row
 
 
-def missed(row: dict[str, float]) -> list[str]:
-    """Return what of some numbers is not as asked, in words."""
-    low = [f"{k} is {v}, asked {_ASKED[k]}" for k, v in row.items() if v < _ASKED.get(k, v)]
-    high = [f"{k} is {v}, asked {_AT_MOST[k]}" for k, v in row.items() if v > _AT_MOST.get(k, v)]
-    return low + high
+def measure_sweep(_: Yardstick | None) -> Row:
+    """Return what a sweep of 10,000 runs of `paper` takes, reckoned from 20 and 1,000."""
+    walls = list[float]()
+    for runs in (20, 1_000):
+        begin = time.perf_counter()
+        ech.sweep(ech.load_scenario("paper"), {"seed": range(runs)})
+        walls.append(time.perf_counter() - begin)
+    whole = walls[0] + 10.0 * walls[1]
+    return {"10,000 runs of `paper` with dataset, reckoned, wall s": round(whole, 1)}
+
+
+def measure_models(_: Yardstick | None) -> Row:
+    """Return what it takes to make native code of each bundled scenario's step."""
+    makes, loads = Row(), Row()
+    for name in ("paper", "unicycle", "van-der-pol", "planar-quadrotor", "yaw-turn", "integrators"):
+        parts, _ = ech.build(ech.load_scenario(name))
+        begin = time.process_time()
+        side = made.steppers(parts, 64)
+        makes[name] = time.process_time() - begin
+        loads[name] = min(_reloaded(program(side.native.plan)) for _ in range(3))
+    return {
+        "a model traced and compiled, the slowest, CPU s": round(max(makes.values()), 2),
+        "code of a model from the cache, the slowest, ms": round(1e3 * max(loads.values()), 1),
+    }
+
+
+def measure_gradient(_: Yardstick | None) -> Row:
+    """Return what a gradient of 200 steps takes, beside the steps alone and JAX's gradient."""
+    parts, steps = flock(ech.Graph.ring(104)), 200
+    side, chosen = made.steppers(parts, 64), ech.Settings(horizon=steps * made.DT, dt=made.DT)
+
+    def cost(sums: Any) -> Any:
+        return sums.errors[0].sum()
+
+    def differentiate(engine: Any) -> float:
+        begin = time.process_time()
+        ech.gradient(parts, chosen._replace(engine=engine), cost, ("P", "coupling"))
+        return 1.0 / (time.process_time() - begin)
+
+    def forward() -> float:
+        return rate(side.native, 104, [steps], side.reference, 64) / (104 * steps)
+
+    for engine in ("native", "jax"):
+        differentiate(engine)  # compiles
+    ways = {"JAX": partial(differentiate, "jax"), "forward": forward}
+    found = turns("", {"native": partial(differentiate, "native"), **ways})
+    return {
+        "gradient of 200 steps, to forward": round(1.0 / found[", to forward"], 2),
+        "gradient of 200 steps, to JAX": round(1.0 / found[", to JAX"], 3),
+    }
+
+
+def measure_command(_: Yardstick | None) -> Row:
+    """Return the wall time of `echelon run paper` when what it compiles is kept already."""
+    walls = list[float]()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "echelon", "run", "paper", "--no-figures", "--out"]
+        around = {
+            **os.environ,
+            "ECHELON_CACHE": folder,
+        }
+        for k in range(3):
+            begin = time.perf_counter()
+            subprocess.run(
+                [*command, f"{folder}/{k}"], env=around, check=True, stdout=subprocess.DEVNULL
+            )
+            walls.append(time.perf_counter() - begin)
+    return {"`echelon run paper` warm, without figures, wall s": round(min(walls[1:]), 2)}
+
+
+def measure_peers(_: Yardstick | None) -> Row:
+    """Return how much faster than crazyflow many formations are stepped, turn by turn."""
+    import peers
+
+    names = ["echelon, float32, RK4", "crazyflow, bare plant", "crazyflow, its controller"]
+    started = {name: peers.start(name, peers.ROOT / "build" / "peers") for name in names}
+    workers = {name: worker for name, worker in started.items() if worker is not None}
+    rates = {name: list[float]() for name in workers}
+    for _ in range(_TURNS):
+        for name, worker in workers.items():
+            rates[name].append(peers.ask(worker))
+    for worker in workers.values():
+        worker.communicate()
+    pairs = {name: zip(rates[names[0]], rates[name], strict=True) for name in [*rates][1:]}
+    found = {name: statistics.median(a / b for a, b in both) for name, both in pairs.items()}
+    return {f"echelon to {name}": round(value, 2) for name, value in found.items()}
+
+
+# ---- all of it -----------------------------------------------------------------------------------
+
+Measure: TypeAlias = Callable[[Yardstick | None], Row]
+_EACH = {"degree": measure_degree, "stored": measure_stored, "same": measure_same}
+_EACH |= {"formations": measure_formations}
+GROUPS: dict[str, list[Measure]] = {
+    "kernels": [
+        *(partial(measure_ring, 10_000, bits) for bits in _BITS),
+        *(partial(measure_ring, 10_000, bits, model=made.Newcomer()) for bits in _BITS),
+        *(partial(measure, bits) for measure in _EACH.values() for bits in _BITS),
+    ],
+    "million": [partial(measure_ring, _MILLION, bits) for bits in _BITS],
+    "geometric": [partial(measure_geometric, 32)],
+    "fleet": [measure_fleet, measure_sweep],
+    "models": [measure_models, measure_gradient, measure_command],
+    "peers": [measure_peers],
+}
+
+
+def _reloaded(text: str) -> float:
+    """Return the CPU seconds in which code is there again that was kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        Code(text, Path(folder))
+        begin = time.process_time()
+        Code(text, Path(folder))
+        return time.process_time() - begin
+
+
+def missed(row: Row) -> list[str]:
+    """Return what of some numbers is not as asked, or not there, in words."""
+    told = [f"{k} is missing" for k in (*_AT_LEAST, *_AT_MOST) if k not in row]
+    told += [f"{k} is {row[k]}, asked {v}" for k, v in _AT_LEAST.items() if row.get(k, v) < v]
+    return told + [f"{k} is {row[k]}, asked {v}" for k, v in _AT_MOST.items() if row.get(k, v) > v]
+
+
+def measured(groups: list[str], yardstick: Path | None) -> Iterator[Row]:
+    """Yield what is measured, each group in a process of its own."""
+    for group in groups:
+        command = [sys.executable, __file__, "--group", group]
+        command += ["--yardstick", str(yardstick)] * (yardstick is not None)
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+        yield from (json.loads(line) for line in done.stdout.splitlines() if line[:1] == "{")
 
 
 def main() -> int:
     """Measure and print; return 1 where a number is missed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--yardstick", type=Path, help="folder of the yardstick in C")
-    rings = [200, 10_000, 1_000_000]
-    parser.add_argument("--agents", type=int, nargs="*", default=rings, help="of rings")
-    parser.add_argument("--large", type=int, default=1_000_000, help="agents of the graph")
-    parser.add_argument("--runs", type=int, default=0, help="of the sweep")
+    parser.add_argument("--group", choices=GROUPS, help="measure here, and nothing else")
     parser.add_argument("--json", action="store_true", help="print JSON")
     asked = parser.parse_args()
-    makes = [partial(measure, n, bits, asked.yardstick) for n in asked.agents for bits in (64, 32)]
-    makes += [partial(measure_formations, bits, asked.yardstick) for bits in (64, 32)]
-    makes += [partial(measure_sweep, asked.runs)]
-    makes += [partial(measure_degree, asked.large, 32)] * bool(asked.large)
-    short = list[str]()
-    for make in makes:
-        row = make()
+    if asked.group is not None:
+        yardstick = None if asked.yardstick is None else Yardstick(asked.yardstick)
+        for measure in GROUPS[asked.group]:
+            print(json.dumps(measure(yardstick)), flush=True)
+        return 0
+    began, all_ = time.perf_counter(), Row()
+    for row in measured([*GROUPS], asked.yardstick):
+        all_ |= row
         said = json.dumps(row) if asked.json else "\n".join(f"{k} {v}" for k, v in row.items())
         print(said, flush=True)
-        short += missed(row)
+    short = missed(all_)
     print("\n".join(f"missed: {text}" for text in short), file=sys.stderr)
+    print(f"{time.perf_counter() - began:.0f} s of wall", file=sys.stderr)
     return int(bool(short) and asked.yardstick is not None)
 
 

@@ -6,6 +6,7 @@ needs a core of its own: the load of the machine is printed, and with a load abo
 tell of the neighbours.
 """
 
+import argparse
 import contextlib
 import json
 import os
@@ -204,9 +205,12 @@ def measure_video(agents: int, run: Path) -> None:
 
 def main() -> None:
     """Measure what is named, or all."""
-    names = sys.argv[1:] or [
-        f"{what}-{n}" for n in (4, 1000) for what in ("live", "replay", "video")
-    ]
+    every = [f"{what}-{n}" for n in (4, 1000) for what in ("live", "replay", "video")]
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(every)}")
+    names = parser.parse_args().names or every
+    if unknown := set(names) - {*every}:
+        parser.error(f"{', '.join(sorted(unknown))} is none of {', '.join(every)}")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f}; {json.dumps(names)}")
     folder, made = Path(tempfile.mkdtemp()), dict[int, Path]()
     for name in names:

@@ -29,7 +29,7 @@ Turn = Callable[[], int]
 def echelon(bits: int, integrator: str) -> Turn:
     """2,500 formations of 4 with leader, consensus, motor limits, RK4 or Euler, and all sums."""
     sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
-    from engine import formations
+    from steppers import FORMATIONS, STEPS, formations
 
     from echelon.core.numerics import precision
 
@@ -38,8 +38,8 @@ def echelon(bits: int, integrator: str) -> Turn:
 
     def turn() -> int:
         with precision(f"float{bits}"):  # type: ignore[arg-type]
-            stepper.advance(stepper.start(), np.array([300], np.int32), reference)
-        return 2_560 * 4 * 300
+            stepper.advance(stepper.start(), np.array([STEPS], np.int32), reference)
+        return 4 * FORMATIONS * STEPS
 
     return turn
 
@@ -196,7 +196,7 @@ def start(name: str, envs: Path) -> "subprocess.Popen[str] | None":
     try:
         python = python_of(WORKERS[name][0], envs)
     except (OSError, subprocess.CalledProcessError) as error:
-        print(f"{name}: its environment cannot be made: {error}")
+        print(f"{name}: its environment cannot be made: {error}", file=sys.stderr)
         return None
     command = [python, __file__, "--worker", name]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -205,7 +205,7 @@ def start(name: str, envs: Path) -> "subprocess.Popen[str] | None":
     for line in worker.stdout:
         if line == "ready\n":
             return worker
-    print(f"{name}: ended before it was ready; what stands above says why")
+    print(f"{name}: ended before it was ready; what stands above says why", file=sys.stderr)
     return None
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from echelon.kernels import SLOTS, Body, Code, Graph, Plan, aligned, lower, nodes, program
+from echelon.kernels import SLOTS, Body, Code, Graph, Plan, aligned, lower, nodes, program, shared
 
 NOTHING = Body({}, {}, {}, {}, {}, [], [], [])
 
@@ -17,7 +17,7 @@ def lowered(function, count, bits=64):
 
 
 def text_of(function, count, bits=64, lanes=None):
-    """Return the code of a function, and how many results it has."""
+    """Return the code of a function, how many results it has, and its plan."""
     results = lowered(function, count, bits)
     body = NOTHING._replace(stores=dict(enumerate(results, count)))
     plan = Plan(
@@ -38,13 +38,13 @@ def text_of(function, count, bits=64, lanes=None):
         table=0,
         dt=0.0,
     )
-    return program(plan), len(results)
+    return program(plan), len(results), plan
 
 
 def run(function, columns, bits=64, lanes=None, cache=None):
     """Return what a function for JAX makes of columns (count, N), as (results, N)."""
     lanes, (count, agents) = lanes or 512 // bits, columns.shape
-    text, results = text_of(function, count, bits, lanes)
+    text, results, plan = text_of(function, count, bits, lanes)
     blocks, dtype = -(-agents // lanes), np.float64 if bits == 64 else np.float32
     rows = aligned((blocks, count + results, lanes), dtype)
     padded = np.resize(columns.T, (blocks * lanes, count))
@@ -52,6 +52,8 @@ def run(function, columns, bits=64, lanes=None, cache=None):
     segments, slots = np.array([0, blocks], np.int64), np.zeros(len(SLOTS), np.int64)
     values = {"rows": rows.ctypes.data, "segments": segments.ctypes.data}
     values |= {"starts": segments.ctypes.data, "ends": segments[1:].ctypes.data}
+    common = aligned((1 + len(shared(plan)),), dtype)
+    values |= {"common": common.ctypes.data}
     values |= dict.fromkeys(("steps", "levels", "groups", "threads"), 1)
     for name, value in values.items():
         slots[SLOTS.index(name)] = value

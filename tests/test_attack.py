@@ -131,8 +131,15 @@ def test_a_drift_that_contracts_by_itself_takes_any_coupling():
 # ---- awkward agents ----
 
 
-@pytest.mark.parametrize("count", [8, pytest.param(100, marks=pytest.mark.slow)])
-def test_no_promise_for_an_awkward_agent_is_false(count):
+@pytest.mark.parametrize(
+    ("count", "least"),
+    [
+        (8, 0),
+        pytest.param(30, 3, marks=pytest.mark.slow),
+        pytest.param(100, 10, marks=pytest.mark.study),
+    ],
+)
+def test_no_promise_for_an_awkward_agent_is_false(count, least):
     found = [try_specimen(3, number) for number in range(count)]
     assert [r for r in found if r.get("violations")] == []
-    assert count < 100 or sum("promised" in r for r in found) >= 10
+    assert sum("promised" in r for r in found) >= least

@@ -76,6 +76,31 @@ def test_a_chain_heard_one_way_has_one_eigenvalue_whatever_its_order():
     assert graph.neighbours(int(order[5])) == (order[4],)
 
 
+def test_one_way_everybody_hears_those_that_are_nearer_to_a_leader():
+    drawn = ech.Graph.geometric(30, 0.35, seed=2, leaders=(0, 7))
+    heavy = ech.Graph([(i, j, 1.0 + i + 0.1 * j) for i, j in drawn.edges], drawn.leaders)
+    y = np.random.default_rng(0).normal(size=(30, 2))
+    for graph in (drawn, heavy, ech.Graph.grid(4, 5), ech.Graph.complete(6)):
+        # NetworkX knows how far everybody is, and the sums are written out.
+        far = nx.multi_source_dijkstra_path_length(
+            nx.Graph(graph.edges.tolist()), set(graph.leaders)
+        )
+        wanted = np.zeros((graph.agents, 2))
+        for (i, j), w in zip(graph.edges.tolist(), graph.weights, strict=True):
+            for a, b in ((i, j), (j, i)):
+                wanted[a] += w * (far[b] < far[a]) * (y[a] - y[b])
+        one_way = graph.one_way()
+        assert one_way.directed and one_way.leaders == graph.leaders
+        with precision("float64"):
+            found = one_way.disagreement(jnp.asarray(y[: graph.agents]))
+        np.testing.assert_allclose(found, wanted, atol=1e-13)
+        np.testing.assert_array_equal(one_way.one_way().edges, one_way.edges)
+    scenario = ech.load_scenario(
+        "paper", ["graph={name: grid, rows: 2, columns: 2, directed: true}"]
+    )
+    assert ech.build(scenario)[0].graph == ech.Graph.grid(2, 2).one_way()
+
+
 def test_weights_that_floats_can_hardly_add_keep_their_smallest_eigenvalue():
     # Of a circle of two, one light way in: the determinant over the trace, to rounding.
     light = 1e-9

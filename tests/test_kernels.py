@@ -12,7 +12,7 @@ from lanes import lowered, run, text_of
 from scipy.special import erf
 
 from echelon.core.numerics import precision
-from echelon.kernels import Graph, Unsupported
+from echelon.kernels import Graph, Unsupported, native
 
 rng = np.random.default_rng(7)
 WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)
@@ -150,6 +150,18 @@ def both(v):
     return jnp.where(v[1] > 0.5, near, far)
 
 
+def chained(v):
+    """What one side needs rests on a choice by the same truth, which needs the same side."""
+    first = v
+    for _ in range(8):
+        first = jnp.cos(first) + 0.2 * first[::-1]
+    chosen = jnp.where(v[0] > 0.2, first, v) + 1.0
+    second = chosen
+    for _ in range(8):
+        second = jnp.exp(-second * second) + 0.3 * second[::-1]
+    return jnp.concatenate([jnp.where(v[0] > 0.2, second, chosen), chosen])
+
+
 def metres(v):
     M = jnp.array([[2.0, 0.1, 0.0], [0.1, 3.0, 0.2], [0.0, 0.2, 1.0]]) + jnp.diag(v**2)
     return jnp.concatenate([jnp.linalg.solve(M, v), jnp.linalg.inv(M)[0]])
@@ -178,6 +190,8 @@ PROGRAMS = {
     "a branch": branch,
     "much behind a branch": much,
     "much on both sides": both,
+    "much that rests on a choice by the same truth": jnp.sinc,
+    "much on the one side of a choice and of the next": chained,
     "equations": metres,
     "equations that need a pivot": pivoted,
     "a root of a matrix": halves,
@@ -197,6 +211,117 @@ def test_bits_are_the_same_for_vectors_of_all_widths(name):
     whole = run(PROGRAMS[name], columns, lanes=8)
     for lanes in (2, 4, 16):
         assert run(PROGRAMS[name], columns, lanes=lanes).tobytes() == whole.tobytes()
+
+
+KNOTS = jnp.linspace(-1.0, 1.0, 7)
+TABLE = jnp.array([0.0, 1.0, 4.0, 2.0, 3.0, -1.0, 0.5])
+
+
+def whole(v):
+    return jnp.floor(3.0 * v[0]).astype(int)
+
+
+def triangles(v):
+    A, kinds = jnp.eye(3) * 3.0 + jnp.outer(v, v), [(True, 0), (False, 0), (True, 1), (False, 2)]
+    solved = [
+        jax.scipy.linalg.solve_triangular(A, v, lower=low, trans=turned, unit_diagonal=turned == 2)
+        for low, turned in kinds
+    ]
+    right = jax.lax.linalg.triangular_solve(A, v[None], left_side=False, lower=True)
+    return jnp.concatenate([*solved, right[0], jax.scipy.linalg.cho_solve((A, True), v)])
+
+
+def factors(v):
+    # Without a pivot it would be divided by next to nothing.
+    A = jnp.array([[1e-9, 2.0, 1.0], [3.0, 0.5, 0.0], [1.0, 0.0, 4.0]]) + jnp.diag(v * v)
+    P, L, U = jax.scipy.linalg.lu(A)
+    sign, size = jnp.linalg.slogdet(A)
+    return jnp.concatenate([P.ravel(), L.ravel(), U.ravel(), jnp.stack([sign, size])])
+
+
+PICKS = {
+    "a curve through points": lambda v: jnp.interp(v, KNOTS, TABLE),
+    "a place among points": lambda v: jnp.searchsorted(KNOTS, v, side="right") * 1.0,
+    "the largest": lambda v: jnp.stack([jnp.argmax(v), jnp.argmin(v), v[jnp.argmax(v)]]),
+    "order": lambda v: jnp.concatenate([jnp.sort(v), jnp.argsort(v), -jnp.sort(-v)[:1]]),
+    "a middle": jnp.median,
+    "entries of a table": lambda v: jnp.concatenate(
+        [
+            TABLE[whole(v)][None],
+            jnp.take(TABLE, whole(v) + jnp.arange(2), mode="clip"),
+            TABLE[1:][jnp.array([whole(v), 1])],
+        ]
+    ),
+    "an entry that is not there": lambda v: TABLE.at[jnp.abs(whole(v)) + 4].get(
+        mode="fill", fill_value=jnp.nan
+    ),
+    "rows of a state": lambda v: jax.lax.dynamic_slice(v, (jnp.argmax(v),), (2,)),
+    "an entry that is set": lambda v: jnp.concatenate(
+        [v.at[whole(v)].set(7.0), v.at[whole(v)].add(0.5), v.at[jnp.argmin(v)].set(v[0])]
+    ),
+    "rows that are set": lambda v: jax.lax.dynamic_update_slice(v, v[1:] * 2.0, (whole(v),)),
+    "an entry of a matrix": lambda v: jnp.outer(v, v)[jnp.argmax(v), jnp.argmin(v)],
+    "cases": lambda v: jax.lax.switch(whole(v), [jnp.sin, lambda u: 2.0 * u, jnp.square], v),
+    "cases by truths": lambda v: jnp.select([v[0] < 0.0, v[1] > 0.0], [v[0], v[1]], v[2]),
+    "whole numbers": lambda v: (
+        jnp.stack(
+            [
+                whole(v) // 2,
+                whole(v) % 3,
+                jax.lax.div(whole(v), 2),
+                (v[1] * 9.0).astype(int),
+                -whole(v),
+            ]
+        )
+        * 1.0
+    ),
+    "products": lambda v: jnp.concatenate(
+        [jnp.cumprod(v), jax.lax.cumprod(v, reverse=True), jnp.cumsum(v)]
+    ),
+    "triangles": triangles,
+    "factors": factors,
+    "an exponential of a matrix": lambda v: jax.scipy.linalg.expm(jnp.outer(v, v[::-1])).ravel(),
+}
+
+
+@pytest.mark.parametrize("name", PICKS)
+def test_what_agents_pick_is_what_jax_picks(name):
+    columns = rng.normal(size=(3, 41))
+    found, wanted = run(PICKS[name], columns), by_jax(PICKS[name], columns)
+    np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-13)
+
+
+def test_what_is_no_number_is_picked_and_ordered_as_by_jax():
+    columns = np.array(list(itertools.product([np.nan, 1.0, -np.inf, np.inf], repeat=3))).T
+
+    def function(v):
+        large = jnp.where(jnp.isfinite(v), v, 0.0) * 3e9
+        return jnp.concatenate(
+            [
+                jnp.stack([jnp.argmax(v), jnp.argmin(v)]) * 1.0,
+                jnp.sort(v),
+                jnp.argsort(v) * 1.0,
+                v.astype(jnp.int32) * 1.0,
+                large.astype(jnp.int32) * 1.0,
+                (-large).astype(jnp.uint32) * 1.0,
+            ]
+        )
+
+    np.testing.assert_array_equal(run(function, columns), by_jax(function, columns))
+
+
+@pytest.mark.parametrize(
+    ("function", "told"),
+    [
+        (lambda v: jnp.interp(v[0], jnp.linspace(0, 1, 99), jnp.ones(99)), "a table of 99 places"),
+        (lambda v: jnp.sort(jnp.concatenate([v, v, v])), "`sort` of 9 entries"),
+        (lambda v: v.at[jnp.stack([whole(v), 0])].set(1.0), "`scatter` of more than one entry"),
+        (lambda v: (whole(v) & 1) * 1.0, "`and` of whole numbers"),
+    ],
+)
+def test_what_is_too_much_to_pick_from_is_told(function, told):
+    with pytest.raises(Unsupported, match=f"{told} in .*test_kernels.py, line"):
+        text_of(function, 3)
 
 
 LEAVES = [lambda v: v[0], lambda v: v[1], lambda v: v[2], lambda v: 0.7, lambda v: -1.3]
@@ -280,10 +405,9 @@ def ends_by_itself(v):
     ("function", "told"),
     [
         (ends_by_itself, "a `while` loop"),
-        (lambda v: jnp.sort(v), "`sort`"),
+        (lambda v: jnp.abs(jnp.fft.fft(v)), "`convert_element_type` to complex128"),
         (lambda v: jax.lax.fori_loop(0, 999, lambda k, x: jnp.sin(x), v), "a loop of 999 rounds"),
         (lambda v: jnp.linalg.eigvalsh(jnp.outer(v, v)), "`eigh`"),
-        (lambda v: v[jnp.argmax(v)], "`argmax`"),
     ],
 )
 def test_what_has_no_code_is_told_with_file_and_line(function, told):
@@ -312,6 +436,29 @@ def test_whatever_is_traced_has_code_or_is_refused_in_words(function):
         assert str(refused)
     else:
         np.testing.assert_allclose(found, by_jax(function, columns), rtol=1e-12)
+
+
+LESS = {
+    "avx512": "vectors of 256 bits, with fused multiply-add",
+    "avx512 avx2 avx fma": "vectors of 128 bits, without fused multiply-add",
+    "avx512 avx2 avx fma sse4": "vectors of 128 bits, without fused multiply-add",
+}
+
+
+@pytest.mark.parametrize("without", LESS)
+@pytest.mark.parametrize("bits", [64, 32])
+def test_a_processor_with_less_computes_the_same_and_says_what_it_has(monkeypatch, without, bits):
+    function, columns = PROGRAMS["a loop"], rng.normal(size=(3, 40))
+    whole = run(function, columns, bits)
+    has = native.features().split(",")
+    less = [f"-{x[1:]}" if x[1:].startswith(tuple(without.split())) else x for x in has]
+    monkeypatch.setattr(native, "features", lambda: ",".join(less))
+    if "+avx512f" in has:
+        assert native.vectors().endswith(LESS[without])
+    found = run(function, columns, bits)
+    if "fma" not in without:
+        assert found.tobytes() == whole.tobytes()
+    np.testing.assert_allclose(found, whole, rtol=1e-13 if bits == 64 else 1e-5)
 
 
 def test_what_was_compiled_is_kept_and_a_damaged_file_is_made_again(tmp_path):

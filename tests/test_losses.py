@@ -355,6 +355,14 @@ def test_a_changed_scenario_does_not_go_on(here, echelon):
     code, _, err = echelon("run", "--resume", "o")
     assert code == 2 and "was changed since the run began" in err
     swing.write_text(OWN_PENDULUM)
+    begun = here / "o" / "chunks" / "begun.json"
+    before = begun.read_text()
+    told = json.loads(before)
+    told["versions"]["jax"] = "0.1.0"
+    begun.write_text(json.dumps(told))
+    code, _, err = echelon("run", "--resume", "o")
+    assert code == 2 and "was begun under jax `0.1.0`, and this is" in err
+    begun.write_text(before)
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
     for name in ("nowhere", "models"):
         code, _, err = echelon("run", "--resume", name)

@@ -1,5 +1,9 @@
 """Native steps against JAX's: states, inputs, sums and moments, for all that a run may have."""
 
+import time
+from concurrent import futures
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,15 +20,25 @@ QUADROTOR = ech.models.Quadrotor()
 CIRCLE = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5))
 
 
-def stepped(parts, chosen, counts, engine):
-    """Return the chunk of some frames, and the stepper, by one of the engines."""
+def ready(parts, chosen, engine):
+    """Return what is to be flown and the stepper, by one of the engines."""
     prepared = prepare(parts, chosen._replace(engine=engine))
-    stepper = prepared.parts.drive.stepper(prepared.problem)
+    return prepared, prepared.parts.drive.stepper(prepared.problem)
+
+
+def steps_of(prepared, stepper, chosen, counts):
+    """Return the chunk of some frames from the start."""
     with jax.enable_x64(chosen.precision == "float64"):
         times = chosen.dt * jnp.arange(int(np.sum(counts)) + 1)
         wanted = prepared.parts.drive.reference_states(prepared.parts.model, times)
         wanted = None if wanted is None else np.asarray(wanted, float)
-        return stepper.advance(stepper.start(), np.array(counts), wanted), stepper
+        return stepper.advance(stepper.start(), np.array(counts), wanted)
+
+
+def stepped(parts, chosen, counts, engine):
+    """Return the chunk of some frames, and the stepper, by one of the engines."""
+    prepared, stepper = ready(parts, chosen, engine)
+    return steps_of(prepared, stepper, chosen, counts), stepper
 
 
 def check_alike(parts, chosen, counts=(1, 0, 17, 60, 0), tolerance=1e-13):
@@ -158,12 +172,17 @@ def test_single_precision_is_that_of_jax_to_its_own_rounding():
 # ---- the same bits, however it is cut ----
 
 
+@pytest.fixture(scope="module")
+def six():
+    chosen = run_settings()
+    return *ready(flock(ech.Graph.path(6)), chosen, "native"), chosen
+
+
 @given(cuts=st.lists(st.integers(0, 30), min_size=1, max_size=6))
 @settings(max_examples=8)
-def test_bits_do_not_depend_on_where_a_run_is_cut(cuts):
-    parts, chosen = flock(ech.Graph.path(6)), run_settings()
-    whole, _ = stepped(parts, chosen, [sum(cuts)], "native")
-    cut, stepper = stepped(parts, chosen, cuts, "native")
+def test_bits_do_not_depend_on_where_a_run_is_cut(six, cuts):
+    _, stepper, _ = six
+    whole, cut = (steps_of(*six, counts) for counts in ([sum(cuts)], cuts))
     assert cut.now.states.tobytes() == whole.now.states.tobytes()
     with jax.enable_x64(True):
         kept = stepper.recall(numbers(cut.now))
@@ -198,6 +217,41 @@ def test_bits_do_not_depend_on_threads():
     assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, alone.sums, strict=True))
 
 
+def test_threads_of_which_not_all_were_started_do_not_wait_for_the_others():
+    did = []
+
+    class Interrupted(ThreadPoolExecutor):
+        def submit(self, *args):
+            if self._threads:
+                raise KeyboardInterrupt
+            return super().submit(*args)
+
+    with Interrupted(2) as pool, pytest.raises(KeyboardInterrupt):
+        crew.share(pool, did.append, range(2))
+    # The pool has ended, and so has its thread.
+    assert did == []
+
+
+def test_what_threads_write_to_lives_until_they_end(monkeypatch):
+    did, calls = [], []
+
+    def wait(begun):
+        calls.append(len(begun))
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        futures.wait(begun)
+
+    def act(part):
+        time.sleep(0.05)
+        did.append(part)
+
+    monkeypatch.setattr(crew, "wait", wait)
+    with ThreadPoolExecutor(2) as pool:
+        with pytest.raises(KeyboardInterrupt):
+            crew.share(pool, act, range(2))
+        assert sorted(did) == [0, 1] and calls == [2, 2]
+
+
 # ---- what is told ----
 
 
@@ -210,24 +264,24 @@ def test_long_runs_are_native_and_short_ones_are_not():
     assert short.engine == "jax" and not short.warnings
 
 
-class Sorts(ech.laws.Law):
+class Bends(ech.laws.Law):
     """Uses what has no native code."""
 
     def update(self, model, view, memory):
-        return jnp.sort(view.disagreement)[:1] * 0.0, memory
+        return jax.scipy.special.erfinv(view.disagreement)[:1] * 0.0, memory
 
 
 def test_what_has_no_native_code_runs_by_jax_and_says_why():
     model, graph = ech.models.Pendulum(), ech.Graph.path(2)
-    drive = ech.Laws(ech.laws.TrimInput(), Sorts())
+    drive = ech.Laws(ech.laws.TrimInput(), Bends())
     parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 2))), drive)
-    told = r"there is no native code for `sort` in .*test_native\.py, line \d+"
+    told = r"there is no native code for `erf_inv` in .*test_native\.py, line \d+"
     with pytest.raises(ech.errors.SimulationError, match=rf"^`engine` is `native`, and {told}\.$"):
         ech.simulate(parts, run_settings(engine="native"))
     found = ech.simulate(parts, run_settings(horizon=600.0, dt=0.01, store_every=1000))
     assert found.engine == "jax"
     [warning] = [w for w in found.warnings if w.startswith("JAX steps the agents")]
-    assert "`sort`" in warning
+    assert "`erf_inv`" in warning
 
 
 def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():

@@ -7,6 +7,7 @@ import signal
 import types
 
 import distributed
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from typer.testing import CliRunner
 
 import echelon as ech
 from echelon.cli.app import app
+from echelon.engine import laws, many
 from echelon.engine.many import Fleet
 from echelon.plots.sweep import sweep_figures
 from echelon.promises.promise import promise, promises
+from echelon.scenario.yaml import inline_yaml
 from echelon.sweeps import crew as sweeps
 from echelon.sweeps.axes import Axis, axes_of, read_axes
 from echelon.sweeps.crew import Batch
@@ -174,6 +177,56 @@ def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
         check_same(one, ech.simulate(*run))
 
 
+# ---- what has no native code ----
+
+
+class Bends(ech.laws.Law):
+    """Feeds back what it hears, and uses what has no native code."""
+
+    gain: float = 1.0
+
+    def update(self, model, view, memory):
+        heard = jax.scipy.special.erfinv(jnp.tanh(view.disagreement))
+        return -self.gain * heard, memory
+
+
+def test_runs_without_native_code_are_stepped_side_by_side_and_say_why(monkeypatch):
+    monkeypatch.setattr(laws, "_WORTH", 100)
+    model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
+    wind = ech.World(disturbance=ech.Disturbance(rms={"position": 0.3}, hold=0.05))
+    chosen, runs = ech.Settings(horizon=0.5, dt=0.01, store_every=10), []
+    for gain in (1.0, 0.5):
+        drive = ech.Laws(ech.laws.TrimInput(), Bends(gain))
+        formation = ech.Formation.line(model, graph)
+        parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0}, world=wind)
+        runs += [(parts, chosen._replace(seed=k)) for k in (3, 4)]
+    alone = [ech.simulate(*run) for run in runs]
+    monkeypatch.setattr(many, "simulate", None)
+    for one, other in zip(Fleet(1).fly(runs), alone, strict=True):
+        check_same(one, other, 1e-13)
+        [told] = one.warnings
+        assert "no native code for `erf_inv` in" in told and "test_sweep.py, line" in told
+
+
+def test_a_start_that_a_law_refuses_is_refused_among_many():
+    class Picky(ech.laws.Law):
+        def update(self, model, view, memory):
+            return -view.disagreement, memory
+
+        def refusals(self, model, states):
+            return [(k, "too far") for k in np.flatnonzero(np.abs(states).max(axis=1) > 2.6)]
+
+    model, graph = ech.models.SingleIntegrator(dimension=2), ech.Graph.path(3)
+    drive = ech.Laws(ech.laws.TrimInput(), Picky())
+    formation = ech.Formation.line(model, graph)
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
+    found = list(Fleet(1).fly([(parts, chosen._replace(seed=k)) for k in range(12)]))
+    told = {str(each) for each in found if isinstance(each, ech.EchelonError)}
+    assert told == {"agent 2 starts where its law has no meaning: too far."}
+    assert any(isinstance(each, ech.Result) for each in found)
+
+
 # ---- what is promised ----
 
 
@@ -232,6 +285,30 @@ def test_a_sweep_is_each_of_its_runs():
             assert int(here["outcome"]) == 0 and int(here["promised"]) == int(
                 promise(run.parts, run.settings).promised
             )
+
+
+def test_formations_and_schedules_in_a_sweep_are_those_of_single_runs_by_jax():
+    turns = [{"at": 0.3, "edges": [[0, 2], [2, 3], [3, 1]]}]
+    ring = {"edges": [[0, 1], [1, 2], [2, 3]], "schedule": turns, "period": 0.7}
+    base = ["simulation.horizon=2", "report.steady_window=1", f"graph={inline_yaml(ring)}"]
+    over = {
+        "graph.schedule": [
+            turns,
+            [{"at": 0.2, "edges": [[0, 3], [1, 3]]}, {"at": 0.5, "edges": [[0, 1], [1, 2]]}],
+        ],
+        "formation.offsets": [{1: [1, 0, 0], 2: [1, 0.8, 0]}, {3: [0, 0, 2]}],
+        "seed": [3, 4, 5],
+    }
+    found = ech.sweep(ech.load_scenario("integrators", [*base, "simulation.engine=native"]), over)
+    assert (found["engine"] == "native").all() and (found["outcome"] == 0).all()
+    errors = found["final_error"].values
+    assert len(np.unique(errors[..., 1:].sum(axis=-1))) == 12
+    for place in ((0, 0, 1), (0, 1, 2), (1, 0, 0), (1, 1, 2)):
+        pairs = zip(over.items(), place, strict=True)
+        changes = [f"{key}={inline_yaml(values[k])}" for (key, values), k in pairs]
+        run = ech.run(ech.load_scenario("integrators", [*base, "simulation.engine=jax", *changes]))
+        alone = np.linalg.norm(run.errors[-1], axis=-1)
+        np.testing.assert_allclose(errors[place][1:], alone[1:], rtol=1e-11)
 
 
 def test_what_cannot_be_made_is_refused_and_the_others_run():

@@ -86,7 +86,7 @@ def walk(
 
     # Equations stand in order and assign once, so one pass binds every variable before its use.
     for equation in _used(jaxpr):
-        results = _apply(equation, [read(v) for v in equation.invars], algebra)
+        results = apply(equation, [read(v) for v in equation.invars], algebra)
         values |= dict(zip(equation.outvars, results, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
@@ -101,8 +101,8 @@ def _used(jaxpr: Any) -> list[Any]:
     return found[::-1]
 
 
-def _apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
-    """Return the results of one equation."""
+def apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
+    """Return the results of one equation for arrays of entries or of numbers."""
     name = equation.primitive.name
     if name in INLINED:
         inner = _inner_jaxpr(equation)
@@ -116,6 +116,8 @@ def _apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[
     # It only keeps XLA from reordering, and nothing is reordered here.
     if name == "optimization_barrier":
         return operands
+    if name in PLACED | ADDED and _is_open(equation, operands):
+        return algebra.unknown(equation, operands)
     if name in PLACED:
         return _place(equation, operands, algebra.outside)
     if name in ADDED:
@@ -160,11 +162,25 @@ ADDED = {"scatter-add", "scatter_add", "cumsum"}
 """Primitives that are linear in their entries, with weights of any kind."""
 
 
+_INDICES: dict[str, tuple[int, int | None]] = {
+    **{name: (1, 2) for name in ("gather", "scatter", "scatter-add", "scatter_add")},
+    "dynamic_slice": (1, None),
+    "dynamic_update_slice": (2, None),
+}
+"""Which operands say where: from the first number to before the second."""
+
+
 def _inner_jaxpr(equation: Any) -> Any:
     """Return the jaxpr, closed or not, that an equation of an `INLINED` primitive calls."""
     return next(
         equation.params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in equation.params
     )
+
+
+def _is_open(equation: Any, operands: list[np.ndarray]) -> bool:
+    """Tell whether an index is an entry, so that where it points is not known."""
+    first = _INDICES.get(equation.primitive.name)
+    return first is not None and any(a.dtype == object for a in operands[first[0] : first[1]])
 
 
 def each(function: Callable[..., object], *arrays: np.ndarray) -> np.ndarray:

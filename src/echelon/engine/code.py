@@ -1,8 +1,9 @@
 """The code that steps loops, made once for those that are alike but for their numbers."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, MutableMapping
 from pathlib import Path
 from typing import NamedTuple, final
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -33,8 +34,17 @@ class _Kernel(NamedTuple):
     common: int
 
 
-def _kernel(own: Own, bits: int, together: bool, lines: bool, weighted: bool) -> _Kernel:
+def _kernel(
+    own: Own,
+    bits: int,
+    together: bool,
+    lines: bool,
+    weighted: bool,
+    codes: MutableMapping[str, Code],
+) -> _Kernel:
     """Return the code that steps some loops, the rows that it works on, and its plan.
+
+    `codes` are those that were made, by their texts: other graphs are other numbers in the same.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -61,7 +71,9 @@ def _kernel(own: Own, bits: int, together: bool, lines: bool, weighted: bool) ->
     )
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
-    code = Code(program(plan), Path(cache) if cache else None)
+    text = program(plan)
+    code = codes.get(text) or Code(text, Path(cache) if cache else None)
+    codes[text] = code
     return _Kernel(code, rows, plan, len(shared(plan)))
 
 
@@ -72,6 +84,7 @@ class Kernels:
     def __init__(self) -> None:
         """Begin with none."""
         self._made: dict[Hashable, _Kernel] = {}
+        self._codes: MutableMapping[str, Code] = WeakValueDictionary()
 
     def of(
         self, own: Own, bits: int, together: bool, lines: bool = False, weighted: bool = False
@@ -81,11 +94,12 @@ class Kernels:
         Raises:
             Unsupported: a law or the model uses what has no scalar operations.
         """
-        # The rows too: those of wind and noise are there only where these are.
-        key = (own.signature, Rows.of(own.loop, own.count), bits, together, lines, weighted)
+        # Of wind and noise too: their rows are there only where these are.
+        wind = jax.tree.structure(own.loop.motion.wind)
+        key = (own.signature, wind, bits, together, lines, weighted)
         if key not in self._made:
             # The oldest goes: a sweep over models has one after the other.
             while len(self._made) >= _KEPT:
                 self._made.pop(next(iter(self._made)))
-            self._made[key] = _kernel(own, bits, together, lines, weighted)
+            self._made[key] = _kernel(own, bits, together, lines, weighted, self._codes)
         return self._made[key]

@@ -3,9 +3,10 @@
 import ctypes
 import os
 import sys
-from collections.abc import Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from functools import cache
+from threading import Event
 from typing import Any, final
 
 import numpy as np
@@ -79,7 +80,7 @@ class Crew:
             fly(groups)
             return
         # More parts than threads, since another process may take a processor from one of them.
-        list(self.pool.map(fly, np.array_split(groups, min(len(groups), 8))))
+        share(self.pool, fly, np.array_split(groups, min(len(groups), 8)))
 
     def _swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
@@ -100,7 +101,32 @@ class Crew:
             _call(code, values | told, firsts | parts)
 
         # A thread each, since they wait for each other.
-        list(self._own.map(fly, range(count)))
+        share(self._own, fly, range(count))
+
+
+def share(pool: Executor, act: Callable[[Any], None], parts: Iterable[Any]) -> None:
+    """Let threads act on a part each, all of them or, where Ctrl-C falls between, none.
+
+    Those that began would else wait for ever for those that did not.
+    """
+    gate, whole, begun = Event(), list[bool](), list[Future[None]]()
+
+    def begin(part: Any) -> None:
+        gate.wait()
+        if whole:
+            act(part)
+
+    try:
+        begun += [pool.submit(begin, part) for part in parts]
+        whole.append(True)
+        gate.set()
+        wait(begun)
+    finally:
+        gate.set()
+        # The memory that they write to must live until they end, also after Ctrl-C.
+        wait(begun)
+    for each in begun:
+        each.result()
 
 
 def _from(starts: Array, ends: Array) -> dict[str, Array]:

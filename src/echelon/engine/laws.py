@@ -1,5 +1,6 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, final
 
 import jax
@@ -94,13 +95,18 @@ class Laws(Drive):
         Raises:
             LawError: one is refused.
         """
-        graph = problem.graph
+        refused = self.refusals(problem.model, problem.graph, problem.states[None])
+        for _, agent, text in refused:
+            raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")
+
+    def refusals(
+        self, model: ControlAffine, graph: Graph, states: Array
+    ) -> Iterator[tuple[int, int, str]]:
+        """Yield which of many starts (K, N, n) a law cannot take: which, the agent, and why."""
         for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
-            refused = law.refusals(problem.model, problem.states[list(agents)])
-            for place, text in refused:
-                raise LawError(
-                    f"agent {agents[place]} starts where its law has no meaning: {text}."
-                )
+            starts = states[:, list(agents)].reshape(-1, states.shape[2])
+            for place, text in law.refusals(model, starts):
+                yield place // len(agents), agents[place % len(agents)], text
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
         """Return the warnings of both laws, and what of the reference the leaders cannot do."""
@@ -139,15 +145,42 @@ class Laws(Drive):
             SimulationError: native code is asked for, and cannot be made.
         """
         loop, settings = assemble(problem, self.leader, self.follower), problem.settings
-        by_jax = JaxStepper(loop, problem.states, devices=settings.devices)
-        if not worth_native(settings, len(problem.states)):
-            return by_jax
-        try:
-            return NativeStepper([loop], problem.states, int(settings.precision[5:]), by_jax)
-        except (Unsupported, MissingExtraError) as error:
-            if settings.engine == "native":
-                raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
-            return JaxStepper(loop, problem.states, _in_words(error))
+        states, devices = problem.states, settings.devices
+
+        def native() -> Stepper:
+            bits = int(settings.precision[5:])
+            return NativeStepper([loop], states, bits, JaxStepper(loop, states))
+
+        return choose_stepper(
+            settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
+        )
+
+
+def choose_stepper(
+    settings: Settings,
+    agents: int,
+    native: Callable[[], Stepper],
+    by_jax: Callable[[str], Stepper],
+) -> Stepper:
+    """Return what steps so many agents.
+
+    Args:
+        settings: of the run.
+        agents: how many.
+        native: makes native code.
+        by_jax: takes why there is none, in words; empty where none is wanted.
+
+    Raises:
+        SimulationError: native code is asked for, and cannot be made.
+    """
+    if not worth_native(settings, agents):
+        return by_jax("")
+    try:
+        return native()
+    except (Unsupported, MissingExtraError) as error:
+        if settings.engine == "native":
+            raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
+        return by_jax(_in_words(error))
 
 
 _WORTH = 100_000
@@ -161,10 +194,14 @@ def worth_native(settings: Settings, agents: int) -> bool:
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1:
+    if settings.devices > 1 or not is_long(settings, agents):
         return False
-    long = settings.steps * agents >= _WORTH
-    return long and is_installed() and jax.default_backend() == "cpu"
+    return is_installed() and jax.default_backend() == "cpu"
+
+
+def is_long(settings: Settings, agents: int) -> bool:
+    """Tell whether it pays to compile something else than the steps of a run alone."""
+    return settings.engine == "native" or settings.steps * agents >= _WORTH
 
 
 def _in_words(error: EchelonError) -> str:

@@ -1,27 +1,30 @@
 """Many runs at once, each as `simulate` would have it.
 
-Runs that are alike but for numbers are stepped together by native code, a formation a lane; the
-others run one after the other.
+Runs that are alike but for numbers are stepped together, by native code with a formation a lane, or
+by JAX, where states may differ from those of a run alone by rounding; the others run one after the
+other.
 """
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 from typing import NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
 import equinox as eqx
 import numpy as np
 
-from echelon.core.errors import EchelonError, MissingExtraError, Outcome
+from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
+from echelon.engine.by_jax import JaxFormations
 from echelon.engine.crew import processors
-from echelon.engine.drive import Chunk
+from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.family import Families
 from echelon.engine.grid import Grid
 from echelon.engine.initial import Starts
-from echelon.engine.laws import Laws, worth_native
+from echelon.engine.laws import Laws, choose_stepper, is_long, worth_native
 from echelon.engine.loop import Loop, assemble
 from echelon.engine.motion import Motion
 from echelon.engine.native import Kernels, NativeStepper, beyond
@@ -32,7 +35,6 @@ from echelon.engine.result import Result
 from echelon.engine.settings import Settings
 from echelon.engine.simulate import result_of, sample_reference, simulate
 from echelon.engine.sums import Sums, on_host
-from echelon.kernels import Unsupported
 
 Run: TypeAlias = tuple[Parts, Settings]
 Told: TypeAlias = Callable[[int, int], None]
@@ -99,12 +101,13 @@ class Fleet:
                 job = None  # `simulate` says it again
             if job is not None:
                 families.setdefault(job.case.family, []).append(job)
-        return [jobs for jobs in families.values() if _fit(jobs)]
+        found = (_accepted(jobs) for jobs in families.values())
+        return [jobs for jobs in found if jobs and _fit(jobs)]
 
     def _job(self, place: int, parts: Parts, settings: Settings) -> _Job | None:
         """Return a run as a job; None where no laws drive it."""
-        case = self._case(parts, settings._replace(seed=0))
-        if case.loop is None or settings.engine == "jax":
+        case = self._case(parts, settings)
+        if case.loop is None or settings.devices > 1:
             return None
         prepared, loop = case.prepared, case.loop
         problem = prepared.problem._replace(settings=settings, states=case.starts(settings.seed))
@@ -116,8 +119,8 @@ class Fleet:
         return _Job(place, case, prepared._replace(problem=problem), loop)
 
     def _case(self, parts: Parts, settings: Settings) -> _Case:
-        known = self._cases.setdefault(parts, {})
-        if settings not in known:
+        known, alike = self._cases.setdefault(parts, {}), settings._replace(seed=0)
+        if alike not in known:
             prepared = prepare(parts, settings)
             check_memory(parts, settings)
             drive = prepared.parts.drive
@@ -125,30 +128,35 @@ class Fleet:
                 loop = family = None
                 if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
-                    family = self.kinds.of(loop, settings)
-                known[settings] = _Case(prepared, Starts(prepared.parts), loop, family)
-        return known[settings]
+                    family = self.kinds.of(loop, alike)
+                known[alike] = _Case(prepared, Starts(prepared.parts), loop, family)
+        return known[alike]
 
     # ---- flights ----
 
     def _together(self, jobs: list[_Job], told: Told | None) -> dict[int, Result | EchelonError]:
-        """Return what a family comes to; nothing where there is no native code for it."""
+        """Return what a family comes to; nothing where its runs cannot go together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
-        bits = int(settings.precision[5:])
+        bits, pool = int(settings.precision[5:]), (self.pool, self.kernels)
         loops, began = [job.loop for job in jobs], time.perf_counter()
         with precision(settings.precision):
             try:
-                stepper = NativeStepper(loops, states, bits, None, self.pool, self.kernels)
-            except (Unsupported, MissingExtraError, TypeError):
+                stepper = choose_stepper(
+                    settings,
+                    len(states),
+                    lambda: NativeStepper(loops, states, bits, None, *pool),
+                    lambda why: JaxFormations(loops, states, why),
+                )
+                record = _Flock(len(jobs), Grid(settings, stepper.longest), jobs[0].prepared, bits)
+                record.fly(stepper, told)
+            except (SimulationError, TypeError):
                 # A model that wants its numbers as numbers is traced for each of them.
                 return {}
-            record = _Flock(len(jobs), Grid(settings, stepper.longest), jobs[0].prepared, bits)
-            record.fly(stepper, told)
         # Each by itself then goes on by JAX.
         seconds = (time.perf_counter() - began) / len(jobs)
         return {
-            job.place: record.result(k, job.prepared, seconds)
+            job.place: record.result(k, job.prepared, stepper, seconds)
             for k, job in enumerate(jobs)
             if not record.far[k]
         }
@@ -166,9 +174,10 @@ class _Flock:
         self.sums = Sums(*(np.stack([part] * count) for part in nothing))
         self.finite, self.far = np.ones(count, bool), np.zeros(count, bool)
 
-    def fly(self, stepper: NativeStepper, told: Told | None) -> None:
+    def fly(self, stepper: Stepper, told: Told | None) -> None:
         """Take all steps."""
         now, done, frames = stepper.start(), 0, 0
+        self.native = stepper.engine == "native"
         while frames < self.grid.frames:
             reference = sample_reference(self.first, done, self.grid.longest + 1)
             made = stepper.advance(now, self.grid.counts(done), reference)
@@ -189,7 +198,8 @@ class _Flock:
         stored = self.grid.stored(points)
         # Frames between those that are stored tell of a loss too, and of states too large.
         self.finite &= finite.all(axis=0)
-        self.far |= beyond(x, self.bits).any(axis=(0, 2, 3))
+        if self.native:
+            self.far |= beyond(x, self.bits).any(axis=(0, 2, 3))
         self.times.append(self.first.problem.settings.dt * points[stored])
         self._states.append(x[stored])
         self._inputs.append(u[stored])
@@ -197,22 +207,34 @@ class _Flock:
             self._references.append(reference[points - first][stored])
         return int(stored.sum())
 
-    def result(self, k: int, prepared: Prepared, seconds: float) -> Result:
+    @cached_property
+    def _whole(self) -> tuple[Array, Array, Array, Array | None]:
+        """Times, states and inputs of each run, and the reference."""
+        states, inputs = (
+            np.ascontiguousarray(np.concatenate(parts).swapaxes(0, 1))
+            for parts in (self._states, self._inputs)
+        )
+        reference = np.concatenate(self._references) if self._references else None
+        return np.concatenate(self.times), states, inputs, reference
+
+    def result(self, k: int, prepared: Prepared, stepper: Stepper, seconds: float) -> Result:
         """Return one of the runs."""
+        times, states, inputs, reference = self._whole
         stretch = Stretch(
             first=0,
             done=self.grid.steps,
-            times=np.concatenate(self.times),
-            states=np.concatenate([part[:, k] for part in self._states]),
-            inputs=np.concatenate([part[:, k] for part in self._inputs]),
-            reference=np.concatenate(self._references) if self._references else None,
+            times=times,
+            states=states[k],
+            inputs=inputs[k],
+            reference=reference,
             sums=Sums(*(part[k] for part in self.sums)),
             moment=(),
             stopped=None,
             seconds=seconds,
         )
         recorder = Recorder(prepared.problem, self.grid, stretch.sums, [stretch])
-        return result_of(prepared, recorder.close(Outcome.INTERRUPTED), "native")
+        record = recorder.close(Outcome.INTERRUPTED)
+        return result_of(prepared, record, stepper.engine, stepper.warnings)
 
 
 def _split(sums: Sums, count: int) -> Sums:
@@ -241,10 +263,23 @@ def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | Eche
         return error
 
 
+def _accepted(jobs: list[_Job]) -> list[_Job]:
+    """Return the runs whose starts the laws take."""
+    prepared = jobs[0].prepared
+    model, graph, drive = prepared.parts.model, prepared.parts.graph, prepared.parts.drive
+    assert isinstance(drive, Laws)
+    states = np.stack([job.prepared.problem.states for job in jobs])
+    refused = {k for k, _, _ in drive.refusals(model, graph, states)}
+    return [job for k, job in enumerate(jobs) if k not in refused]
+
+
 def _fit(jobs: list[_Job]) -> bool:
     """Tell whether runs are worth stepping together: long enough, and filling their vectors."""
     problem = jobs[0].prepared.problem
-    agents = len(problem.states)
-    if len(jobs) < 2 or agents > _SMALL and len(jobs) < 8:
+    agents, settings = len(problem.states), problem.settings
+    if len(jobs) == 1:
+        # By itself, but by code that was made for others.
+        return worth_native(settings, agents)
+    if agents > _SMALL and len(jobs) < 8:
         return False
-    return worth_native(problem.settings, len(jobs) * agents)
+    return is_long(settings, len(jobs) * agents)

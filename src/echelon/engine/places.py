@@ -258,11 +258,15 @@ class Formations(Places):
         meter, lanes, last = self.loop.meter, self.lanes, len(self.loops) - 1
         pairs, q = np.asarray(meter.edges), len(meter.measured)
         rows = aligned((self.groups, len(pairs), q + 2, lanes), dtype)
+        # Runs that differ in their seeds alone share one.
+        made = dict[int, Array]()
         for f in range(self.groups * lanes):
             meter = self.loops[min(f, last)].meter
-            goals = np.asarray(meter.offsets)[:, list(meter.measured)]
-            rows[f // lanes, :, :q, f % lanes] = goals[pairs[:, 0]] - goals[pairs[:, 1]]
-            rows[f // lanes, :, q, f % lanes] = meter.spacings
+            if id(meter) not in made:
+                goals = np.asarray(meter.offsets)[:, list(meter.measured)]
+                apart = goals[pairs[:, 0]] - goals[pairs[:, 1]]
+                made[id(meter)] = np.column_stack([apart, meter.spacings])
+            rows[f // lanes, :, : q + 1, f % lanes] = made[id(meter)]
         return rows
 
     def spacing(self, edges: Array) -> Array:

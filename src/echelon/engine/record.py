@@ -137,7 +137,9 @@ class Recorder:
         `unfinished` is how a run ended that neither reached its horizon nor was lost.
         """
         whole = join(self.stretches) or self._nothing()
-        lost = np.argwhere(~_finite(whole.states, whole.inputs))
+        lost = np.zeros((0, 2), int)
+        if not whole.finite:
+            lost = np.argwhere(~_finite(whole.states, whole.inputs))
         # In the order of frames, then agents: the first row is the first to be lost.
         cut = slice(int(lost[0, 0]) if len(lost) else None)
         return Record(
@@ -158,9 +160,10 @@ class Recorder:
 
     def _completed(self, whole: Stretch) -> tuple[Outcome, str]:
         """Return how a run ended that reached its horizon: whether all stayed in their chart."""
-        model, inside = self.problem.model, self._inside(whole)
+        inside = self._inside(whole)
         if not inside.size or inside.min() >= ALWAYS:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
+        model = self.problem.model
         agent, k = divmod(int(inside.argmin()), inside.shape[1])
         name = [*model.chart][k]
         unit = model.state_units[model.state_names.index(name)]
@@ -174,10 +177,8 @@ class Recorder:
 
     def _inside(self, whole: Stretch) -> Array:
         """Return `Sums.inside` with the moment at which the last step ends, where none begins."""
-        model = self.problem.model
-        charted = [model.state_names.index(name) for name in model.chart]
-        bounds = np.array([*model.chart.values()], float).reshape(-1, 2)
-        last = outside(whole.states[-1][:, charted], *bounds.T)
+        meter = self.problem.meter
+        last = outside(whole.states[-1][:, meter.charted], *meter.chart.T)
         return np.minimum(self.sums.inside, np.where(last, self.grid.steps, ALWAYS))
 
     def _role(self, agent: int) -> str:
@@ -201,8 +202,8 @@ class Recorder:
 
 def join(stretches: Sequence[Stretch]) -> Stretch | None:
     """Return stretches that follow each other as one; None where there is none."""
-    if not stretches:
-        return None
+    if len(stretches) < 2:
+        return stretches[0] if stretches else None
     times, states, inputs = (
         np.concatenate([getattr(each, name) for each in stretches])
         for name in ("times", "states", "inputs")

@@ -2,8 +2,9 @@
 
 from echelon.kernels.common import shared
 from echelon.kernels.drivers import program
+from echelon.kernels.entries import Unsupported, nodes
 from echelon.kernels.frame import SLOTS, Body, Plan, stride
-from echelon.kernels.lowering import Unsupported, lower, nodes
+from echelon.kernels.lowering import lower
 from echelon.kernels.native import Code, aligned, is_installed, vectors
 from echelon.kernels.quotients import inverses_shared
 from echelon.kernels.scalar import Graph, Node, needed

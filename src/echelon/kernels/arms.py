@@ -1,5 +1,6 @@
 """What only one side of a choice needs: worth a branch where it is much."""
 
+import graphlib
 from collections.abc import Sequence
 from typing import final
 
@@ -18,13 +19,10 @@ class Arm:
         side: whether the arm is taken where it holds, or where it does not.
         nodes: of the arm, in order.
         left: those of them that the choices read.
-        first: the first of the choices.
     """
 
-    def __init__(
-        self, which: Node, side: bool, nodes: list[Node], left: list[Node], first: Node
-    ) -> None:
-        self.which, self.side, self.nodes, self.left, self.first = which, side, nodes, left, first
+    def __init__(self, which: Node, side: bool, nodes: list[Node], left: list[Node]) -> None:
+        self.which, self.side, self.nodes, self.left = which, side, nodes, left
 
 
 def choices(results: Sequence[Node]) -> list[tuple[Node, bool]]:
@@ -54,8 +52,32 @@ def arms(nodes: list[Node], results: Sequence[Node]) -> list[Arm]:
         if len(arm) >= _MANY and not taken.intersection([*arm, *selects, which]):
             inside = set(arm)
             left = [n for n in arm if any(u not in inside for u in users[n])]
-            found.append(Arm(which, side, arm, left, selects[0]))
+            found.append(Arm(which, side, arm, left))
             taken.update(arm)
+    return _without_circles(nodes, found)
+
+
+def _without_circles(nodes: list[Node], found: list[Arm]) -> list[Arm]:
+    """Return the arms that can be written in one piece each.
+
+    One that needs the result of a choice which itself reads the arm cannot; its nodes then stand
+    among the others.
+    """
+    while found:
+        owner: dict[Node, Node | Arm] = {node: arm for arm in found for node in arm.nodes}
+        needs: dict[Node | Arm, set[Node | Arm]] = {
+            arm: {owner.get(arm.which, arm.which)} for arm in found
+        }
+        for node in nodes:
+            whole = owner.get(node, node)
+            needs.setdefault(whole, set()).update(owner.get(a, a) for a in node.args)
+            needs[whole].discard(whole)
+        try:
+            graphlib.TopologicalSorter(needs).prepare()
+        except graphlib.CycleError as circle:
+            found = [arm for arm in found if arm not in circle.args[1]]
+        else:
+            break
     return found
 
 

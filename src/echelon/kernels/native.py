@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.core.errors import MissingExtraError
 from echelon.core.trace import in_short
-from echelon.kernels.lowering import Unsupported
+from echelon.kernels.entries import Unsupported
 
 
 @cache

@@ -7,7 +7,7 @@ behind a branch that is taken where any lane takes that side.
 
 import math
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import final
 
 from echelon.kernels.arms import Arm, arms
@@ -337,15 +337,21 @@ class Emitter:
 
     def _write_with_branches(self, nodes: list[Node], results: Sequence[Node]) -> None:
         """Write nodes in order; those that one side of a choice alone needs, behind a branch."""
-        behind = arms(nodes, results)
-        owned = {node: arm for arm in behind for node in arm.nodes}
+        owned = {node: arm for arm in arms(nodes, results) for node in arm.nodes}
+        self._write_in_order(nodes, owned)
+
+    def _write_in_order(self, nodes: Iterable[Node], owned: Mapping[Node, Arm]) -> None:
+        """Write nodes that no arm owns; before what reads of an arm, the arm behind its branch."""
         for node in nodes:
-            arm = owned.get(node)
-            if arm is None:
-                for other in behind:
-                    if node is other.first:
-                        self._branch(other)
-                self._write([node])
+            if node in owned or node in self.values:
+                continue
+            for arm in dict.fromkeys(owned[a] for a in node.args if a in owned):
+                if arm.nodes[0] not in self.values:
+                    # Arms rest on no choice of their own, so that this comes to an end.
+                    rest = needed([arm.which, *arm.nodes])
+                    self._write_in_order([n for n in rest if owned.get(n) is not arm], owned)
+                    self._branch(arm)
+            self._write([node])
 
     def _branch(self, arm: Arm) -> None:
         """Write an arm behind a branch, and what it leaves as values that hold after it."""

@@ -23,11 +23,11 @@ from echelon.network.edges import (
 )
 from echelon.network.eigenvalues import directed_spectrum, switching_spectrum, symmetric_spectrum
 from echelon.network.exchange import Exchange
-from echelon.network.radius import advising
+from echelon.network.radius import advising, pairs_within
 from echelon.network.reach import check_reached
 from echelon.network.spectrum import Spectrum
 from echelon.network.switching import Schedule, Stretch, unite
-from echelon.network.tree import ordered_outward, parents_of
+from echelon.network.tree import ordered_outward, outward_edges, parents_of
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -205,19 +205,21 @@ class Graph:
         Raises:
             GraphError: the radius is too small for the points to be connected.
         """
-        # Imported here: random graphs alone need it.
-        from scipy.spatial import KDTree
-
         # An agent's neighbours are those in its disc, as far as that lies in the square.
         share = min(1.0, np.pi * float(radius) * float(radius))
         check_size(agents, 2, "geometric", share * agents * (agents - 1) / 2)
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
-        pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
-        # The tree returns pairs in no promised order; sorted, a seed is one graph everywhere. One
-        # number a pair sorts ten times faster than two.
-        number = np.sort(pairs[:, 0] * agents + pairs[:, 1])
         with advising(points, radius):
-            return cls(np.stack(np.divmod(number, agents), axis=1), leaders, agents)
+            return cls(pairs_within(points, radius), leaders, agents)
+
+    def one_way(self) -> "Graph":
+        """Return the directed graph in which agents hear those alone that are nearer to a leader.
+
+        Raises:
+            GraphError: the graph switches.
+        """
+        edges, weights = outward_edges(self)
+        return Graph(edges, self.leaders, self.agents, True, weights.tolist())
 
     def adjacency(self) -> sp.csr_array:
         """Return the adjacency matrix (N, N), sparse: A_ij weighs what i hears of j.

@@ -14,6 +14,18 @@ _MOST = 2000
 """Places of which all distances are taken, 32 MB of them."""
 
 
+def pairs_within(places: Array, radius: float) -> Array:
+    """Return the pairs (E, 2) of places (N, 2) that are closer than a radius, in order."""
+    # Imported here: random graphs alone need it.
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(places).query_pairs(radius, output_type="ndarray")
+    # The tree returns pairs in no promised order; sorted, a seed is one graph everywhere. One
+    # number a pair sorts ten times faster than two.
+    number = np.sort(pairs[:, 0] * len(places) + pairs[:, 1])
+    return np.stack(np.divmod(number, len(places)), axis=1)
+
+
 @contextmanager
 def advising(places: Array, radius: float) -> Iterator[None]:
     """Add to the error of agents at places (N, 2) that `radius` does not connect what would."""

@@ -29,6 +29,22 @@ def ordered_outward(graph: "Graph") -> tuple[tuple[int, tuple[int, ...]], ...]:
     )
 
 
+def outward_edges(graph: "Graph") -> tuple[Array, Array]:
+    """Return the edges (E, 2) as arrows from nearer to a leader to farther, and their weights (E,).
+
+    Edges between agents equally far are none of them.
+
+    Raises:
+        GraphError: the graph switches.
+    """
+    if graph.schedule is not None:
+        raise GraphError("the graph switches, and no agent is nearer to a leader at all times.")
+    depth = graph.depths()[graph.edges]
+    apart = depth[:, 0] < depth[:, 1] if graph.directed else depth[:, 0] != depth[:, 1]
+    edges = np.take_along_axis(graph.edges, np.argsort(depth, axis=1), axis=1)
+    return edges[apart], graph.weights[apart]
+
+
 def parents_of(graph: "Graph") -> tuple[int, ...]:
     """Return what `Graph.parents` says.
 

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from echelon.certificates.certificate import RegionCertificate
+from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem, Verdict
@@ -255,19 +256,50 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     return known[settings]
 
 
-def promises(parts: Parts, settings: Sequence[Settings]) -> Iterator[Promise]:
+def promises(parts: Parts, settings: Sequence[Settings]) -> Iterator[Promise | EchelonError]:
     """Yield what is promised of parts under settings that differ in the seed alone.
 
-    Each is what `promise` returns; what no seed changes is computed once.
-
-    Raises:
-        EchelonError: as in `promise`.
+    Each is what `promise` returns, or raises; what no seed changes is computed once.
     """
-    alike = (s for s in _kept.get(parts, {}) if s._replace(seed=0) == settings[0]._replace(seed=0))
-    first, prepared = promise(parts, next(alike, settings[0])), prepare(parts, settings[0])
+    for k, each in enumerate(settings):
+        try:
+            found = _first(parts, each)
+        except EchelonError as error:
+            # Others may start where the laws have a meaning.
+            yield error
+            continue
+        yield from _alike(settings[k:], *found)
+        return
+
+
+def _first(parts: Parts, settings: Settings) -> tuple[Promise, Prepared]:
+    """Return what is promised under any such settings, and the parts under these."""
+    prepared, alike = prepare(parts, settings), settings._replace(seed=0)
+    known = (s for s in _kept.get(parts, {}) if s._replace(seed=0) == alike)
+    return promise(parts, next(known, settings)), prepared
+
+
+def _each(prepared: Prepared, settings: Sequence[Settings]) -> Iterator[Promise | EchelonError]:
+    """Yield what is promised of starts of which each is looked at by itself."""
+    starts = Starts(prepared.parts)
+    for each in settings:
+        problem = prepared.problem._replace(settings=each, states=starts(each.seed))
+        try:
+            with precision("float64"):
+                prepared.parts.drive.accept(problem)
+                found: Promise | EchelonError = _compute(prepared._replace(problem=problem), each)
+        except EchelonError as error:
+            found = error
+        yield found
+
+
+def _alike(
+    settings: Sequence[Settings], first: Promise, prepared: Prepared
+) -> Iterator[Promise | EchelonError]:
+    """Yield the promises where the first is accepted."""
     if first.hold is not None or _asks_where(prepared.parts, first.loop) and first.frozen is None:
         # A tube is of where agents start; or nobody leaves the trim, and a seed may be what does.
-        yield from (promise(parts, each) for each in settings)
+        yield from _each(prepared, settings)
         return
     with precision("float64"):
         states = np.stack(list(map(Starts(prepared.parts), (each.seed for each in settings))))

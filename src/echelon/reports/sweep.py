@@ -1,5 +1,6 @@
 """A sweep in words: how many runs there were, how they ended, and how large errors were."""
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from echelon.sweeps.dataset import share_bounds, succeeded
 if TYPE_CHECKING:
     import xarray as xr
 
-_LINES = 20
+_LINES, _WARNINGS = 20, 5
 
 
 def sweep_mapping(data: "xr.Dataset") -> dict[str, Any]:
@@ -52,7 +53,13 @@ def sweep_report(data: "xr.Dataset") -> str:
             lines.append(
                 f"- {what}: median {middle}{units.get(name, '')}, 5 to 95 %: {low} to {high}."
             )
-    return "\n".join([*lines, *_cases(data)])
+    return "\n".join([*lines, *_warned(data), *_cases(data)])
+
+
+def _warned(data: "xr.Dataset") -> list[str]:
+    """Return a line for each of the warnings that most runs gave."""
+    told = Counter(line for text in data["warnings"].values.flat for line in text.splitlines())
+    return [f"- Warning, of {n} of the runs: {line}" for line, n in told.most_common(_WARNINGS)]
 
 
 def _cases(data: "xr.Dataset") -> list[str]:

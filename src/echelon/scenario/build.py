@@ -259,7 +259,8 @@ def _graph(scenario: Scenario) -> Graph:
         return Graph.from_edges(spec.stretches[0][1], *rest)
     make = getattr(Graph, str(spec.name))
     given = {key: value for key, value in spec.model_dump().items() if value is not None}
-    return make(**offered(make, given))
+    graph = make(**offered(make, given))
+    return graph.one_way() if spec.directed and not graph.directed else graph
 
 
 def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:

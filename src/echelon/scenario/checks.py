@@ -31,10 +31,9 @@ SOURCES: dict[str, tuple[str, str, bool]] = {
 # What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
 _Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
 _GRAPH_KEYS: _Taken = dict.fromkeys(registry.GRAPHS, (("agents",), ("directed",))) | {
-    "complete": (("agents",), ()),
     "edges": ((), ("agents", "weights", "directed", "schedule", "period")),
-    "grid": (("rows", "columns"), ("agents",)),
-    "geometric": (("agents", "radius"), ("seed",)),
+    "grid": (("rows", "columns"), ("agents", "directed")),
+    "geometric": (("agents", "radius"), ("seed", "directed")),
 }
 _FORMATION_KEYS: _Taken = dict.fromkeys(registry.FORMATIONS, ((), ("spacing",))) | {
     "offsets": ((), ()),

@@ -88,7 +88,8 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
     """Weights of the edges, one for each, where they stand in a list of their own; above 0."""
     directed: bool = False
     """Edges are arrows along which it is told: of `[i, j]` j hears i, and i does not hear j. The
-    graphs `path`, `ring` and `star` then lead away from agent 0."""
+    graphs `path`, `ring` and `star` then lead away from agent 0, all others outward from the
+    leaders."""
     schedule: Annotated[tuple[StretchSpec, ...], Field(strict=False)] = ()
     """Other edges from later times on, as in `[{at: 3.0, edges: [[0, 1]]}]`; `edges` hold until
     then, and the last ones for ever."""

@@ -94,7 +94,4 @@ def _promised(built: Sequence[Built]) -> Iterator[Promise | EchelonError]:
     """Yield what is promised of runs, of which neighbours often differ in the seed alone."""
     for _, alike in groupby(built, key=lambda each: id(each.parts)):
         runs = list(alike)
-        try:
-            yield from promises(runs[0].parts, [each.settings for each in runs])
-        except EchelonError as error:
-            yield from [error] * len(runs)
+        yield from promises(runs[0].parts, [each.settings for each in runs])

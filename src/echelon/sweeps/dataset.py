@@ -28,6 +28,7 @@ _ERRORS = (
 _WHAT = {
     "outcome": "how the run ended",
     "promised": "whether anything was promised, before the run",
+    "warnings": "what of the run is probably not meant, a line each",
     "formation_rmse": "root mean square of the followers' errors, over all steps and followers",
     "formation_steady_rmse": "the same in the steady window",
     "worst_final_error": "error of the follower that is farthest from its goal at the end",

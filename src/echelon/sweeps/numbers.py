@@ -30,7 +30,10 @@ NUMBERS = (
     "start_size",
 )
 UNIT = "error_unit"
-WORDS = ("message", "promise_kind", "promise_theorem", "promise_against", "engine", UNIT)
+WORDS = (
+    *("message", "promise_kind", "promise_theorem", "promise_against", "engine", "warnings"),
+    UNIT,
+)
 Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
 
@@ -58,6 +61,7 @@ def numbers_of(result: Result, promise: Promise) -> dict[str, Any]:
         "leader_steady_rmse": _number(found.leader.steady_rmse),
         "saturation_fraction": found.saturation_fraction,
         "engine": result.engine,
+        "warnings": "\n".join(result.warnings),
         UNIT: result.unit,
         **_promised(promise),
     }

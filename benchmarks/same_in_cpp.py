@@ -1,0 +1,185 @@
+"""A follower's whole step as C++ with vector types, operation by operation, to compare code with.
+
+What LLVM makes native code of is written out a second time and compiled by `g++ -O3`: the same
+nodes in the same order, without the branches that native code takes around what seldom happens.
+"""
+
+import ctypes
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias, final
+
+import numpy as np
+
+from echelon.engine.code import LANES
+from echelon.engine.native import NativeStepper
+from echelon.engine.scalars import body_of
+from echelon.kernels import SLOTS, Body, Code, Node, Plan, aligned, program
+from echelon.kernels.scalar import needed
+from echelon.kernels.usual import rewritten, whole
+
+Run: TypeAlias = Callable[[np.ndarray, int], None]
+"""Takes some steps of agents in rows (blocks, rows, lanes)."""
+_BLOCKS = 64
+"""Of agents, whose rows stay in a cache: code is compared, and not memory."""
+
+_HEAD = """
+#include <immintrin.h>
+#include <string.h>
+typedef {T} V __attribute__((vector_size(64)));
+typedef {I} M __attribute__((vector_size(64)));
+static inline V all({T} x) {{ return x - (V){{}}; }}
+static inline M bits(V x) {{ return (M)x; }}
+extern "C" void run({T} *rows, long blocks, long steps) {{
+for (long step = 0; step < steps; step++) for (long b = 0; b < blocks; b++) {{
+{T} *at = rows + b * {size};
+"""
+_INFIX = {"add": "+", "sub": "-", "apart": "-", "mul": "*", "div": "/"}
+_INFIX |= {"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
+_CALLS = {
+    "sqrt": "(V)_mm512_sqrt_{s}((__m512{t}){0})",
+    "floor": "(V)_mm512_roundscale_{s}((__m512{t}){0}, 9)",
+    "ceil": "(V)_mm512_roundscale_{s}((__m512{t}){0}, 10)",
+    "rint": "(V)_mm512_roundscale_{s}((__m512{t}){0}, 8)",
+    "min": "(V)_mm512_min_{s}((__m512{t}){0}, (__m512{t}){1})",
+    "max": "(V)_mm512_max_{s}((__m512{t}){0}, (__m512{t}){1})",
+    "abs": "(V)_mm512_abs_{s}((__m512{t}){0})",
+    "copysign": "(V)((bits({0}) & ~{sign}) | (bits({1}) & {sign}))",
+    "neg": "-{0}",
+    "not": "~{0}",
+    "select": "({0} ? {1} : {2})",
+    "bit0": "((bits({0}) & 1) != 0)",
+    "bit1": "((bits({0}) & 2) != 0)",
+    "pow2": "(V)(bits({0} + all({magic})) << {shift})",
+    "exponent": "__builtin_convertvector((bits({0}) - {root}) >> {shift}, V)",
+    "mantissa": "(V)(bits({0}) - (((bits({0}) - {root}) >> {shift}) << {shift}))",
+}
+_KINDS: dict[int, dict[str, Any]] = {
+    64: {"T": "double", "I": "long", "s": "pd", "t": "d", "shift": 52, "magic": 1.5 * 2**52 + 1023},
+    32: {"T": "float", "I": "int", "s": "ps", "t": "", "shift": 23, "magic": 1.5 * 2**23 + 127},
+}
+_KINDS[64] |= {"sign": "(1L << 63)", "root": "0x3FE6A09E667F3BCDL"}
+_KINDS[32] |= {"sign": "(1 << 31)", "root": "0x3F3504F3"}
+
+
+@final
+class Follower:
+    """What a follower does in a step, with what it hears and is told read from rows of its own.
+
+    Args:
+        stepper: of the agents, of which the first follower is taken.
+        bits: 64 or 32.
+    """
+
+    def __init__(self, stepper: NativeStepper, bits: int) -> None:
+        """Put all that is read into rows, and all that is written."""
+        self.bits, self.lanes, own = bits, LANES[bits], stepper.own
+        body = body_of(own, bits, stepper.rows, False, stepper.follows)
+        places: dict[Any, int] = {}
+
+        def read(node: Node, _: Any) -> Node | None:
+            if node.op != "leaf" or node.value[0] == "row":
+                return None
+            place = places.setdefault(node.value, stepper.rows.total + len(places))
+            return node.graph.leaf("row", place)
+
+        made = body.become(rewritten(body.results(), read))
+        graph = next(iter(made.stores.values())).graph
+        pairs = ((made.sums, "add"), (made.greatest, "max"), (made.least, "min"))
+        self.stores = made.stores | {
+            row: graph.make(op, graph.leaf("row", row), node)
+            for kept, op in pairs
+            for row, node in kept.items()
+        }
+        self.rows, self.state = stepper.rows.total + len(places), stepper.rows.state
+        self.first = np.asarray(stepper.states[1:2]).T
+
+    def memory(self) -> np.ndarray:
+        """Return rows of agents that begin near the first follower, and hear little."""
+        kind = np.float64 if self.bits == 64 else np.float32
+        rows = aligned((_BLOCKS, self.rows, self.lanes), kind)
+        rows[:] = 1e-3 * np.random.default_rng(0).uniform(-1, 1, rows.shape)
+        rows[:, self.state.start : self.state.stop] += self.first
+        return rows
+
+    def after(self, run: Run, start: np.ndarray, steps: int) -> np.ndarray:
+        """Return the rows after some steps."""
+        rows = aligned(start.shape, start.dtype)
+        rows[:] = start
+        run(rows, steps)
+        return rows
+
+    def rate(self, run: Run, start: np.ndarray, steps: int) -> float:
+        """Return agent-steps per second of CPU time, of one turn."""
+        begin = time.process_time()
+        self.after(run, start, steps)
+        return start.shape[0] * start.shape[2] * steps / (time.process_time() - begin)
+
+    def native(self) -> Run:
+        """Return it as native code."""
+        nothing = Body({}, {}, {}, {}, {}, [], [], [])
+        bodies = nothing._replace(stores=self.stores), nothing
+        read = (0, 0, False, False, False, (), 0, 0.0)
+        plan = Plan(self.bits, self.lanes, False, False, self.rows, 0, *bodies, *read)
+        code = Code(program(plan))
+
+        def run(rows: np.ndarray, steps: int) -> None:
+            ends = np.array([0, len(rows)], np.int64)
+            told = {"rows": rows.ctypes.data, "segments": ends.ctypes.data, "steps": steps}
+            told |= {"starts": ends.ctypes.data, "ends": ends[1:].ctypes.data}
+            told |= dict.fromkeys(("levels", "groups", "threads"), 1)
+            code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
+
+        return run
+
+    def cpp(self) -> Run:
+        """Return it as C++, compiled."""
+        with tempfile.TemporaryDirectory() as folder:
+            source, made = Path(folder) / "step.cpp", Path(folder) / "step.so"
+            source.write_text(self._text())
+            flags = "-O3 -march=native -std=c++17 -shared -fPIC".split()
+            subprocess.run(["g++", *flags, source, "-o", made], check=True)
+            library = ctypes.CDLL(str(made))
+
+        def run(rows: np.ndarray, steps: int) -> None:
+            at = ctypes.c_void_p(rows.ctypes.data)
+            library.run(at, ctypes.c_long(len(rows)), ctypes.c_long(steps))
+
+        return run
+
+    def _text(self) -> str:
+        """Return the step as C++."""
+        kind, complete = _KINDS[self.bits], whole(list(self.stores.values()))
+        results = {row: complete[node] for row, node in self.stores.items()}
+        lines = [_HEAD.format(size=self.rows * self.lanes, **kind)]
+        for node in needed(results.values()):
+            lines.append(f"const {'M' if node.truth else 'V'} v{node.number} = {self._one(node)};")
+        for row, node in results.items():
+            lines.append(f"*(V*)(at + {row * self.lanes}) = v{node.number};")
+        return "\n".join([*lines, "}}", ""])
+
+    def _one(self, node: Node) -> str:
+        """Return an operation."""
+        args, kind = [f"v{a.number}" for a in node.args], _KINDS[self.bits]
+        if node.op == "constant":
+            value = float(np.float32(node.value)) if self.bits == 32 else node.value
+            return f"(M){{}} {'==' if node.value else '!='} 0" if node.truth else _shown(value)
+        if node.op == "leaf":
+            return f"*(const V*)(at + {node.value[1] * self.lanes})"
+        if node.op in _INFIX:
+            return f"{args[0]} {_INFIX[node.op]} {args[1]}"
+        return _CALLS[node.op].format(*args, **kind)
+
+
+def _shown(value: float) -> str:
+    """Return a constant for all lanes."""
+    if np.isfinite(value):
+        return f"all({float(value).hex()})"
+    return (
+        'all(__builtin_nan(""))'
+        if np.isnan(value)
+        else f"all({value:+f})".replace("inf", "__builtin_inf()")
+    )
