@@ -479,3 +479,13 @@ def test_a_folder_without_room_for_code_is_no_fault(tmp_path):
     columns = rng.normal(size=(3, 8))
     found = run(PROGRAMS["a loop"], columns, cache=blocked)
     np.testing.assert_allclose(found, by_jax(PROGRAMS["a loop"], columns), rtol=1e-14)
+
+
+def test_quotients_by_one_number_share_its_inverse_and_stay_whole_where_they_are_cut():
+    x = np.stack([rng.integers(1, 99, 400), rng.integers(1, 99, 400), rng.normal(size=400)])
+    found = run(lambda v: jnp.stack([v[2] / v[1] + 1.0, 2.0 * (v[0] / v[1])]), x.astype(float))
+    np.testing.assert_allclose(found, [x[2] / x[1] + 1.0, 2.0 * (x[0] / x[1])], rtol=1e-15)
+    cut = run(
+        lambda v: jnp.stack([jnp.floor(7.0 * v[1] / v[1]), v[0] / v[1] + 1.0]), x.astype(float)
+    )
+    np.testing.assert_array_equal(cut[0], 7.0)

@@ -450,8 +450,8 @@ def test_integrators_are_promised_from_everywhere_and_arrive_in_time(graph, told
 
 
 def test_stopping_points_stay_within_what_turns_of_graphs_bound():
-    rows = [(0.0, [(0, 1), (1, 2), (2, 3)]), (1.0, [(0, 1), (0, 2), (2, 3)]), (1.6, [(0, 3)])]
-    graph, c, s, dt = ech.Graph.switching(rows, period=2.1), 4.0, 1.5, 1e-3
+    rows = [(0.0, [(0, 3)]), (0.6, [(0, 1), (1, 2), (2, 3)]), (2.6, [(0, 1), (0, 2), (2, 3)])]
+    graph, c, s, dt = ech.Graph.switching(rows), 4.0, 1.5, 1e-3
     stops, times = np.array([0.5, 4.0, -1.0, 0.3]), 0.01 * np.arange(801)
     found = _in_turns(stops, graph, StoppingPoint(), c, s, times)
     Ls, x = [L.toarray() for L in graph.stretches()], stops[1:] - stops[0]
@@ -461,7 +461,7 @@ def test_stopping_points_stay_within_what_turns_of_graphs_bound():
             assert (np.abs(x) <= found.bounds[:, k // 10] * (1.0 + 1e-6)).all()
         z = c * (Ls[graph.schedule.row(k * dt)] @ x)
         x = x - dt * z / np.sqrt(1.0 + (z / s) ** 2)
-    assert found.bounds[:, -1].max() < 0.9 * found.bounds[:, 0].max()
+    assert found.bounds[:, -1].max() < 0.05 < 3.0 < found.bounds[:, 60].max()
 
 
 @pytest.mark.slow
