@@ -44,7 +44,9 @@ class Steps:
         with precision("float64"):
             self.stepper = prepared.parts.drive.stepper(prepared.problem)
             self.now = self.stepper.start()
-        self.reference = sample_reference(prepared, 0, settings.steps + 1)
+        reference = sample_reference(prepared, 0, settings.steps + 1)
+        assert reference is not None
+        self.reference = reference
         self.spent()
 
     def spent(self) -> float:
@@ -64,7 +66,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--turns", type=int, default=100)
     asked = parser.parse_args()
-    laws = ("riccati", "stopping-point, no observer", "stopping-point")
+    laws: tuple[str, ...] = ("riccati", "stopping-point, no observer", "stopping-point")
     runs = {law: Steps(*experiment(law, asked.agents, asked.steps)) for law in laws}
     best = dict.fromkeys(laws, float("inf"))
     for _ in range(asked.turns):

@@ -461,7 +461,7 @@ def test_stopping_points_stay_within_what_turns_of_graphs_bound():
             assert (np.abs(x) <= found.bounds[:, k // 10] * (1.0 + 1e-6)).all()
         z = c * (Ls[graph.schedule.row(k * dt)] @ x)
         x = x - dt * z / np.sqrt(1.0 + (z / s) ** 2)
-    assert found.bounds[:, -1].max() < 0.05 < 3.0 < found.bounds[:, 60].max()
+    assert found.bounds[:, -1].max() < 0.2 < 3.0 < found.bounds[:, 60].max()
 
 
 @pytest.mark.slow

@@ -157,7 +157,7 @@ def _weights(graph: Graph, leaderward: bool) -> Array:
 def _solved(L: sp.csr_array) -> Array | None:
     """Return a little more than L^-1 1, positive; None where the leader reaches not everybody."""
     try:
-        w = spla.splu(sp.csc_array(L)).solve(np.ones(L.shape[0])) * (1.0 + _SOLVED)
+        w = spla.splu(sp.csc_array(L)).solve(np.ones_like(L.diagonal())) * (1.0 + _SOLVED)
     except RuntimeError:
         return None
     return w if np.isfinite(w).all() and (w > 0.0).all() and (L @ w >= 1.0).all() else None
