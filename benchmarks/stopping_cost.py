@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--turns", type=int, default=100)
     asked = parser.parse_args()
-    laws: tuple[str, ...] = ("riccati", "stopping-point, no observer", "stopping-point")
+    laws = ["riccati", "stopping-point, no observer", "stopping-point"]
     runs = {law: Steps(*experiment(law, asked.agents, asked.steps)) for law in laws}
     best = dict.fromkeys(laws, float("inf"))
     for _ in range(asked.turns):
