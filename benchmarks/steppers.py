@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -37,14 +36,13 @@ class Newcomer(ech.ControlAffine):
 
     def _turned(self, x: Any) -> tuple[Any, Any]:
         """Return the rotation of the body, and what makes rates of angles of body rates."""
-        (sr, sp, sy), (cr, cp, cy) = jnp.sin(x[6:9]), jnp.cos(x[6:9])
+        (sr, sp, sy), (cr, cp, cy), tp = jnp.sin(x[6:9]), jnp.cos(x[6:9]), jnp.tan(x[7])
         one, zero = jnp.ones_like(sr), jnp.zeros_like(sr)
         about_x = jnp.array([[one, zero, zero], [zero, cr, -sr], [zero, sr, cr]])
         about_y = jnp.array([[cp, zero, sp], [zero, one, zero], [-sp, zero, cp]])
         about_z = jnp.array([[cy, -sy, zero], [sy, cy, zero], [zero, zero, one]])
-        rates = jnp.array([[one, sr * sp / cp, cr * sp / cp], [zero, cr, -sr]])
-        last = jnp.array([[zero, sr / cp, cr / cp]])
-        return about_z @ about_y @ about_x, jnp.concatenate([rates, last])
+        rates = [[one, sr * tp, cr * tp], [zero, cr, -sr], [zero, sr / cp, cr / cp]]
+        return about_z @ about_y @ about_x, jnp.array(rates)
 
     def drift(self, x: Any) -> Any:
         """Return f(x): drag by the angle at which air meets the body, more of it when fast."""
@@ -119,7 +117,7 @@ def rate(
 
 
 def formations(
-    bits: int, own: bool, threads: int = 1, integrator: Any = "rk4"
+    bits: int, own: bool, threads: int = 1, integrator: Any = "rk4", steps: int = STEPS
 ) -> tuple[NativeStepper, np.ndarray]:
     """Return what steps 2,560 formations of 4 that all hear each other, and the reference.
 
@@ -133,7 +131,7 @@ def formations(
     with precision("float64"):
         loop = assemble(prepared.problem, drive.leader, drive.follower)
         states = prepared.problem.states + 0.02 * draws.uniform(-1, 1, (FORMATIONS, 4, 12))
-        times = DT * jax.numpy.arange(STEPS + 1)
+        times = DT * jnp.arange(steps + 1)
         reference = np.asarray(drive.reference_states(prepared.parts.model, times))
         loops = [_regained(loop, draws) for _ in range(FORMATIONS)] if own else None
     pool = ThreadPoolExecutor(threads) if threads > 1 else None

@@ -14,7 +14,7 @@ from typing import Any
 from PIL import Image
 
 import echelon as ech
-from echelon.plots import style
+from echelon.plots import files
 from echelon.plots.comparison import comparison_figures
 from echelon.plots.sweep import sweep_figures
 from echelon.plots.video import save_video
@@ -119,7 +119,7 @@ def draw_laws(out: Path, quick: bool) -> None:
 
 def save(figures: dict[str, Any], out: Path) -> None:
     """Write figures as PNG of 128 colours, which is a third of the size."""
-    for path in style.save(figures, out, kinds=("png",), dpi=120):
+    for path in files.save(figures, out, kinds=("png",), dpi=120):
         with Image.open(path) as picture:
             small = picture.convert("RGB").quantize(128, dither=Image.Dither.NONE)
         small.save(path, optimize=True)

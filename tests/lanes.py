@@ -49,12 +49,11 @@ def run(function, columns, bits=64, lanes=None, cache=None):
     rows = aligned((blocks, count + results, lanes), dtype)
     padded = np.resize(columns.T, (blocks * lanes, count))
     rows[:, :count] = padded.reshape(blocks, lanes, count).transpose(0, 2, 1)
-    segments, slots = np.array([0, blocks], np.int64), np.zeros(len(SLOTS), np.int64)
-    values = {"rows": rows.ctypes.data, "segments": segments.ctypes.data}
-    values |= {"starts": segments.ctypes.data, "ends": segments[1:].ctypes.data}
+    turn, slots = np.array([0, 0, 0, blocks, 0, 0, 0, 0]), np.zeros(len(SLOTS), np.int64)
+    values = {"rows": rows.ctypes.data, "turns": turn.ctypes.data}
     common = aligned((1 + len(shared(plan)),), dtype)
     values |= {"common": common.ctypes.data}
-    values |= dict.fromkeys(("steps", "levels", "groups", "threads"), 1)
+    values |= dict.fromkeys(("steps", "count", "groups", "threads"), 1)
     for name, value in values.items():
         slots[SLOTS.index(name)] = value
     Code(text, cache).call(slots)

@@ -47,7 +47,7 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "model": "Quadrotor",
         "reference": None,
         "edges": np.array([[max(0, k - 2), k] for k in range(1, agents)]),
-        "mutual": False,
+        "schedule": None,
         "state_units": tuple("m" if name in "xyz" else "" for name in names),
         "input_names": tuple(f"u{k}" for k in range(inputs_count)),
         "input_units": ("N",) * inputs_count,
@@ -64,6 +64,8 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "attributes": {"outcome": "completed", "message": "The run reached its horizon."},
     } | more
     own.setdefault("weights", np.ones(len(own["edges"])))
+    # Both ends hear each other, but for leaders.
+    own.setdefault("heard", ~np.isin(own["edges"], leaders))
     return Recording(
         times=times,
         states=states,

@@ -18,6 +18,7 @@ from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.linearization import linearize
 from echelon.models.model import wound
 from echelon.network.eigenvalues import _least
+from echelon.network.hearing import heard_along
 from echelon.promises.promise import promise
 from echelon.promises.statement import Hypothesis, Line
 from echelon.promises.stopping import stopping_of
@@ -107,6 +108,20 @@ def test_weights_that_floats_can_hardly_add_keep_their_smallest_eigenvalue():
     dense = np.array([[1.0 + light, -1.0], [-1.0, 1.0]])
     wanted = light / (2.0 + light)
     assert _least(dense) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_who_hears_along_an_edge_is_who_has_the_other_as_a_neighbour():
+    pairs = [[0, 1], [1, 2], [2, 1], [3, 2], [1, 3], [0, 4], [4, 3]]
+    for directed, edges in ((True, pairs), (False, [[1, 0], [1, 2], [3, 2], [1, 3], [0, 4]])):
+        graph = ech.Graph(edges, [0, 4], directed=directed)
+        depth = graph.depths()
+        for leaderward, reacts in ((False, True), (False, False), (True, False)):
+            heard = heard_along(graph, leaderward, reacts)
+            for pair, ends in zip(graph.edges.tolist(), heard.tolist(), strict=True):
+                for (me, other), hears in zip((pair, pair[::-1]), ends, strict=True):
+                    told = not directed or [other, me] == pair
+                    near = depth[other] < depth[me] or not leaderward
+                    assert hears == (told and near and (reacts or me not in graph.leaders))
 
 
 def test_networkx_means_the_same_by_arrows():

@@ -225,10 +225,10 @@ def test_quiet_prints_nothing_and_does_the_same(echelon, here, file):
     assert code == 2 and told == "" and fault
 
 
-def test_a_result_is_a_table_in_a_notebook():
+def test_a_result_is_a_table_in_a_notebook_with_its_pictures():
     model, graph = ech.models.SingleIntegrator(dimension=1), ech.Graph.path(3)
     states = np.array([[[0.0], [2.0], [4.0]], [[0.0], [0.5], [0.25]]])
     page = made_up(states, model, graph)._repr_html_()
-    assert page.count("<tr>") == 4
+    assert page.count("<tr>") == 4 and page.count('src="data:image/png;base64,') == 2
     assert "<td>follower 1</td><td>2</td><td>0.5</td>" in page
     assert "<td>leader 0</td><td></td><td></td>" in page

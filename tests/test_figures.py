@@ -7,6 +7,7 @@ import pytest
 from recordings import PROMISE, flown, tracked
 
 from echelon.core.errors import OutputError
+from echelon.network.switching import Schedule
 from echelon.plots.run import NAMES, figures
 from echelon.plots.style import ONE_COLUMN, TWO_COLUMNS
 
@@ -138,6 +139,27 @@ def test_the_network_has_every_edge_and_an_arrow_from_who_leads(run):
     assert {text.get_text() for text in ax.texts} - {""} == {"0", "1", "2", "3"}
 
 
+def test_a_graph_that_switches_has_the_links_of_each_time(run):
+    weights = np.array([[1.0, 1.0, 0.0], [0.0, 2.0, 1.0]])
+    schedule = Schedule(np.array([0.0, 2.5]), weights, None)
+    switched = dataclasses.replace(run, schedule=schedule, weights=weights.max(axis=0))
+    made = figures(switched, ["network", "distances", "trajectories"])
+    for ax, row in zip(made["network"].axes, weights, strict=True):
+        drawn = [line for part in ax.collections for line in part.get_segments()]
+        np.testing.assert_allclose(np.stack(drawn), run.offsets[run.edges[row > 0.0]][:, :, :2])
+    titles = [ax.get_title() for ax in made["network"].axes]
+    assert titles == ["from 0 to 2.5 s", "from 2.5 s on"]
+    for place, (i, j) in enumerate(run.edges):
+        shown = lines_of(made["distances"])[f"{i} to {j}"]
+        there = weights[(run.times >= 2.5).astype(int), place] > 0.0
+        np.testing.assert_array_equal(np.isfinite(shown[:, 1]), there)
+    # Of the six times of the graph three are before the switch.
+    grey = [line for line in made["trajectories"].axes[0].lines if line.get_zorder() == 3]
+    counts = [np.isfinite(np.array(line.get_data_3d())).all(axis=0).sum() for line in grey]
+    assert counts == [4] * 6
+    np.testing.assert_allclose(np.array(grey[5].get_data_3d()).T[3], run.states[-1, 0, :3])
+
+
 def test_a_flock_is_bands_a_median_and_its_worst_by_name(flock):
     lines = lines_of(figures(flock, ["formation"])["formation"])
     errors = flock.formation_errors[:, list(flock.followers)]
@@ -215,6 +237,7 @@ def stored(run, version):
             "nearest_leader": ("agent", run.nearest),
             "edge_agents": (("edge", "end"), run.edges),
             "edge_weight": ("edge", run.weights),
+            "edge_heard": (("edge", "end"), run.heard.astype(np.int8)),
         },
         {
             "time": run.times,

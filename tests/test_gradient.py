@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.engine import backward
+from echelon.engine import gradient as gradients
 from echelon.engine.gradient import gradient
 
 LINE = ech.Graph.path(2)
@@ -26,12 +28,14 @@ def integrators(coupling, p=1.0, r=1.0, start=0.7):
     )
 
 
+@pytest.mark.parametrize("engine", ["jax", "native"])
 @pytest.mark.parametrize("steps", [1, 2, 7, 30])
-def test_the_slopes_of_a_scalar_have_a_closed_form(steps):
+def test_the_slopes_of_a_scalar_have_a_closed_form(steps, engine):
     c, p, r, start, dt = 0.8, 1.5, 2.0, 0.7, 0.1
-    settings = ech.Settings(steps * dt, dt, integrator="euler")
+    settings = ech.Settings(steps * dt, dt, integrator="euler", engine=engine)
     wrt = ("P", "R", "coupling", "initial")
     found = ech.gradient(integrators(c, p, r, start), settings, squares, wrt)
+    assert found.engine == engine
     # sum over k < K of start^2 q^(2k), q = 1 - dt c p / r.
     q, k = 1.0 - dt * c * p / r, np.arange(steps)
     value = start**2 * (q ** (2 * k)).sum()
@@ -47,10 +51,8 @@ def test_the_slopes_of_a_scalar_have_a_closed_form(steps):
 
 def flock():
     """Three vehicles on a line that follow a circle behind their limits."""
-    built = ech.load_scenario("paper", ["simulation.horizon=0.4", "simulation.dt=0.01"])
-    from echelon.scenario.build import build
-
-    return build(built)
+    horizon = ["simulation.horizon=0.4", "simulation.dt=0.01", "simulation.engine=native"]
+    return ech.build(ech.load_scenario("paper", horizon))
 
 
 def test_the_slopes_of_the_paper_s_run_are_those_of_differences():
@@ -77,6 +79,103 @@ def test_the_slopes_of_the_paper_s_run_are_those_of_differences():
     assert found.slopes["coupling"] == pytest.approx(by_c, rel=1e-4)
 
 
+WRT = ("P", "R", "coupling", "initial")
+
+
+def all_terms(sums):
+    """A cost with slopes along everything that is summed, distances apart."""
+    errors = sums.errors[0].sum() + 0.1 * (sums.errors[1] ** 2).sum()
+    led = 0.3 * sums.tracking.sum() + 0.2 * (sums.outputs**2).sum()
+    return errors + led + 0.01 * sums.effort.sum()
+
+
+def with_distances(sums):
+    return all_terms(sums) + 0.5 * sums.spacing.sum()
+
+
+def check_equal(parts, settings, cost, wrt):
+    ours, theirs = (
+        ech.gradient(parts, settings._replace(engine=engine), cost, wrt)
+        for engine in ("native", "jax")
+    )
+    assert (ours.engine, theirs.engine) == ("native", "jax")
+    assert ours.value == pytest.approx(theirs.value, rel=1e-13)
+    for name in wrt:
+        a, b = ours.slopes[name], theirs.slopes[name]
+        assert np.abs(b).max() > 0.0 and np.abs(a - b).max() <= 1e-12 * np.abs(b).max(), name
+
+
+def points(graph, feedforward, dimension=2, **more):
+    """Points in the plane that follow a circle."""
+    model = ech.models.DoubleIntegrator(dimension=dimension)
+    gain = ech.synthesize(model, ech.Graph.path(5), ech.gains.Riccati(coupling=0.3))
+    leader = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5))
+    drive = ech.Laws(leader, ech.laws.Consensus(gain, feedforward=feedforward))
+    formation = ech.Formation.circle(model, graph, spacing=1.0)
+    return ech.Parts(model, graph, formation, drive, initial={"position": 0.3}, **more)
+
+
+def uneven():
+    """Two leaders, edges of one direction and of several weights, that switch; and wind."""
+    first = [(0, 1, 2.0), (1, 2, 1.0), (3, 2, 0.5), (2, 1, 1.5), (0, 4, 1.0)]
+    then = [(3, 1, 1.0), (1, 2, 0.7), (1, 4, 1.0), (4, 2, 3.0)]
+    graph = ech.Graph.switching([(0.0, first), (0.075, then)], (0, 3), 5, directed=True)
+    wind = ech.Disturbance(constant={"velocity": 0.3})
+    return points(graph, "relay", world=ech.World(disturbance=wind))
+
+
+SHORT = ech.Settings(horizon=0.2, dt=0.01, steady_window=0.1)
+
+
+def test_native_slopes_are_those_of_jax_on_any_graph_in_wind():
+    check_equal(uneven(), SHORT, all_terms, (*WRT, "offsets"))
+
+
+def test_native_slopes_are_those_of_jax_along_distances_and_through_parents():
+    check_equal(points(ech.Graph.path(11), "parent"), SHORT, with_distances, WRT)
+
+
+@pytest.mark.slow
+def test_native_slopes_are_those_of_jax_for_vehicles_and_the_distances_between_them():
+    parts, _ = ech.build(ech.load_scenario("planar-quadrotor"))
+    check_equal(parts, SHORT, with_distances, WRT)
+
+
+@pytest.mark.slow
+def test_native_slopes_are_those_of_jax_for_a_law_that_remembers():
+    parts = points(ech.Graph.ring(5), "relay", dimension=1)
+    parts = parts.replace(drive=ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint()))
+    check_equal(parts, SHORT, all_terms, ("initial", "offsets"))
+
+
+def test_a_run_is_taken_back_in_stretches_as_in_one(monkeypatch):
+    parts, settings = points(ech.Graph.path(11), "parent"), SHORT._replace(engine="native")
+    once = ech.gradient(parts, settings, with_distances, WRT)
+    monkeypatch.setattr(backward, "_TAPE", 1)
+    again = ech.gradient(parts, settings, with_distances, WRT)
+    for name in WRT:
+        np.testing.assert_array_equal(once.slopes[name], again.slopes[name])
+
+
+class Stretched(ech.models.SingleIntegrator):
+    """Sees differences twice as large as they are."""
+
+    def difference(self, x, y):
+        return 2.0 * (x - y)
+
+
+def test_what_cannot_be_taken_back_natively_is_by_jax_and_says_so(monkeypatch):
+    parts, settings = integrators(1.0), ech.Settings(0.2, 0.1)
+    parts = parts.replace(model=Stretched(1))
+    told = "there is no native code for a `difference` of states that is not x - y"
+    with pytest.raises(ech.EchelonError, match=told):
+        ech.gradient(parts, settings._replace(engine="native"), squares, ("P",))
+    monkeypatch.setattr(gradients, "_WORTH", 1)
+    found = ech.gradient(parts, settings, squares, ("P",))
+    assert found.engine == "jax"
+    assert found.warnings[0].startswith(f"JAX takes the steps back, since {told}")
+
+
 def test_where_two_agents_meet_the_distance_between_them_takes_no_slope_away():
     found = ech.gradient(
         integrators(1.0, start=0.0), ech.Settings(0.2, 0.1), lambda s: s.spacing.sum(), ("initial",)
@@ -87,7 +186,7 @@ def test_where_two_agents_meet_the_distance_between_them_takes_no_slope_away():
 @pytest.mark.parametrize(
     ("wrt", "told"),
     [
-        (("Q",), "`wrt` names `Q`, allowed are `P`, `R`, `coupling`, `initial`."),
+        (("Q",), "`wrt` names `Q`, allowed are `P`, `R`, `coupling`, `initial`, `offsets`."),
         (("couplin",), "allowed are .* \\(did you mean `coupling`\\?\\)"),
     ],
 )

@@ -15,6 +15,7 @@ from echelon.core.errors import SimulationError
 from echelon.engine import code
 from echelon.live import mover
 from echelon.live import server as served
+from echelon.live import swarm as looked
 from echelon.live.knobs import Panel
 from echelon.live.promiser import badge_of, first_look
 from echelon.live.server import live, serve_live
@@ -102,6 +103,7 @@ def test_a_law_that_remembers_and_signals_is_live_too():
 
 KNOBS = {
     "coupling": {"coupling": 3.0},
+    "weight": {"weight": 4.0},
     "feedforward": {"feedforward": 0.0},
     "size": {"size": 2.0},
     "turn": {"turn": 30.0},
@@ -160,6 +162,28 @@ def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(se
     told = session.ask({"name": "law", "value": "agreement"})
     assert told["fault"].startswith("follower: the law `agreement` is made for `SingleIntegrator`")
     assert "there is no law `best` here" in session.ask({"name": "law", "value": "best"})["fault"]
+
+
+SWITCHING = {
+    "edges": [[0, 1], [1, 2], [1, 3], [0, 3]],
+    "schedule": [{"at": 0.09, "edges": [[0, 3], [2, 3], [1, 2]]}],
+    "period": 0.15,
+}
+
+
+def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
+    own = scenario(graph=SWITCHING)
+    panel = Panel(own, build(own))
+    # Few periods are foreseen at a time, so that the loop must look ahead again.
+    monkeypatch.setattr(looked, "_AHEAD", 0.2)
+    swarm = Swarm(*panel.built, panel)
+    assert len(swarm.loop.switches.steps) == 10 and panel.slowest(panel.start) is None
+    for knobs in (panel.start, panel.start._replace(cut=frozenset({2}))):
+        parts, settings = build(panel.standing(knobs))
+        settings = settings._replace(horizon=1.2)
+        wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+        swarm.turn(knobs)
+        np.testing.assert_allclose(flown(swarm, 30), wanted.states[1:], atol=1e-11)
 
 
 def test_another_method_brings_its_gain_and_its_coupling(session):

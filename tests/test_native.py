@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.engine import crew, native, places
+from echelon.engine import crew, native, places, turns
 from echelon.engine.drive import numbers
 from echelon.engine.prepare import prepare
 
@@ -215,6 +215,27 @@ def test_bits_do_not_depend_on_threads():
     alone, shared = chunks
     assert shared.now.states.tobytes() == alone.now.states.tobytes()
     assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, alone.sums, strict=True))
+
+
+@pytest.mark.parametrize("graph", [ech.Graph.ring(200), ech.Graph.ring(200, leaders=(0, 90))])
+def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkeypatch):
+    model = ech.models.DoubleIntegrator(1)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.3))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    formation = ech.Formation(np.arange(200.0)[:, None] * [[1.0, 0.0]])
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    whole, stepper = stepped(parts, run_settings(), (5, 0, 40), "native")
+    near = stepper.places.near
+    assert near.reach < 4
+    monkeypatch.setattr(turns, "_CACHES", (8 * near.reach * near.bytes,))
+    for threads in (1, 3):
+        stepper.crew = crew.Crew(stepper.places, None, threads)
+        with jax.enable_x64(True):
+            tiles = stepper.advance(stepper.start(), np.array([5, 0, 40]), None)
+        assert len(stepper.crew._turns(40, 0)) > 3 * 40
+        assert tiles.states.tobytes() == whole.states.tobytes()
+        assert tiles.inputs.tobytes() == whole.inputs.tobytes()
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(tiles.sums, whole.sums, strict=True))
 
 
 def test_threads_of_which_not_all_were_started_do_not_wait_for_the_others():

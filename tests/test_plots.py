@@ -11,6 +11,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from runs import simulate
 
+import echelon as ech
 from echelon.core.errors import Outcome
 from echelon.gains import FixedGain, Riccati
 from echelon.gains.gain import synthesize
@@ -27,7 +28,7 @@ from echelon.network.graph import Graph
 from echelon.plots.run import figures, save_figures
 from echelon.plots.style import COLOURS, thin
 from echelon.references import Circle, Lemniscate
-from echelon.results.dataset import dataset
+from echelon.results.dataset import dataset, summary
 from echelon.results.lyapunov import lyapunov
 from echelon.results.recording import recording
 
@@ -426,3 +427,39 @@ assert "matplotlib.pyplot" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def multitude():
+    """A line of 6,001 agents that a leader in its middle makes go somewhere."""
+    model, agents = ech.models.SingleIntegrator(dimension=2), 6001
+    edges = np.stack([np.arange(agents - 1), np.arange(1, agents)], axis=1)
+    graph = ech.Graph.from_edges(edges, leaders=(3000,), agents=agents)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    places = np.arange(agents)
+    formation = ech.Formation(np.stack([places - 3000.0, places % 7.0], axis=1))
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 0.3})
+    return ech.simulate(parts, ech.Settings(horizon=0.02, dt=0.01, steady_window=0.01))
+
+
+def test_a_multitude_is_drawn_by_some_and_the_graph_about_its_leader(multitude):
+    made = figures(multitude, ("trajectories", "network", "states", "distances"))
+    [ax] = made["trajectories"].axes
+    assert ax.get_title() == "1,501 of 6,001 agents"
+    starts = multitude.states[0]
+    drawn = [line.get_xydata()[0] for line in ax.lines[:1501]]
+    assert np.isin(np.array(drawn), starts).all() and np.isin(starts[3000], drawn[0]).all()
+    [ax] = made["network"].axes
+    assert ax.get_title() == "2,000 of 6,001 agents"
+    across = np.sort([line.get_xydata()[0, 0] for line in ax.lines])
+    wanted = np.sort(multitude.formation.offsets[2000:4001, 0])
+    assert len(across) == 2000 and np.isin(across, wanted).all()
+    assert max(len(ax.lines) for ax in made["states"].axes) < 2010
+
+
+def test_the_summary_of_a_multitude_names_the_best_the_median_and_the_worst(multitude):
+    told, every = summary(multitude), ech.metrics(multitude)
+    errors = np.sort([each.steady_rmse for each in every.followers])
+    assert [row["steady_rmse"] for row in told["followers"]] == errors[[0, 3000, -1]].tolist()
+    off = np.sort([each.distance_rmse for each in every.edges])
+    assert [row["distance_rmse"] for row in told["edges"]] == off[[0, 3000, -1]].tolist()

@@ -327,3 +327,19 @@ def test_combinations_lie_inside_and_points_beyond_a_corner_do_not(seed):
     assert farthest_outside(hull, error, off[None]) == pytest.approx(0.1 * 1000.0)
     error[0, 0] = 0.4
     assert farthest_outside(hull, error, off[None]) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("summary", "sentence"),
+    [
+        ('{"promise": {', "`run/summary.json` cannot be read, or is damaged: "),
+        ("[1]", "`run/summary.json` is damaged: it holds no mapping."),
+        ('{"gain": {"coupling": 1.0}}', "`run` has lost its `gain.json`; `echelon run run --out"),
+        ('{"gain": null}', "the law of `run` left neither a gain nor a tube to verify."),
+    ],
+)
+def test_a_run_without_what_it_promised_is_told_so(echelon, here, summary, sentence):
+    (here / "run").mkdir()
+    (here / "run" / "summary.json").write_text(summary)
+    code, _, fault = echelon("verify", "run")
+    assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1

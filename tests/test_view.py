@@ -14,6 +14,7 @@ from browser import chromium, opened, until
 from recordings import flown, recorded
 
 from echelon.core.errors import OutputError
+from echelon.network.switching import Schedule
 from echelon.plots.space import space_of
 from echelon.results.dataset import dataset
 from echelon.results.recording import recording
@@ -106,24 +107,56 @@ def test_every_link_shown_is_a_link_of_the_graph_and_is_drawn_between_its_agents
         assert darkest(page, x, y) > 140
 
 
-def darkest(page, x, y):
+ARROWS = {
+    "edges": np.array([[0, 1], [1, 2], [3, 2], [0, 3]]),
+    "heard": np.array([[False, True], [False, True], [True, True], [False, False]]),
+    "schedule": Schedule(
+        np.array([0.0, 2.0]), np.array([[1.0, 1.0, 0.0, 1.0], [0.0, 1.0, 2.0, 1.0]]), 3.0
+    ),
+}
+
+
+def test_arrows_go_to_who_hears_and_a_graph_that_switches_has_the_links_of_the_time(
+    browser, tmp_path
+):
+    run = flown(**ARROWS)
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(run), "utf-8")
+    with opened(browser, path.as_uri(), color_scheme="light") as page:
+        for time in (0.0, 1.98, 2.0, 2.98, 3.0, 5.5):
+            seek(page, round(50 * time))
+            assert page.evaluate("echelon.links") == run.edges[run.linked(time)].tolist()
+        seek(page, 275)
+        heard = [page.evaluate(f"echelon.player.view.heardBy({k})") for k in range(4)]
+        assert heard == [[], [], [1, 3], [2]]
+        # The head of the arrow from 1 to 2 is wide where its line is not.
+        first, second = (np.array(page.evaluate(f"echelon.whereOnScreen({k})")) for k in (1, 2))
+        way = second - first
+        aside = 4.0 * np.array([-way[1], way[0]]) / np.linalg.norm(way)
+        parts = {k: darkest(page, *(first + k * way + aside), 1) for k in np.arange(0.4, 0.9, 0.04)}
+        assert min(x for k, x in parts.items() if k > 0.55) < 140
+        assert all(x > 140 for k, x in parts.items() if k < 0.5)
+
+
+def darkest(page, x, y, reach=4):
     """The darkest grey near a place of the scene, with nothing but links in sight."""
     page.evaluate("""for (const button of document.querySelectorAll('.toggle[aria-pressed=true]'))
         if (button.textContent !== 'links') button.click()""")
     return page.evaluate(
-        """([x, y]) => new Promise((done) => requestAnimationFrame(() => {
+        """([x, y, r]) => new Promise((done) => requestAnimationFrame(() => {
         const view = echelon.player.view;
         view.render();
         const flat = document.createElement('canvas');
         const from = view.renderer.domElement, scale = from.width / from.clientWidth;
-        Object.assign(flat, { width: 9, height: 9 });
+        const n = 2 * r + 1;
+        Object.assign(flat, { width: n, height: n });
         const pen = flat.getContext('2d');
         pen.fillStyle = 'white';
-        pen.fillRect(0, 0, 9, 9);
-        pen.drawImage(from, x * scale - 4, y * scale - 4, 9, 9, 0, 0, 9, 9);
-        done(Math.min(...pen.getImageData(0, 0, 9, 9).data.filter((_, k) => k % 4 === 1)));
+        pen.fillRect(0, 0, n, n);
+        pen.drawImage(from, x * scale - r, y * scale - r, n, n, 0, 0, n, n);
+        done(Math.min(...pen.getImageData(0, 0, n, n).data.filter((_, k) => k % 4 === 1)));
     }))""",
-        [x, y],
+        [x, y, reach],
     )
 
 
@@ -405,7 +438,8 @@ def test_what_is_read_from_a_file_is_what_ran(stored):
     run = recording(dataset(result))
     np.testing.assert_array_equal(run.states, result.states)
     np.testing.assert_array_equal(run.errors, result.errors)
-    assert run.position == (0, 1) and run.unit == "m" and not run.mutual
+    assert run.position == (0, 1) and run.unit == "m"
+    assert run.heard.tolist() == [[False, True], [True, True]] and run.schedule is None
     assert run.nearest.tolist() == list(result.graph.nearest_leader())
     assert run.modes is not None and run.modes.poles.real.max() < 0.0
 

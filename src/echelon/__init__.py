@@ -7,6 +7,11 @@ heavy is imported until it is used, and importing changes no global setting.
 
 import lazy_loader
 
+from echelon.core.pages import PAGES
+
 __version__ = "0.1.0"
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# Told here, above all rooms: what a notebook shows of a result is drawn high above the engine.
+PAGES["result"] = "echelon.archive.notebook:result_page"

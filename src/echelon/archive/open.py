@@ -1,6 +1,8 @@
 """A run's folder, read again: the recording of its `run.nc`, or of what was computed of it."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 from echelon.archive.chunks import Chunks
 from echelon.archive.folder import DATA, GAIN, SUMMARY
@@ -54,5 +56,24 @@ def promise_file(place: PathLike) -> Path:
     if (path / GAIN).is_file() or not (path / SUMMARY).is_file():
         return path / GAIN
     if read_tube(path / SUMMARY) is None:
+        if _summary(path / SUMMARY).get("gain") is not None:
+            raise OutputError(
+                f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` makes it again."
+            )
         raise OutputError(f"the law of `{path}` left neither a gain nor a tube to verify.")
     return path / SUMMARY
+
+
+def _summary(file: Path) -> dict[str, Any]:
+    """Return the summary in a file.
+
+    Raises:
+        OutputError: the file is damaged.
+    """
+    try:
+        told = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"`{file}` cannot be read, or is damaged: {error}.") from error
+    if not isinstance(told, dict):
+        raise OutputError(f"`{file}` is damaged: it holds no mapping.")
+    return told

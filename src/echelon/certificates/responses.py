@@ -6,6 +6,7 @@ enclose a polynomial and are halved until the enclosure is tight. Upper bounds a
 (theory page, T5).
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from fractions import Fraction
@@ -97,12 +98,18 @@ class Chain(NamedTuple):
         It is the integral of |h^(order)|, which is how far h^(order - 1) goes up and down; of the
         highest order w itself adds k0.
         """
-        if order == 0:
-            return Fraction(1)
-        if not self.powers:
-            return Fraction(0)
-        direct = self.stiffness if order == len(self.powers) else Fraction(0)
-        return direct + spread_between(self.kernel(order), Fraction(0), Fraction(1))
+        return _gain(self, order)
+
+
+@functools.lru_cache(128)
+def _gain(chain: Chain, order: int) -> Fraction:
+    # Remembered, since it is the same for all starts of a sweep.
+    if order == 0:
+        return Fraction(1)
+    if not chain.powers:
+        return Fraction(0)
+    direct = chain.stiffness if order == len(chain.powers) else Fraction(0)
+    return direct + spread_between(chain.kernel(order), Fraction(0), Fraction(1))
 
 
 def _solve(rows: list[list[Fraction]], right: list[Fraction]) -> list[Fraction]:

@@ -37,8 +37,9 @@ def plot(
     if dpi is not None and not _LEAST <= dpi <= _MOST:
         raise OutputError(f"`--dpi` is {dpi}, and must be from {_LEAST} to {_MOST}.")
     from echelon.archive.open import open_run
+    from echelon.plots.files import save
     from echelon.plots.run import NAMES, figures
-    from echelon.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS, save
+    from echelon.plots.style import ONE_COLUMN, SCREEN, TWO_COLUMNS
 
     recording = open_run(run)
     names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))

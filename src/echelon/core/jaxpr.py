@@ -101,6 +101,14 @@ def _used(jaxpr: Any) -> list[Any]:
     return found[::-1]
 
 
+def read_by(function: Callable[..., Any], *arguments: Any) -> list[bool]:
+    """Return which leaves of the arguments the results of a function for JAX may rest on."""
+    jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
+    read = {v for equation in _used(jaxpr) for v in equation.invars if not hasattr(v, "val")}
+    read.update(v for v in jaxpr.outvars if not hasattr(v, "val"))
+    return [v in read for v in jaxpr.invars]
+
+
 def apply(equation: Any, operands: list[np.ndarray], algebra: Algebra) -> list[np.ndarray]:
     """Return the results of one equation for arrays of entries or of numbers."""
     name = equation.primitive.name
@@ -155,6 +163,7 @@ PLACED = {
     "dynamic_update_slice",
     "expand_dims",
     "tile",
+    "unstack",
 }
 """Primitives that copy entries to other places."""
 

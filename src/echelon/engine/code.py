@@ -1,8 +1,8 @@
 """The code that steps loops, made once for those that are alike but for their numbers."""
 
-from collections.abc import Hashable, MutableMapping
+from collections.abc import Callable, Hashable, MutableMapping
 from pathlib import Path
-from typing import NamedTuple, final
+from typing import NamedTuple, TypeAlias, final
 from weakref import WeakValueDictionary
 
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from echelon.engine.loop import Loop
 from echelon.engine.own import Own
 from echelon.engine.scalars import Rows, body_of, signals_of
-from echelon.kernels import Code, Plan, program, shared
+from echelon.kernels import Code, Plan, program, shared, winds
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
@@ -25,7 +25,7 @@ def follows(loop: Loop) -> bool:
     return loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
 
 
-class _Kernel(NamedTuple):
+class Kernel(NamedTuple):
     """The code that steps some loops, the rows that it works on, its plan, and `common.shared`."""
 
     code: Code
@@ -34,22 +34,15 @@ class _Kernel(NamedTuple):
     common: int
 
 
-def _kernel(
-    own: Own,
-    bits: int,
-    together: bool,
-    lines: bool,
-    weighted: bool,
-    codes: MutableMapping[str, Code],
-) -> _Kernel:
-    """Return the code that steps some loops, the rows that it works on, and its plan.
-
-    `codes` are those that were made, by their texts: other graphs are other numbers in the same.
+def plan_of(
+    own: Own, rows: Rows, bits: int, together: bool, lines: bool, weighted: bool, tabled: bool
+) -> Plan:
+    """Return what is written of some loops, whose own numbers may stand in the table (`tabled`).
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
     """
-    loop, rows, wanted = own.loop, Rows.of(own.loop, own.count), follows(own.loop)
+    loop, wanted = own.loop, follows(own.loop)
     n, alone = len(rows.state), len(loop.leaders) == 1
     plan = Plan(
         bits=bits,
@@ -58,23 +51,37 @@ def _kernel(
         lines=lines,
         rows=rows.total,
         width=n + signals_of(loop),
-        first=body_of(own, bits, rows, True, wanted),
-        others=body_of(own, bits, rows, False, wanted),
+        first=body_of(own, bits, rows, True, wanted, tabled),
+        others=body_of(own, bits, rows, False, wanted, tabled),
         tell=rows.tell.start,
         told=len(rows.tell),
         one_source=alone and loop.parents is None,
         one_leader=alone,
         weighted=weighted or bool((np.asarray(loop.exchange.weights) != 1.0).any()),
         edges=loop.meter.measured,
-        table=n if wanted else 0,
+        table=(n if wanted else 0) + (own.count if tabled else 0),
         dt=loop.motion.dt,
     )
+    # A leader that hears nobody, and is told nothing, waits for nobody.
+    ahead = not together and loop.levels is None and not plan.first.hears
+    return plan._replace(width=plan.width + winds(plan), ahead=ahead)
+
+
+def compiled(rows: Rows, plan: Plan, codes: MutableMapping[str, Code]) -> Kernel:
+    """Return the code of a plan, and with it what is known of it.
+
+    `codes` are those that were made, by their texts: other graphs are other numbers in the same.
+    """
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     text = program(plan)
     code = codes.get(text) or Code(text, Path(cache) if cache else None)
     codes[text] = code
-    return _Kernel(code, rows, plan, len(shared(plan)))
+    return Kernel(code, rows, plan, len(shared(plan)))
+
+
+Make: TypeAlias = Callable[[Own, int, bool, bool, bool], Kernel]
+"""What makes kernels, or has made them, as `Kernels.of` does."""
 
 
 @final
@@ -83,12 +90,12 @@ class Kernels:
 
     def __init__(self) -> None:
         """Begin with none."""
-        self._made: dict[Hashable, _Kernel] = {}
+        self._made: dict[Hashable, Kernel] = {}
         self._codes: MutableMapping[str, Code] = WeakValueDictionary()
 
     def of(
         self, own: Own, bits: int, together: bool, lines: bool = False, weighted: bool = False
-    ) -> _Kernel:
+    ) -> Kernel:
         """Return what steps some loops, `weighted` where their edges' weights may become others.
 
         Raises:
@@ -101,5 +108,7 @@ class Kernels:
             # The oldest goes: a sweep over models has one after the other.
             while len(self._made) >= _KEPT:
                 self._made.pop(next(iter(self._made)))
-            self._made[key] = _kernel(own, bits, together, lines, weighted, self._codes)
+            rows = Rows.of(own.loop, own.count)
+            plan = plan_of(own, rows, bits, together, lines, weighted, False)
+            self._made[key] = compiled(rows, plan, self._codes)
         return self._made[key]

@@ -13,7 +13,8 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.places import Places
-from echelon.kernels import SLOTS, Code
+from echelon.engine.turns import pays, step_by_step, tile_by_tile
+from echelon.kernels import SLOTS, Code, aligned
 
 _SHARED = 20_000
 """Agents of a swarm from which on threads share its steps; they wait twice in each."""
@@ -50,6 +51,7 @@ class Crew:
         large = len(places.agents) >= _SHARED
         self.threads = 1 if places.together else threads or (processors() if large else 1)
         self._own = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._known: dict[tuple[int, int], Array] = {}
 
     def run(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
@@ -65,16 +67,15 @@ class Crew:
         if self._own is not None:
             self._swarm(code, values, firsts, common)
             return
-        groups = np.arange(self.places.groups)
-        segments = self.places.segments
+        groups, turns = np.arange(self.places.groups), self._turns(values["steps"], 0)
 
         def fly(some: Array) -> None:
             own = {
                 name: array[len(array) // len(groups) * some[0] :] for name, array in firsts.items()
             }
             room = common if len(some) == len(groups) else np.empty_like(common)
-            told = {"groups": len(some), "threads": 1}
-            _call(code, values | told, own | _from(segments[:-1], segments[1:]) | {"common": room})
+            told = {"groups": len(some), "threads": 1, "count": len(turns)}
+            _call(code, values | told, own | {"common": room, "turns": turns})
 
         if self.pool is None or len(groups) < 2:
             fly(groups)
@@ -85,23 +86,35 @@ class Crew:
     def _swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array
     ) -> None:
-        """Let each thread take a part of each level, and of the edges."""
+        """Let each thread take its turns."""
         assert self._own is not None
-        segments, count, met = self.places.segments, self.threads, np.zeros(8, np.int64)
-        sizes = np.diff(segments)
+        # Each counts on a line of memory of its own.
+        done = aligned((self.threads, 8), np.int64)
         rest = ctypes.cast(_rest(), ctypes.c_void_p).value or 0
 
         def fly(k: int) -> None:
-            starts, ends = (segments[:-1] + sizes * part // count for part in (k, k + 1))
-            first, last = (values["edge_blocks"] * part // count for part in (k, k + 1))
-            told = {"groups": 1, "threads": count, "rest": rest}
-            told |= {"first_edge": first, "edge_blocks": last}
+            turns = self._turns(values["steps"], k)
+            told = {"groups": 1, "threads": self.threads, "thread": k, "rest": rest}
             room = common if k == 0 else np.empty_like(common)
-            parts = _from(starts, ends) | {"common": room, "met": met}
-            _call(code, values | told, firsts | parts)
+            parts = {"common": room, "done": done, "turns": turns}
+            _call(code, values | told | {"count": len(turns)}, firsts | parts)
 
         # A thread each, since they wait for each other.
-        share(self._own, fly, range(count))
+        share(self._own, fly, range(self.threads))
+
+    def _turns(self, steps: int, thread: int) -> Array:
+        """Return the turns of a thread."""
+        if (steps, thread) not in self._known:
+            if len(self._known) > 8 * self.threads:
+                self._known.clear()
+            segments, near = self.places.segments, self.places.near
+            if near is not None and pays(segments, near, steps):
+                found = tile_by_tile(segments, near, steps, thread, self.threads)
+            else:
+                edges = self.places.edge_blocks
+                found = step_by_step(segments, edges, steps, thread, self.threads)
+            self._known[steps, thread] = found
+        return self._known[steps, thread]
 
 
 def share(pool: Executor, act: Callable[[Any], None], parts: Iterable[Any]) -> None:
@@ -127,10 +140,6 @@ def share(pool: Executor, act: Callable[[Any], None], parts: Iterable[Any]) -> N
         wait(begun)
     for each in begun:
         each.result()
-
-
-def _from(starts: Array, ends: Array) -> dict[str, Array]:
-    return {"starts": np.ascontiguousarray(starts), "ends": np.ascontiguousarray(ends)}
 
 
 def _call(code: Code, values: dict[str, int], arrays: Mapping[str, Array]) -> None:

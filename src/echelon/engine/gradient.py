@@ -10,39 +10,54 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.jaxpr import read_by
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.engine.laws import Laws
+from echelon.engine.backward import Backward, Wants
+from echelon.engine.laws import Laws, choose_engine
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
+from echelon.engine.own import Own, bare
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.settings import Settings
 from echelon.engine.simulate import sample_reference
-from echelon.engine.sums import Sums, reference_at
+from echelon.engine.sums import Sums, distance_of, reference_at
+from echelon.kernels import Unsupported
 
 Cost: TypeAlias = Callable[[Sums], jax.Array]
 """What is to be small, a number made of the sums over all steps of a run, in JAX."""
 
-VARIABLES = ("P", "R", "coupling", "initial")
-"""What a cost can be differentiated by: of the followers' gain, and the starts (N, n)."""
+_WORTH = 10_000
+"""Steps of one agent from which on native code saves more than it takes to make."""
+
+VARIABLES = ("P", "R", "coupling", "initial", "offsets")
+"""What a cost can be differentiated by.
+
+P, R and the coupling of the followers' gain; the starts (N, n); the goals' offsets (N, n), where
+the starts are held.
+"""
 
 
 class Gradient(NamedTuple):
     """A cost, its slope along each of the variables that were asked for, and the sums of the run.
 
-    The slope along P or R is symmetric, that of a change that is.
+    The slope along P or R is symmetric, that of a change that is. `engine` says what took the run
+    back, and a warning why it was not native code where that would have paid.
     """
 
     value: float
     slopes: Mapping[str, Array]
     sums: Sums
+    engine: str = "jax"
+    warnings: tuple[str, ...] = ()
 
 
 def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -> Gradient:
     """Return a cost of a run and how it changes with some of what the run is made of.
 
-    The steps of JAX are differentiated backwards, in float64. Of every some of them the states are
-    kept and the steps between computed again, so that memory grows with the root of their number.
+    The steps are differentiated backwards, in float64, by native code where `settings.engine` has
+    it so and else by JAX; both to rounding alike. Of every some of them the states are kept and the
+    steps between computed again, so that memory grows with the root of their number.
 
     Args:
         parts: agents, graph, formation, laws, starts and world.
@@ -52,7 +67,8 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
 
     Raises:
         EchelonError: a part is malformed or does not fit the others; what drives the agents are no
-            laws, or have no gain; a variable is unknown.
+            laws, or have no gain; a variable is unknown; `settings.engine` is `native`, and there
+            is no such code.
     """
     prepared = prepare(parts, settings)
     values = _values(prepared, wrt)
@@ -60,12 +76,92 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     assert isinstance(drive, Laws)
     with precision("float64"):
         loop = assemble(prepared.problem, drive.leader, drive.follower)
-        reference = sample_reference(prepared, 0, settings.steps)
-        (value, sums), slopes = _differentiate(
-            loop, values, prepared.problem.states, reference, settings.steps, cost
+        run = Run(
+            loop, values, prepared.problem.states, sample_reference(prepared, 0, settings.steps)
         )
+        return choose_engine(
+            settings,
+            len(run.states),
+            lambda: natively(run, settings.steps, cost),
+            lambda why: by_jax(run, settings.steps, cost, why),
+            _WORTH,
+        )
+
+
+class Run(NamedTuple):
+    """A loop, what the cost is differentiated by, the starts (N, n), what the leaders follow."""
+
+    loop: Loop
+    values: dict[str, Array]
+    states: Array
+    reference: Array | None
+
+
+def by_jax(run: Run, steps: int, cost: Cost, instead: str = "") -> Gradient:
+    """Return the gradient by JAX's reverse mode over steps of JAX, `instead` of native code."""
+    (value, sums), slopes = _differentiate(*run, steps, cost)
     found = {name: _symmetric(name, np.asarray(slope)) for name, slope in slopes.items()}
-    return Gradient(float(value), found, jax.tree.map(np.asarray, sums))
+    told = (f"JAX takes the steps back, since {instead}.",) * bool(instead)
+    return Gradient(float(value), found, jax.tree.map(np.asarray, sums), warnings=told)
+
+
+# ---- by native code ------------------------------------------------------------------------------
+
+
+_PARTS = {"P": ("P",), "R": ("R", "R_inverse"), "coupling": ("coupling",)}
+"""What of a gain changes with a variable."""
+
+
+def natively(run: Run, steps: int, cost: Cost) -> Gradient:
+    """Return the gradient by native code.
+
+    Raises:
+        Unsupported: there is none.
+        MissingExtraError: llvmlite is not installed.
+    """
+    names = [part for name in run.values for part in _PARTS.get(name, ())]
+    own, order = _own(run.loop, names)
+    spaced = Sums(*read_by(cost, run.loop.meter.nothing())).spacing
+    back = Backward(own, run.states, run.reference, steps, Wants(spaced, "offsets" in run.values))
+    sums = back.run()
+    if sums is None:
+        raise Unsupported("states beyond the range of its sines")
+    value, along = _slopes_of(cost, sums)
+    found = back.pull(along)
+    parts = dict(zip(order, found.leaves, strict=True))
+    parts |= {"initial": found.states, "offsets": found.offsets}
+    if "R" in parts:
+        inverse = run.loop.follower.gain.R_inverse  # type: ignore[attr-defined]
+        parts["R"] = parts["R"] - inverse.T @ parts["R_inverse"] @ inverse.T
+    slopes = {name: _symmetric(name, parts[name]) for name in run.values}
+    return Gradient(float(value), slopes, sums, "native")
+
+
+def _own(loop: Loop, names: Sequence[str]) -> tuple[Own, list[str]]:
+    """Return the numbers of the followers' gain under some names, and those in their order."""
+
+    def places(loop: Loop) -> list[Any]:
+        law: Any = loop.follower
+        return [getattr(law.gain, name) for name in names]
+
+    if not names:
+        return Own([loop]), []
+    # Twice as much is another number wherever there is one; zeros stay, and fold.
+    unlike = eqx.tree_at(places, loop, [2.0 * np.asarray(part) for part in places(loop)])
+    marked = jax.tree.leaves(eqx.tree_at(places, bare(loop), list(names)))
+    return Own([loop], unlike), [leaf for leaf in marked if isinstance(leaf, str)]
+
+
+@eqx.filter_jit
+def _slopes_of(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
+    """Return a cost of sums, and its slopes along those that have some."""
+    names = ("errors", "tracking", "outputs", "effort", "spacing")
+    smooth = {name: getattr(sums, name) for name in names}
+    value, slopes = jax.value_and_grad(lambda part: cost(sums._replace(**part)))(smooth)
+    return value, sums._replace(**slopes)
+
+
+# ---- by JAX --------------------------------------------------------------------------------------
 
 
 def _values(prepared: Prepared, wrt: Sequence[str]) -> dict[str, Array]:
@@ -75,7 +171,8 @@ def _values(prepared: Prepared, wrt: Sequence[str]) -> dict[str, Array]:
         raise SimulationError(
             f"a run driven by `{type(drive).__name__}` cannot be differentiated, one by `Laws` can."
         )
-    known: dict[str, Array] = {"initial": np.asarray(prepared.problem.states)}
+    problem = prepared.problem
+    known = {"initial": np.asarray(problem.states), "offsets": problem.formation.offsets}
     if gain is not None:
         known |= {"P": gain.P, "R": gain.R, "coupling": np.asarray(gain.coupling)}
     for name in wrt:
@@ -107,7 +204,8 @@ def _differentiate(
 
     def whole(values: dict[str, Any]) -> tuple[jax.Array, Sums]:
         start = jnp.asarray(values.get("initial", states))
-        sums = _sums(_with_gain(loop, values), start, reference, steps)
+        changed = _with_offsets(_with_gain(loop, values), values)
+        sums = _sums(changed, start, reference, steps)
         return cost(sums), sums
 
     return jax.value_and_grad(whole, has_aux=True)(jax.tree.map(jnp.asarray, values))
@@ -124,6 +222,20 @@ def _with_gain(loop: Loop, values: Mapping[str, Any]) -> Loop:
         return [getattr(gain.gain, name) for name in given]
 
     return eqx.tree_at(places, loop, [*given.values()]) if given else loop
+
+
+def _with_offsets(loop: Loop, values: Mapping[str, Any]) -> Loop:
+    """Return the loop with other offsets of the goals."""
+    if "offsets" not in values:
+        return loop
+    offsets, meter = values["offsets"], loop.meter
+    i, j = (offsets[ends][:, np.array(meter.measured)] for ends in meter.edges.T)
+    wanted = distance_of(((i - j) ** 2).sum(axis=1))
+
+    def places(loop: Loop) -> list[Any]:
+        return [loop.offsets, loop.meter.offsets, loop.meter.spacings]
+
+    return eqx.tree_at(places, loop, [offsets, offsets, wanted])
 
 
 def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) -> Sums:

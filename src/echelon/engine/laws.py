@@ -1,7 +1,7 @@
 """Agents that are driven by laws: what each does is a function of what it knows."""
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, TypeVar, final
 
 import jax
 
@@ -151,29 +151,36 @@ class Laws(Drive):
             bits = int(settings.precision[5:])
             return NativeStepper([loop], states, bits, JaxStepper(loop, states))
 
-        return choose_stepper(
+        return choose_engine(
             settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
         )
 
 
-def choose_stepper(
+_WORTH = 100_000
+"""Steps of one agent from which on native code saves more than the second that it takes to make."""
+_Made = TypeVar("_Made")
+
+
+def choose_engine(
     settings: Settings,
     agents: int,
-    native: Callable[[], Stepper],
-    by_jax: Callable[[str], Stepper],
-) -> Stepper:
-    """Return what steps so many agents.
+    native: Callable[[], _Made],
+    by_jax: Callable[[str], _Made],
+    least: int = _WORTH,
+) -> _Made:
+    """Return what one of the engines makes for so many agents.
 
     Args:
         settings: of the run.
         agents: how many.
-        native: makes native code.
+        native: makes it by native code.
         by_jax: takes why there is none, in words; empty where none is wanted.
+        least: from how many steps of one agent on native code pays.
 
     Raises:
         SimulationError: native code is asked for, and cannot be made.
     """
-    if not worth_native(settings, agents):
+    if not worth_native(settings, agents, least):
         return by_jax("")
     try:
         return native()
@@ -183,25 +190,21 @@ def choose_stepper(
         return by_jax(_in_words(error))
 
 
-_WORTH = 100_000
-"""Steps of one agent from which on native code saves more than the second that it takes to make."""
-
-
-def worth_native(settings: Settings, agents: int) -> bool:
+def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
     """Tell whether agents are to be stepped by native code: it is asked for, or pays.
 
-    It computes on processors alone.
+    It computes on processors alone, and `least` is from how many steps of one agent on it pays.
     """
     if settings.engine != "auto":
         return settings.engine == "native"
-    if settings.devices > 1 or not is_long(settings, agents):
+    if settings.devices > 1 or not is_long(settings, agents, least):
         return False
     return is_installed() and jax.default_backend() == "cpu"
 
 
-def is_long(settings: Settings, agents: int) -> bool:
+def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
     """Tell whether it pays to compile something else than the steps of a run alone."""
-    return settings.engine == "native" or settings.steps * agents >= _WORTH
+    return settings.engine == "native" or settings.steps * agents >= least
 
 
 def _in_words(error: EchelonError) -> str:

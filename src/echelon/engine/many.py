@@ -19,15 +19,16 @@ from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.engine.by_jax import JaxFormations
+from echelon.engine.code import Kernels
 from echelon.engine.crew import processors
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.family import Families
 from echelon.engine.grid import Grid
 from echelon.engine.initial import Starts
-from echelon.engine.laws import Laws, choose_stepper, is_long, worth_native
+from echelon.engine.laws import Laws, choose_engine, is_long, worth_native
 from echelon.engine.loop import Loop, assemble
 from echelon.engine.motion import Motion
-from echelon.engine.native import Kernels, NativeStepper, beyond
+from echelon.engine.native import NativeStepper, beyond
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, check_memory, prepare
 from echelon.engine.record import Recorder, Stretch
@@ -138,11 +139,11 @@ class Fleet:
         """Return what a family comes to; nothing where its runs cannot go together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
-        bits, pool = int(settings.precision[5:]), (self.pool, self.kernels)
+        bits, pool = int(settings.precision[5:]), (self.pool, self.kernels.of)
         loops, began = [job.loop for job in jobs], time.perf_counter()
         with precision(settings.precision):
             try:
-                stepper = choose_stepper(
+                stepper = choose_engine(
                     settings,
                     len(states),
                     lambda: NativeStepper(loops, states, bits, None, *pool),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.code import LANES, Kernels, follows
+from echelon.engine.code import LANES, Kernels, Make, follows
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, signals
@@ -17,22 +17,26 @@ from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.scalars import memories_of
 from echelon.engine.sums import ALWAYS, Sums
-from echelon.kernels import aligned
-from echelon.world.disturbance import draw
+from echelon.engine.winds import draw_holds, holds_at_once
+from echelon.kernels import aligned, needed, stride
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
-"""Of a chunk: some tenths of a second."""
-_AHEAD, _AT_ONCE = 64, 50_000
-"""Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
+"""Of a chunk: some hundredths of a second."""
+_OPERATIONS, _ENOUGH = {64: 2e10, 32: 4e10}, 1_000
+"""Of a chunk with no more steps than enough: about a second of one thread."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-_STEPS = 2_048
-"""Of a call: what all agents have in common is kept for each of them."""
+STEPS, _TURNS, _KEPT = 2_048, 200_000, 10_000_000
+"""Of a call: what all agents have in common is kept for each of them, and each level has a turn.
+
+And the numbers of leaders ahead that are kept.
+"""
 
 
 def beyond(states: Array, bits: int) -> Array:
     """Return which states are beyond the range of the kernels' sines; NaN is not."""
-    return np.abs(states) > _LARGEST[bits]
+    # Truths alone, since another array of so many numbers takes longer than all the rest of it.
+    return (states > _LARGEST[bits]) | (states < -_LARGEST[bits])
 
 
 @final
@@ -46,10 +50,11 @@ class NativeStepper(Stepper):
         far: what goes on where a state is beyond the range of the kernels' sines; None where the
             caller looks.
         pool: threads that step formations; None for the caller's alone.
-        kernels: those that were made before.
+        make: makes the kernel, or has made it before.
         unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
             weights of edges anyway; None where nothing is turned.
         threads: that share the steps of one formation; by its size when left out.
+        places: of the agents, where they are known.
 
     Raises:
         Unsupported: a law or the model uses what has no scalar operations.
@@ -62,9 +67,10 @@ class NativeStepper(Stepper):
         bits: int,
         far: Stepper | None,
         pool: Executor | None = None,
-        kernels: Kernels | None = None,
+        make: Make | None = None,
         unlike: Loop | None = None,
         threads: int | None = None,
+        places: Places | None = None,
     ) -> None:
         """Write and compile the step."""
         self.own = Own(loops, unlike)
@@ -72,20 +78,23 @@ class NativeStepper(Stepper):
         self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
-        self.places: Places = Formations(loops, lanes) if together else Swarm(self.loop, lanes)
+        known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
+        self.places: Places = known
         self.crew = Crew(self.places, pool, threads)
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
         lines, turned = self.places.lines, unlike is not None
-        made = (kernels or Kernels()).of(self.own, bits, together, lines, turned)
+        made = (make or Kernels().of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
+        self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
         self._held: Moment | None = None
         self._drawn, self._left = -1, -1
-        self._ahead = max(1, min(_AHEAD, _AT_ONCE // len(states)))
+        self._tape: Array | None = None
+        self._ahead = holds_at_once(len(states))
 
     # ---- memory ----
 
@@ -95,13 +104,27 @@ class NativeStepper(Stepper):
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
         shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
         self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
-        self.found = places.find(plan.width, plan.rows, self.dtype)
+        self.found = places.find(plan.width, plan.told if plan.ahead else plan.rows, self.dtype)
+        self.led = int(places.segments[1])
+        if plan.ahead:
+            assert isinstance(places, Swarm)
+            parts = (self.blocks, *self.mirrors, *self.found[1:3], *self.found[5:7])
+            bytes_ = sum(part.nbytes for part in parts) // places.blocks
+            far = 1 if plan.lines else stride(plan.width, plan.lanes)
+            places.measure(self.found, far, bytes_)
         self.edges, self.heavy = self.found.edges, self.found.weights
 
-    def _read(self, rows: range) -> Array:
-        """Return rows of all agents, (N, rows)."""
-        part = self.blocks[:, rows.start : rows.stop].transpose(0, 2, 1)
-        return part.reshape(len(self.places.agents), -1)[self.places.of]
+    def _read(self, *parts: range, out: Array | None = None) -> Array:
+        """Return parts of the rows of all agents, (N, rows), in an array that is given or new."""
+        ends = np.cumsum([len(rows) for rows in parts]).tolist()
+        dtype = self.dtype if out is None else out.dtype
+        turned = np.empty((len(self.blocks), self.plan.lanes, ends[-1]), dtype)
+        for rows, end in zip(parts, ends, strict=True):
+            part = self.blocks[:, rows.start : rows.stop]
+            turned[..., end - len(rows) : end] = part.transpose(0, 2, 1)
+        flat = turned.reshape(len(self.places.agents), -1)
+        # Places are right, and to look at each would take a copy.
+        return np.take(flat, self.places.of, axis=0, out=out, mode="clip")
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
@@ -129,7 +152,9 @@ class NativeStepper(Stepper):
     @property
     def longest(self) -> int:
         """Steps that take some tenths of a second, or a few of very many agents."""
-        return max(_FEWEST, _AGENT_STEPS * len(self.loops) // len(self.states))
+        agents = len(self.states) // len(self.loops)
+        more = int(_OPERATIONS[self.bits] / (self._work * agents))
+        return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
@@ -146,7 +171,7 @@ class NativeStepper(Stepper):
         """Store frames and take steps; what happens on the way is seen afterwards."""
         if now is not self._held:
             self._load(now)
-        made = self._fly(int(now.step), counts, reference)
+        made = self._fly(now, counts, reference)
         if self.far is None or not beyond(made.states, self.bits).any():
             return made
         self._held = None
@@ -161,48 +186,61 @@ class NativeStepper(Stepper):
         # Offsets, numbers and the wind are written with a moment.
         self._held = None
 
-    def _fly(self, first: int, counts: Array, reference: Array | None) -> Chunk:
-        self._clear_sums()
-        table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
-        step, states, inputs = first, list[Array](), list[Array]()
-        for count in counts.tolist():
-            states.append(self._read(self.rows.state))
-            if count:
-                self._run(step, 1, first, table)
-                inputs.append(self._read(self.rows.input))
-                self._run(step + 1, count - 1, first, table)
-                step += count
-            elif step == first or counts[len(inputs) - 1]:
-                inputs.append(self._look(step, first, table))
-            else:
-                inputs.append(inputs[-1])
-        self._held = self._moment(step)
-        x, u = (np.stack(part).astype(np.float64) for part in (states, inputs))
-        return Chunk(self._held, x, u, self._sums(first, step))
+    def record(self, tape: Array | None, first: int) -> None:
+        """Keep what derivatives need of the steps from one on: (steps, blocks, taped, lanes)."""
+        self._tape, self._taped_from = tape, first
 
-    def _look(self, step: int, first: int, table: Array | None) -> Array:
-        """Return the inputs of a step that is not taken."""
+    def _fly(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+        self._clear_sums()
+        first = int(now.step)
+        table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
+        step, agents = first, len(self.places.of)
+        x, u = (np.empty((len(counts), agents, len(r))) for r in (self.rows.state, self.rows.input))
+        for k, count in enumerate(counts.tolist()):
+            if step == first:
+                x[k] = now.states
+            else:
+                self._read(self.rows.state, out=x[k])
+            if count:
+                self._run(step, count, first, table)
+                self._read(self.rows.input, out=u[k])
+                step += count
+            elif step == first or counts[k - 1]:
+                self._look(step, first, table, u[k])
+            else:
+                u[k] = u[k - 1]
+        self._held, sums = self._leave(first, step)
+        return Chunk(self._held, x, u, sums)
+
+    def _look(self, step: int, first: int, table: Array | None, out: Array) -> None:
+        """Read the inputs of a step that is not taken."""
         changed = (self.blocks, self.edges, *self.mirrors)
         kept, drawn = [array.copy() for array in changed], self._drawn
         self._run(step, 1, first, table)
-        found = self._read(self.rows.input)
+        self._read(self.rows.input, out=out)
         self.mirrors.reverse()
         for array, before in zip(changed, kept, strict=True):
             array[:] = before
         # What was drawn for it is gone from the blocks again.
         self._drawn = drawn
-        return found
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps under one draw of the wind, and one stretch of the graph, after the other."""
-        wind = self.loop.motion.wind
+        """Take steps under one draw of the wind, and one stretch of the graph, after the other.
+
+        The inputs of the first one are left in the rows.
+        """
+        wind, shown = self.loop.motion.wind, step
+        most = _TURNS // len(self.places.segments)
+        if self.plan.ahead:
+            each = self.plan.mirror + self.plan.told * self.plan.lanes
+            most = min(most, _KEPT // (self.led * each))
         while steps:
-            count = min(steps, _STEPS, self._switch(step))
+            count = min(steps, STEPS, max(1, most), self._switch(step))
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
                 count = min(count, hold - step % hold)
-            self._call(step, count, None if table is None else table[step - first :])
+            self._call(step, count, shown, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
 
     def _switch(self, step: int) -> int:
@@ -217,32 +255,42 @@ class NativeStepper(Stepper):
             return
         first, at = number - number % self._ahead, number % self._ahead
         if first != self._drawn - self._drawn % self._ahead or self._drawn < 0:
-            # What is beyond the end of the run may wrap: nobody asks for it.
-            steps = ((first + np.arange(self._ahead)) * hold).astype(np.int32)
-            agents = np.arange(len(self.loop.offsets))
-            drawn = _drawn([loop.motion.wind for loop in self.loops], steps, agents)
-            self._winds = [part if part is None else np.asarray(part) for part in drawn]
+            self._winds = draw_holds(self.loops, first + np.arange(self._ahead), hold)
         self._drawn = number
         for rows, part in zip((self.rows.push, self.rows.noise), self._winds, strict=True):
             if part is not None:
                 self._write(rows, part[at].reshape(len(self.states), -1))
 
-    def _call(self, step: int, steps: int, table: Array | None) -> None:
+    def _call(self, step: int, steps: int, shown: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
-        arrays = self.found._asdict() | {"segments": self.places.segments}
+        places, plan, arrays = self.places, self.plan, self.found._asdict()
+        if plan.ahead:
+            arrays["ahead"] = aligned((steps + 1, *self._led.shape), self.dtype)
+            arrays["told"] = aligned((steps, self.led, plan.told, plan.lanes), self.dtype)
+            arrays["ahead"][0] = self._led
         values = {name: array.ctypes.data for name, array in arrays.items()}
         values |= {} if table is None else {"table": table.ctypes.data}
-        values |= {"first_step": step, "steps": steps, "levels": len(self.places.segments) - 1}
-        # The inputs of single steps are read afterwards; those of many would be stored for nothing.
-        values |= {"edge_blocks": len(self.found.edge_ends), "shown": int(steps == 1)}
-        values["line"] = self.places.line
-        values["first_steady"] = int(self.loop.meter.first_steady)
+        values |= {"first_step": step, "steps": steps, "shown": shown, "led_blocks": self.led}
+        values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
+        values |= {"line": places.line, "first_steady": int(self.loop.meter.first_steady)}
+        if self._tape is not None:
+            now = self._tape[step - self._taped_from]
+            values |= {"tape": now.ctypes.data, "tape_step": now.size}
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
         firsts["edges"] = self.edges
         common = np.empty(steps * self.common, self.dtype)
         self.crew.run(self.code, values, firsts, common)
         if steps % 2:
             self.mirrors.reverse()
+        if plan.ahead:
+            self._led[:] = arrays["ahead"][-1]
+
+    @property
+    def _led(self) -> Array:
+        """What leaders show."""
+        if self.plan.lines:
+            return self.mirrors[0][:, : self.led * self.plan.lanes]
+        return self.mirrors[0][: self.led]
 
     # ---- moments and sums ----
 
@@ -289,19 +337,26 @@ class NativeStepper(Stepper):
             self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)
             return
         wide = self.mirrors[0].reshape(*shown.shape[:2], -1)
+        # Whether an angle is large is left open, and seen by the kernel.
+        wide[:, :, : self.plan.width] = np.nan
         wide[:, :, : values.shape[1]] = shown
 
-    def _moment(self, step: int) -> Moment:
-        """Return what is in the blocks as a moment."""
-        loop, flat = self.loop, self._read(self.rows.memory)
+    def _leave(self, first: int, step: int) -> tuple[Moment, Sums]:
+        """Return what is in the blocks as a moment, and the sums from one step to another."""
+        loop, rows = self.loop, self.rows
+        sums = range(rows.errors.start, rows.tracking.start)
+        parts = (rows.state, rows.memory, rows.cut, sums)
+        # All at once, since each reads the memory of all agents in another order.
+        found = np.split(self._read(*parts), np.cumsum([len(r) for r in parts[:-1]]), axis=1)
+        x, memory, cut, kept = found
         now: Any = [
             np.asarray(step, np.int32),
-            self._read(self.rows.state),
-            memories_of(loop.leader, flat[self.leaders]),
-            memories_of(loop.follower, flat[self.followers]),
-            self._read(self.rows.cut).astype(np.int8),
+            np.ascontiguousarray(x),
+            memories_of(loop.leader, memory[self.leaders]),
+            memories_of(loop.follower, memory[self.followers]),
+            cut.astype(np.int8),
         ]
-        return Moment._make(now)
+        return Moment._make(now), self._sums(first, step, kept)
 
     def _clear_sums(self) -> None:
         first = self.rows.errors.start
@@ -310,21 +365,24 @@ class NativeStepper(Stepper):
         self.blocks[:, self.rows.inside.start : self.rows.inside.stop] = ALWAYS
         self.edges[..., -1, :] = 0.0
 
-    def _sums(self, first: int, end: int) -> Sums:
-        """Return the sums over the steps from one to another."""
+    def _sums(self, first: int, end: int, kept: Array) -> Sums:
+        """Return the sums over the steps from one to another, of which agents keep theirs."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
-        kept = self._read(range(begin, rows.total)).astype(np.float64)
 
         def of(places: range) -> Array:
             return kept[:, places.start - begin : places.stop - begin]
 
+        def led(places: range) -> Array:
+            block, lane = np.divmod(self.places.of[leaders], self.plan.lanes)
+            return self.blocks[block, places.start : places.stop, lane].astype(np.float64)
+
         found = Sums(
             steps=np.array([end - first, steady]),
-            errors=of(rows.errors).T,
-            tracking=of(rows.tracking)[leaders].T,
-            outputs=of(rows.outputs)[leaders],
+            errors=_whole(of(rows.errors)),
+            tracking=_whole(led(rows.tracking)),
+            outputs=led(rows.outputs),
             effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
             limited=of(rows.limited)[:, 0],
@@ -335,9 +393,6 @@ class NativeStepper(Stepper):
         return Sums(*(np.asarray(part, np.float64) for part in found))
 
 
-@jax.jit
-def _drawn(winds: Sequence[Any], steps: jax.Array, agents: jax.Array) -> Any:
-    """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
-    many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
-    one = jax.vmap(draw, (None, None, 0))
-    return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)
+def _whole(parted: Array) -> Array:
+    """Return sums of all steps and of the steady window (2, N) from those before it and in it."""
+    return np.stack([parted.sum(axis=1), parted[:, 1]])

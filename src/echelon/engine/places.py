@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,7 +10,9 @@ import scipy.sparse.csgraph as csgraph
 
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
+from echelon.engine.turns import Near
 from echelon.kernels import aligned, stride
+from echelon.network.exchange import Exchange
 
 
 class Found(NamedTuple):
@@ -26,7 +28,8 @@ class Found(NamedTuple):
         edges: rows of the edges, for the sums of how far distances are off: the differences of the
             goals, the distances that they make, and room for the sums.
         edge_ends: (edges, 2, lanes) where the two ends of each show their numbers.
-        smooth: (blocks,) whether the k-th neighbours of a block follow each other, for all k.
+        smooth: (blocks,) whether the k-th neighbours of a block follow each other, for all k; where
+            nothing lies in lines, whether no leader is among them.
         smooth_edges: (edges,) whether both ends of a block of edges do.
     """
 
@@ -56,6 +59,7 @@ class Places(abc.ABC):
         groups: of formations, which are stepped one after the other.
         together: whether vectors hold agents of as many formations.
         lines: whether what neighbours read lies row by row over all positions.
+        near: how far blocks reach, where leaders may be ahead of all others and that is known.
     """
 
     loop: Loop
@@ -66,6 +70,13 @@ class Places(abc.ABC):
     groups: int
     together: bool
     lines: bool
+    near: Near | None = None
+
+    @property
+    def edge_blocks(self) -> int:
+        """How many blocks the edges of a group fill."""
+        edges = len(np.asarray(self.loop.meter.edges))
+        return edges if self.together else -(-edges // self.lanes)
 
     @property
     def line(self) -> int:
@@ -90,7 +101,7 @@ class Places(abc.ABC):
 
 _MOSTLY = 0.75
 """Of the blocks: how many find their neighbours one after the other where they lie in lines."""
-_WINDOW = 1_024
+_WINDOW = 256
 """Agents among which those of one degree are brought together: so few stay near each other."""
 _LARGE = 10_000
 """Agents whose numbers no longer stay in a processor's own memory from one to the next."""
@@ -99,7 +110,8 @@ _LARGE = 10_000
 def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Array]:
     """Return the agents in the order of their acting, and the first block of each level.
 
-    A level fills its last block with copies, which do what the agent does and are read by nobody.
+    A level fills its last block with copies of its last agent, which do what that does and are read
+    by nobody.
     """
     levels = [loop.followers]
     if loop.levels is not None:
@@ -112,7 +124,7 @@ def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Arra
             level[np.lexsort((degrees[level], near))]
             for level, near in zip(levels, window, strict=True)
         ]
-    filled = [np.resize(a, -(-len(a) // lanes) * lanes) for a in (loop.leaders, *levels)]
+    filled = [np.append(a, np.repeat(a[-1:], -len(a) % lanes)) for a in (loop.leaders, *levels)]
     segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
     return np.concatenate(filled), segments
 
@@ -131,10 +143,21 @@ def _nearby(loop: Loop) -> Array:
     # Both ways, as the order wants a symmetric pattern, and directed edges have none.
     both = np.concatenate([i, j]), np.concatenate([j, i])
     links = sp.csr_array((np.ones(2 * len(i), np.int8), both), shape=(agents, agents))
-    order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
+    order = _from_an_end(links)
+    if len(order) < agents:
+        order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
     rank = np.empty(agents, int)
     rank[order] = own
     return rank if np.abs(rank[i] - rank[j]).sum() < np.abs(i - j).sum() else own
+
+
+def _from_an_end(links: Any) -> Array:
+    """Return the agents that one reaches from another, by how far they are from one at an end.
+
+    Neighbours are then at most about two layers apart, which are small where they begin at an end.
+    """
+    reached = csgraph.breadth_first_order(links, 0, return_predecessors=False)
+    return csgraph.breadth_first_order(links, reached[-1], return_predecessors=False)
 
 
 def _first(agents: Array) -> Array:
@@ -142,7 +165,7 @@ def _first(agents: Array) -> Array:
     return np.unique(agents, return_index=True)[1]
 
 
-def _senders(loop: Loop) -> Array:
+def senders_of(loop: Loop) -> Array:
     """Return who tells each agent what it is told, (N,)."""
     if loop.parents is None:
         return np.asarray(loop.meter.nearest)
@@ -162,9 +185,9 @@ class Swarm(Places):
         degrees = np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of))
         if len(loop.offsets) >= _LARGE and not self.lines and self._uneven(degrees[self.agents]):
             self._stand(degrees)
-        # Ends that are near in memory follow each other.
-        edges = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1)
-        self.edge_order = np.lexsort(edges.T[::-1])
+        # Ends that are near in memory follow each other; leaders are near to all.
+        i, j = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1).T
+        self.edge_order = np.lexsort((j, i, np.where(i < self.segments[1] * lanes, j, i)))
 
     def _uneven(self, degrees: Array) -> bool:
         """Tell whether blocks have fewer slots where those of one degree stand side by side."""
@@ -180,13 +203,8 @@ class Swarm(Places):
         self.of = _first(self.agents)
         self.heard = heard(loop, self)
         starts, positions, _ = self.heard
-        slots = _follow(positions)
-        self.smooth = (
-            np.bincount(np.repeat(np.arange(self.blocks), np.diff(starts)), ~slots, self.blocks)
-            == 0
-        )
-        # A number that is gathered lane by lane costs some times what one of a line does.
-        self.lines = bool(self.smooth.mean() > _MOSTLY)
+        led = int(self.segments[1]) * lanes
+        self.smooth, self.lines = smooth_blocks(starts, positions, led)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
@@ -195,7 +213,7 @@ class Swarm(Places):
         starts, positions, weights = self.heard
         heavy = aligned(weights.shape, dtype)
         heavy[:] = weights
-        held = self.of[_senders(loop)[self.agents]]
+        held = self.of[senders_of(loop)[self.agents]]
         nearest = np.asarray(loop.meter.nearest)[self.agents]
         return Found(
             starts,
@@ -205,8 +223,28 @@ class Swarm(Places):
             (self.of[nearest] * far).astype(np.int32),
             *(edges := edge_blocks(loop, self, dtype, far)),
             self.smooth.astype(np.int8),
-            np.asarray(_follow(edges[1]).all(axis=1), np.int8),
+            self._smooth_edges(edges[1]),
         )
+
+    def _smooth_edges(self, ends: Array) -> Array:
+        leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
+        return np.asarray(_follow(ends).all(axis=1) & ~leads, np.int8)
+
+    def measure(self, found: Found, far: int, bytes_: int) -> None:
+        """Find how far blocks of so many bytes reach, whose agents show numbers `far` apart."""
+        size, led = self.lanes * far, int(self.segments[1])
+        slots = slice(found.neighbour_starts[led], None)
+        block = np.repeat(np.arange(self.blocks, dtype=np.int32), np.diff(found.neighbour_starts))
+        there = found.neighbours[slots] // size
+        apart = np.where(there < led, 0, np.abs(there - block[slots, None]))
+        ends = found.edge_ends // size
+        # The last block is filled with edges from elsewhere, which nobody reads.
+        filled = np.arange(ends[:, 0].size).reshape(-1, 1, self.lanes) >= len(self.edge_order)
+        ends = np.where((ends < led) | filled, self.blocks, ends)
+        first = np.minimum.accumulate(ends.min(axis=(1, 2))[::-1])[::-1]
+        last = np.where(ends == self.blocks, 0, ends).max(axis=(1, 2))
+        reach = max(1, apart.max(initial=0), (last - first).max(initial=0))
+        self.near = Near(int(reach), first, bytes_)
 
     def spacing(self, edges: Array) -> Array:
         """Return the sums that rows of edges hold, (E,)."""
@@ -245,7 +283,7 @@ class Formations(Places):
             starts,
             (positions * far).astype(np.int32),
             heavy,
-            (of[_senders(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
+            (of[senders_of(loop)[self.alone.agents]] * rows * lanes).astype(np.int32),
             (of[np.asarray(loop.meter.nearest)[self.alone.agents]] * far).astype(np.int32),
             self._edges(dtype),
             np.ascontiguousarray(ends, np.int32),
@@ -275,19 +313,39 @@ class Formations(Places):
         return each[: len(self.loops)].reshape(-1)
 
 
+def smooth_blocks(starts: Array, positions: Array, led: int = 0) -> tuple[Array, bool]:
+    """Return whose neighbours follow each other, slot by slot, and whether lines pay for it.
+
+    Where they do not, it is whose neighbours are none of the leaders, of so many positions.
+    """
+    block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+
+    def all_(slots: Array) -> Array:
+        return np.bincount(block, ~slots, len(starts) - 1) == 0
+
+    smooth = all_(np.logical_and(_follow(positions), positions[:, 0] >= led))
+    # A number that is gathered lane by lane costs some times what one of a line does.
+    lines = bool(smooth.mean() > _MOSTLY)
+    return (smooth if lines else all_(np.asarray((positions >= led).all(axis=1)))), lines
+
+
 def _follow(positions: Array) -> Array:
     """Return which of some lists of positions (..., lanes) are each one more than the last."""
     return (np.diff(positions, axis=-1) == 1).all(axis=-1)
 
 
-def heard(loop: Loop, places: Places) -> tuple[Array, Array, Array]:
+def heard(
+    loop: Loop, places: Places, exchange: Exchange | None = None
+) -> tuple[Array, Array, Array]:
     """Return whom each agent hears, slot by slot: the k-th neighbour of each of a block.
+
+    It is by the loop's edges, or by others where they are given.
 
     Returns:
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, agents = loop.exchange, places.agents.reshape(-1, places.lanes)
+    exchange, agents = exchange or loop.exchange, places.agents.reshape(-1, places.lanes)
     order = np.argsort(np.asarray(exchange.receivers), kind="stable")
     senders = np.asarray(exchange.senders)[order]
     weights = np.atleast_2d(np.asarray(exchange.weights))[:, order]

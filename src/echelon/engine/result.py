@@ -1,13 +1,13 @@
 """What a run leaves behind: everything that metrics, figures and files read, in float64 NumPy."""
 
 import dataclasses
-import html
 from collections.abc import Mapping
 from typing import Any, final
 
 import numpy as np
 
 from echelon.core.errors import Outcome
+from echelon.core.pages import page_of
 from echelon.core.types import Array
 from echelon.engine.drive import Drive
 from echelon.engine.parts import Parts
@@ -112,36 +112,12 @@ class Result:
         return "m" if self.model.position else "state"
 
     def _repr_html_(self) -> str:
-        """Return the run as a notebook shows it: how it ended, and who is how far from its goal."""
-        unit = " (m)" if self.unit == "m" else ""
-        heads = ("agent", f"error at the start{unit}", f"at the end{unit}", "limited (% of steps)")
-        rows = "".join(_row(cells) for cells in self._shown())
-        more = self.graph.agents - len(self._shown())
-        rest = f"<p>and {more} agents more</p>" if more else ""
-        title = self.provenance.get("scenario") or type(self.model).__name__
-        head = "".join(f"<th>{each}</th>" for each in heads)
-        told = f"<b>{html.escape(title)}</b>: {html.escape(self.message)}"
-        return f"<p>{told}</p><table><tr>{head}</tr>{rows}</table>{rest}"
-
-    def _shown(self) -> list[tuple[str, str, str, str]]:
-        """Return the cells of the first twelve agents."""
-        leads, found = {*self.graph.leaders}, []
-        with np.errstate(over="ignore", invalid="ignore"):
-            sizes = np.linalg.norm(self.errors[:, :12, list(self.measured)], axis=2)
-        for agent in range(sizes.shape[1]):
-            role = "leader" if agent in leads else "follower"
-            ends = ("", "") if agent in leads or not len(sizes) else sizes[[0, -1], agent]
-            shown = tuple(each if each == "" else f"{each:.3g}" for each in ends)
-            found.append((f"{role} {agent}", *shown, f"{100.0 * self.saturated[agent]:.3g}"))
-        return found
+        """Return the run as a notebook shows it: a table, with its picture."""
+        return page_of("result", self)
 
     def with_provenance(self, **texts: str) -> "Result":
         """Return the same run with more provenance."""
         return dataclasses.replace(self, provenance={**self.provenance, **texts})
-
-
-def _row(cells: tuple[str, ...]) -> str:
-    return f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
 
 
 def finite_or_none(value: Any) -> float | None:

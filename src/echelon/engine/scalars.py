@@ -30,7 +30,8 @@ class Rows(NamedTuple):
         tell: what it sends besides its state.
         input: what is delivered to it (m,).
         own: numbers of its law and model that are others in other formations.
-        errors, tracking, outputs, effort, limited, unsettled, inside, chatter: as in `Sums`.
+        errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
+        effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
         total: how many rows there are.
     """
 
@@ -44,13 +45,13 @@ class Rows(NamedTuple):
     input: range
     own: range
     errors: range
-    tracking: range
-    outputs: range
     effort: range
     limited: range
     unsettled: range
     inside: range
     chatter: range
+    tracking: range
+    outputs: range
     total: int
 
     @classmethod
@@ -65,7 +66,7 @@ class Rows(NamedTuple):
         noisy = wind is not None and wind.noise is not None
         memory = max(memory_size(law) for law in (loop.leader, loop.follower))
         sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, told_by(loop), m, own]
-        sizes += [2, 2, q, 1, 1, 1, len(loop.meter.charted), 1]
+        sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q]
         ends = np.cumsum([0, *sizes]).tolist()
         rows: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
         return cls(*rows)
@@ -120,7 +121,7 @@ def _said(loop: Loop, law: Law, x: Any, offset: Any, memory: Memory) -> Any:
     return jnp.zeros(0, x.dtype) if signal is None else signal
 
 
-class _Known(NamedTuple):
+class Known(NamedTuple):
     """What an agent's step rests on, entry by entry."""
 
     t: Any
@@ -138,7 +139,7 @@ class _Known(NamedTuple):
     before: Any
 
 
-class _Done(NamedTuple):
+class Done(NamedTuple):
     """What it comes to."""
 
     state: Any
@@ -158,12 +159,12 @@ class _Done(NamedTuple):
     saying: Any
 
 
-def _agent(loop: Loop, leads: bool) -> Callable[[_Known], _Done]:
+def agent_step(loop: Loop, leads: bool) -> Callable[[Known], Done]:
     """Return what a leader or another agent does in a step, as a function for JAX."""
     law = loop.leader if leads else loop.follower
     model, motion, meter = loop.model, loop.motion, loop.meter
 
-    def act(known: _Known) -> _Done:
+    def act(known: Known) -> Done:
         x, offset = known.x, known.offset
         view = LocalView(known.t, x, offset, known.z, known.told, motion.dt)
         asked, u, memory, told = act_alone(loop, law, view, known.memory, leads)
@@ -173,7 +174,7 @@ def _agent(loop: Loop, leads: bool) -> Callable[[_Known], _Done]:
         if known.wanted is not None:
             tracking, outputs = meter.of_leader(known.steady, x, offset, known.wanted)
         state = motion.move(x, u, known.push, known.noise)
-        return _Done(
+        return Done(
             state=state,
             memory=memory,
             cut=cut,
@@ -194,7 +195,9 @@ def _agent(loop: Loop, leads: bool) -> Callable[[_Known], _Done]:
     return act
 
 
-def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body:
+def body_of(
+    own: Own, bits: int, rows: Rows, leads: bool, follows: bool, tabled: bool = False
+) -> Body:
     """Return what the leaders or all others do in a step.
 
     Args:
@@ -203,27 +206,29 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
         rows: where its numbers lie.
         leads: whether leaders are meant.
         follows: whether they follow a reference, which stands in the table.
+        tabled: whether the loop's own numbers are the same for all, and stand there behind it.
 
     Raises:
         Unsupported: the law or the model uses what has no scalar operations.
     """
     graph, loop = Graph(bits), own.loop
     law = loop.leader if leads else loop.follower
-    known = _known(loop, graph, rows, law, leads, follows)
+    known = known_of(loop, graph, rows, law, leads, follows)
 
-    def act(leaves: list[Any], known: _Known) -> _Done:
-        return _agent(own.filled(leaves), leads)(known)
+    def act(leaves: list[Any], known: Known) -> Done:
+        return agent_step(own.filled(leaves), leads)(known)
 
-    found = lower(act, graph, [own.leaves(_leaves(graph, "row", rows.own)), known])
-    shapes = jax.tree.structure(_Done(*[0] * 15)._replace(memory=law.init()))
-    done: _Done = shapes.unflatten([nodes(graph, part) for part in found])
+    found = lower(act, graph, [own_leaves(own, graph, rows, follows, tabled), known])
+    shapes = jax.tree.structure(Done(*[0] * 15)._replace(memory=law.init()))
+    done: Done = shapes.unflatten([nodes(graph, part) for part in found])
     remembered = jax.tree.leaves(done.memory, is_leaf=lambda part: isinstance(part, list))
     stores = {"state": done.state, "cut": done.cut, "memory": sum(remembered, start=[])}
     if leads or loop.levels is not None:
         stores["tell"] = done.tell
-    sums = {name: getattr(done, name) for name in ("errors", "effort", "limited", "chatter")}
+    sums = {name: getattr(done, name) for name in ("effort", "limited", "chatter")}
+    sums |= {"errors": _parted(known, done.errors)}
     if leads and follows:
-        sums |= {"tracking": done.tracking, "outputs": done.outputs}
+        sums |= {"tracking": _parted(known, done.tracking), "outputs": done.outputs}
     apart = functools.partial(map, functools.partial(graph.make, "apart"))
     body = Body(
         stores=_placed(rows, stores),
@@ -238,55 +243,75 @@ def body_of(own: Own, bits: int, rows: Rows, leads: bool, follows: bool) -> Body
     return body.become(inverses_shared(body.all()))
 
 
+def _parted(known: Known, twice: list[Node]) -> list[Node]:
+    """Return a number of all steps and of the steady window as one before and one in it.
+
+    Only one of the two is then added to at a step.
+    """
+    all_, steady = twice
+    return [all_.graph.make("select", known.steady[()], 0.0, all_), steady]
+
+
+def own_leaves(own: Own, graph: Graph, rows: Rows, follows: bool, tabled: bool) -> list[np.ndarray]:
+    """Return the leaves of a loop in which numbers are its own: in rows, or in the table."""
+    begin = len(rows.state) if follows else 0
+    places = range(begin, begin + own.count) if tabled else rows.own
+    return own.leaves(leaves_of(graph, "table" if tabled else "row", places, tabled))
+
+
 def _difference(loop: Loop, graph: Graph, states: int, signals: int) -> list[Node]:
     """Return the differences of what neighbours read: of states by the model, of signals plain."""
     # Of the model as it is: how far two states are apart is the same for all formations.
-    own, their = (_leaves(graph, kind, range(states + signals)) for kind in ("own", "their"))
+    own, their = (leaves_of(graph, kind, range(states + signals)) for kind in ("own", "their"))
     [found] = lower(loop.model.difference, graph, [own[:states], their[:states]])
     plain = zip(own[states:], their[states:], strict=True)
     return [*nodes(graph, found), *(graph.make("sub", a, b) for a, b in plain)]
 
 
-def _known(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follows: bool) -> _Known:
+def known_of(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follows: bool) -> Known:
     """Return what a step rests on as leaves of a graph."""
     n, signals = len(rows.state), signals_of(loop)
 
     def row(places: range) -> np.ndarray:
-        return _leaves(graph, "row", places)
+        return leaves_of(graph, "row", places)
 
     x, offset, size = row(rows.state), row(rows.offset), memory_size(law)
     late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
-    return _Known(
-        t=_single(graph.leaf("time", uniform=True)),
-        step=_single(graph.leaf("step", uniform=True)),
-        steady=_single(late),
-        wanted=_leaves(graph, "table", range(n), True) if leads and follows else None,
+    return Known(
+        t=single(graph.leaf("time", uniform=True)),
+        step=single(graph.leaf("step", uniform=True)),
+        steady=single(late),
+        wanted=leaves_of(graph, "table", range(n), True) if leads and follows else None,
         x=x,
         offset=offset,
-        z=_leaves(graph, "z", range(n, n + signals) if signals else range(n)),
+        z=leaves_of(graph, "z", range(n, n + signals) if signals else range(n)),
         # Nobody is before a leader whose input it could be sent.
-        told=np.zeros(len(rows.input)) if leads else _leaves(graph, "told", range(len(rows.tell))),
-        memory=_shaped(row(rows.memory[:size]), law.init()),
-        leader=x - offset if leads else _leaves(graph, "leader", range(n)),
+        told=np.zeros(len(rows.input))
+        if leads
+        else leaves_of(graph, "told", range(len(rows.tell))),
+        memory=shaped(row(rows.memory[:size]), law.init()),
+        leader=x - offset if leads else leaves_of(graph, "leader", range(n)),
         push=row(rows.push) if len(rows.push) else None,
         noise=row(rows.noise) if len(rows.noise) else None,
         before=row(rows.cut),
     )
 
 
-def _leaves(graph: Graph, kind: str, places: Sequence[int], uniform: bool = False) -> np.ndarray:
+def leaves_of(graph: Graph, kind: str, places: Sequence[int], uniform: bool = False) -> np.ndarray:
+    """Return leaves of one kind, a number each."""
     entries = np.empty(len(places), object)
     entries[:] = [graph.leaf(kind, place, uniform=uniform) for place in places]
     return entries
 
 
-def _single(node: Node) -> np.ndarray:
+def single(node: Node) -> np.ndarray:
+    """Return a node as an array without axes."""
     array = np.empty((), object)
     array[()] = node
     return array
 
 
-def _shaped(entries: np.ndarray, like: Memory) -> Memory:
+def shaped(entries: np.ndarray, like: Memory) -> Memory:
     """Return a memory whose numbers are entries, in the order of its tree."""
     leaves, tree = jax.tree.flatten(like)
     ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()

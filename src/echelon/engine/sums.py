@@ -182,7 +182,7 @@ class Meter(eqx.Module):
             tracking=tracking,
             outputs=outputs,
             effort=each.effort,
-            spacing=self._spacing(states),
+            spacing=self.spacing(states),
             limited=limited.astype(jnp.int32),
             unsettled=each.unsettled.astype(jnp.int32),
             inside=each.inside.astype(jnp.int32),
@@ -244,14 +244,23 @@ class Meter(eqx.Module):
         )
         return off.T, outputs
 
-    def _spacing(self, states: States) -> jax.Array:
+    def spacing(self, states: States) -> jax.Array:
         """Return the squared errors of the distances along the edges, (E,)."""
         i, j = self.edges.T
         square = jax.vmap(self._length)(states[i] - states[j])
-        # A root has no slope at 0, where two agents meet, and one choice alone would still ask it.
-        apart = square > 0.0
-        distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
-        return (distance - jnp.asarray(self.spacings, states.dtype)) ** 2
+        return spacing_error(square, jnp.asarray(self.spacings, states.dtype))
+
+
+def spacing_error(square: jax.Array, wanted: jax.Array) -> jax.Array:
+    """Return how far distances, given by their squares, are from those that are wanted, squared."""
+    return (distance_of(square) - wanted) ** 2
+
+
+def distance_of(square: jax.Array) -> jax.Array:
+    """Return the root of a square, with a slope of 1 where two agents meet."""
+    # A root has no slope at 0, and one choice alone would still ask it.
+    apart = square > 0.0
+    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
 
 
 def outside(bounded: Any, low: Any, high: Any) -> Any:

@@ -1,16 +1,19 @@
 """Code for this machine: from a trace to scalars, to vectors, to the loops about them."""
 
+from echelon.kernels.adjoint import fed_widths, from_tape
 from echelon.kernels.common import shared
 from echelon.kernels.drivers import program
 from echelon.kernels.entries import Unsupported, nodes
-from echelon.kernels.frame import SLOTS, Body, Plan, stride
+from echelon.kernels.frame import SLOTS, TURN, Body, Plan, stride
 from echelon.kernels.lowering import lower
 from echelon.kernels.native import Code, aligned, is_installed, vectors
 from echelon.kernels.quotients import inverses_shared
 from echelon.kernels.scalar import Graph, Node, needed
+from echelon.kernels.winding import winds
 
 __all__ = [
     "SLOTS",
+    "TURN",
     "Body",
     "Code",
     "Graph",
@@ -18,6 +21,8 @@ __all__ = [
     "Plan",
     "Unsupported",
     "aligned",
+    "fed_widths",
+    "from_tape",
     "inverses_shared",
     "is_installed",
     "lower",
@@ -27,4 +32,5 @@ __all__ = [
     "shared",
     "stride",
     "vectors",
+    "winds",
 ]

@@ -1,6 +1,7 @@
 """What only one side of a choice needs: worth a branch where it is much."""
 
 import graphlib
+import heapq
 from collections.abc import Sequence
 from typing import final
 
@@ -47,7 +48,7 @@ def arms(nodes: list[Node], results: Sequence[Node]) -> list[Arm]:
     found, taken = list[Arm](), set[Node]()
     # Those of the later choices hold those of the earlier ones, and are worth more.
     for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
-        arm = _exclusive(nodes, users, outside, which, side, selects)
+        arm = _exclusive(users, outside, which, side, selects)
         arm = [node for node in arm if node.op != "leaf"]
         if len(arm) >= _MANY and not taken.intersection([*arm, *selects, which]):
             inside = set(arm)
@@ -82,7 +83,6 @@ def _without_circles(nodes: list[Node], found: list[Arm]) -> list[Arm]:
 
 
 def _exclusive(
-    nodes: list[Node],
     users: dict[Node, list[Node]],
     outside: set[Node],
     which: Node,
@@ -91,18 +91,24 @@ def _exclusive(
 ) -> list[Node]:
     """Return the nodes that nothing needs but one side of some choices."""
     chosen, inside = set(selects), set[Node]()
-    for node in reversed(nodes):
-        if node in outside or node is which or not users[node]:
+
+    def wanted(node: Node, user: Node) -> bool:
+        # The choice itself may read it at that side only, and not as its truth.
+        if user not in chosen or user in inside:
+            return user in inside
+        return node is not user.args[2 if side else 1] and node is not user.args[0]
+
+    # Backwards from the choices: all that read a number come before it.
+    near = {a.number: a for select in selects for a in select.args if a in users}
+    order = [-number for number in near]
+    heapq.heapify(order)
+    while order:
+        node = near[-heapq.heappop(order)]
+        if node in outside or node is which or not all(wanted(node, u) for u in users[node]):
             continue
-        wanted = True
-        for user in users[node]:
-            if user in inside:
-                continue
-            # The choice itself may read it at that side only, and not as its truth.
-            other = user.args[2 if side else 1] if user.op == "select" else None
-            wanted = user in chosen and node is not other and node is not user.args[0]
-            if not wanted:
-                break
-        if wanted:
-            inside.add(node)
-    return [node for node in nodes if node in inside]
+        inside.add(node)
+        for a in node.args:
+            if a in users and a.number not in near:
+                near[a.number] = a
+                heapq.heappush(order, -a.number)
+    return sorted(inside, key=lambda node: node.number)

@@ -11,11 +11,14 @@ next one, so that it stays in the nearest cache.
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from echelon.kernels.adjoint import record, taken, tape_at, tape_of
 from echelon.kernels.arms import choices
 from echelon.kernels.common import apart, shared
 from echelon.kernels.frame import (
     ADDRESSES,
+    NO_NEWS,
     SLOTS,
+    TURN,
     Body,
     Context,
     Plan,
@@ -27,8 +30,9 @@ from echelon.kernels.frame import (
     only_if,
     store_row,
 )
-from echelon.kernels.neighbours import exchange, line, measure_edges, write_mirror
+from echelon.kernels.neighbours import exchange, led, line, measure_edges, write_mirror
 from echelon.kernels.scalar import Node, needed
+from echelon.kernels.threads import tell_done, wait
 from echelon.kernels.usual import usual, whole
 from echelon.kernels.vector_ir import Emitter, Writer, number
 
@@ -45,7 +49,7 @@ def program(plan: Plan) -> str:
     if numbers:
         _share(w, plan, slots, numbers, last)
     with loop(w, "0", slots["groups"], []) as (group, _, _):
-        _steps(w, plan, _group(w, plan, slots, group), last, len(numbers))
+        _turns(w, plan, _group(w, plan, slots, group), len(numbers))
     w.do("ret void")
     head = "define void @run(ptr noalias %slots) #0 {"
     # 512 bits also where a processor would rather have halves: the types say what is meant.
@@ -86,9 +90,7 @@ def _named(leaf: Node) -> tuple[str, Sequence[int]]:
 
 def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str, str]:
     """Write where the numbers of a group are."""
-    end = w.put(f"getelementptr i64, ptr {slots['segments']}, i64 {slots['levels']}")
-    blocks = w.put(f"load i64, ptr {end}")
-    agents = w.put(f"mul i64 {group}, {blocks}")
+    agents = w.put(f"mul i64 {group}, {slots['blocks']}")
     edges = w.put(f"mul i64 {group}, {slots['edge_blocks']}")
     sizes = {"rows": plan.rows * plan.lanes, "mirror": plan.mirror, "next_mirror": plan.mirror}
     found = {name: (agents, size) for name, size in sizes.items()}
@@ -100,73 +102,78 @@ def _group(w: Writer, plan: Plan, slots: dict[str, str], group: str) -> dict[str
     return slots | own
 
 
-def _steps(w: Writer, plan: Plan, slots: dict[str, str], last: str, numbers: int) -> None:
-    """Write all steps of a group."""
-    mirrors = [("ptr", slots["mirror"]), ("ptr", slots["next_mirror"])]
-    with loop(w, slots["first_step"], last, mirrors) as (step, carried, following):
-        passed = w.put(f"sub i64 {step}, {slots['first_step']}")
-        row = w.put(f"mul i64 {passed}, {numbers}")
-        common = w.put(f"getelementptr {w.scalar}, ptr {slots['common']}, i64 {row}")
-        around = Context(plan, slots, carried[0], carried[1], step, "", common)
+def _turns(w: Writer, plan: Plan, slots: dict[str, str], numbers: int) -> None:
+    """Write all steps of a group, turn by turn."""
+    with loop(w, "0", slots["count"], []) as (number, _, _):
+        first = w.put(f"mul i64 {number}, {len(TURN)}")
+        turn = dict[str, str]()
+        for k, name in enumerate(TURN):
+            at = w.put(f"getelementptr i64, ptr {slots['turns']}, i64 {first}")
+            at = w.put(f"getelementptr i64, ptr {at}, i64 {k}")
+            turn[name] = w.put(f"load i64, ptr {at}")
+        wait(w, slots, turn["before"], turn["after"])
+        around = _around(w, plan, slots, turn["passed"], numbers)
+        leads, done = w.put(f"icmp eq i64 {turn['level']}, 0"), w.fresh("done")
+        ways = {name: w.fresh(name) for name in ("lead", "follow")}
+        w.do(f"br i1 {leads}, label %{ways['lead']}, label %{ways['follow']}")
+        w.label(ways["lead"])
+        _lead(w, around, turn)
+        w.do(f"br label %{done}")
+        w.label(ways["follow"])
         if plan.edges:
-            measure_edges(w, around)
-        with _blocks(w, around, "0") as block:
-            _act(w, around, plan.first, block)
-        _meet(w, around, passed, "0")
-        with loop(w, "1", slots["levels"], []) as (level, _, _):
-            with _blocks(w, around, level) as block:
-                _act(w, around, plan.others, block)
-            _meet(w, around, passed, level)
-        following[:] = [carried[1], carried[0]]
+            measure_edges(w, around, turn["first_edge"], turn["last_edge"])
+        with loop(w, turn["start"], turn["end"], []) as (block, _, _):
+            _act(w, around, plan.others, block)
+        w.do(f"br label %{done}")
+        w.label(done)
+        tell_done(w, slots, number)
 
 
-@contextlib.contextmanager
-def _blocks(w: Writer, around: Context, level: str) -> Iterator[str]:
-    """Write the loop over the blocks of a level."""
-    places = (
-        w.put(f"getelementptr i64, ptr {around.slots[name]}, i64 {level}")
-        for name in ("starts", "ends")
+def _around(w: Writer, plan: Plan, slots: dict[str, str], passed: str, numbers: int) -> Context:
+    """Write where a step finds what changes from step to step."""
+    step = w.put(f"add i64 {slots['first_step']}, {passed}")
+    turned = passed
+    if plan.backward:
+        last = w.put(f"sub i64 {slots['steps']}, 1")
+        turned = w.put(f"sub i64 {last}, {passed}")
+    odd = w.put(f"trunc i64 {turned} to i1")
+    now, later = (
+        w.put(f"select i1 {odd}, ptr {slots[a]}, ptr {slots[b]}")
+        for a, b in (("next_mirror", "mirror"), ("mirror", "next_mirror"))
     )
-    start, end = (w.put(f"load i64, ptr {place}") for place in places)
-    with loop(w, start, end, []) as (block, _, _):
-        yield block
+    shown = w.put(f"icmp eq i64 {step}, {slots['shown']}")
+    shown = w.put(f"zext i1 {shown} to i64")
+    common = _part(w, slots["common"], passed, str(numbers))
+    tape = tape_at(w, slots, passed) if plan.taped else ""
+    around = Context(plan, slots | {"shown": shown}, now, later, step, "", common, tape=tape)
+    if not plan.ahead:
+        return around
+    blocks, each = slots["led_blocks"], plan.told * plan.lanes
+    size, told = (w.put(f"mul i64 {blocks}, {n}") for n in (plan.mirror, each))
+    ahead, told = (_part(w, slots[k], passed, n) for k, n in (("ahead", size), ("told", told)))
+    return around._replace(ahead=ahead, told=told, led=w.put(f"mul i64 {blocks}, {plan.lanes}"))
 
 
-_TURNS = 1_000
-"""That a thread waits before it leaves the processor: another may need it to come here."""
+def _part(w: Writer, start: str, count: str, size: str) -> str:
+    """Write the address behind some parts of a size."""
+    far = w.put(f"mul i64 {count}, {size}")
+    return w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {far}")
 
 
-def _meet(w: Writer, around: Context, passed: str, level: str) -> None:
-    """Write that a thread waits until all have come here."""
-    slots = around.slots
-    alone = w.put(f"icmp eq i64 {slots['threads']}, 1")
-    come, turn, here = (w.fresh(stem) for stem in ("come", "turn", "here"))
-    w.do(f"br i1 {alone}, label %{here}, label %{come}")
-    w.label(come)
-    # They come once a level and step, and none goes on before all came: a count says which it is.
-    before = w.put(f"mul i64 {passed}, {slots['levels']}")
-    number = w.put(f"add i64 {w.put(f'add i64 {before}, {level}')}, 1")
-    wanted = w.put(f"mul i64 {number}, {slots['threads']}")
-    w.put(f"atomicrmw add ptr {slots['met']}, i64 1 acq_rel")
-    turns, more = "%" + w.fresh("t"), "%" + w.fresh("t")
-    w.do(f"br label %{turn}")
-    w.label(turn)
-    rested = w.fresh("rested")
-    w.do(f"{turns} = phi i64 [ 0, %{come} ], [ {more}, %{rested} ]")
-    w.do(f"{more} = add i64 {turns}, 1")
-    seen = w.put(f"load atomic i64, ptr {slots['met']} acquire, align 8")
-    all_ = w.put(f"icmp sge i64 {seen}, {wanted}")
-    wait, rest = w.fresh("wait"), w.fresh("rest")
-    w.do(f"br i1 {all_}, label %{here}, label %{wait}")
-    w.label(wait)
-    tired = w.put(f"icmp sgt i64 {turns}, {_TURNS}")
-    w.do(f"br i1 {tired}, label %{rest}, label %{rested}")
-    w.label(rest)
-    w.put(f"call i32 {slots['rest']}()")
-    w.do(f"br label %{rested}")
-    w.label(rested)
-    w.do(f"br label %{turn}")
-    w.label(here)
+def _lead(w: Writer, around: Context, turn: dict[str, str]) -> None:
+    """Write what the leaders do in a step; those ahead leave it for the others."""
+    plan, slots = around.plan, around.slots
+    if plan.ahead:
+        after = _part(w, around.ahead, slots["led_blocks"], str(plan.mirror))
+        around = around._replace(following=after, slots=slots | {"line": around.led})
+    with loop(w, turn["start"], turn["end"], []) as (block, _, _):
+        _act(w, around, plan.first, block)
+        if plan.ahead:
+            base = _part(w, slots["rows"], block, str(plan.rows * plan.lanes))
+            kept = _part(w, around.told, block, str(plan.told * plan.lanes))
+            for k in range(plan.told):
+                told = load_row(w, base, plan.tell + k, plan.lanes)
+                store_row(w, kept, k, plan.lanes, told)
 
 
 # ---- a body --------------------------------------------------------------------------------------
@@ -187,12 +194,15 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
         return load_row(w, base, leaf.value[1], plan.lanes)
 
     z = exchange(w, around, complete, block, heard, row) if heard else {}
+    fed = taken(w, around, complete, block)
 
     def load(leaf: Node) -> str:
         kind, *rest = leaf.value
-        return z[rest[0]] if kind == "z" else _load(w, around, block, base, kind, rest)
+        if kind in ("z", "fed"):
+            return (z if kind == "z" else fed)[rest[0]]
+        return _load(w, around, block, base, kind, rest)
 
-    usually = usual(all_, choices(body.results()))
+    usually = usual(all_, [*choices(body.results()), *_news(body)])
     done, otherwise = w.fresh("done"), w.fresh("otherwise")
     if usually.levels:
         emitter = Emitter(w, load)
@@ -209,6 +219,18 @@ def _act(w: Writer, around: Context, body: Body, block: str) -> None:
         w.label(done)
 
 
+def _news(body: Body) -> list[tuple[Node, bool]]:
+    """Return the truths by which there is news of what is kept as the least, which is seldom."""
+    least = (node for node in body.least.values() if node.op == "select")
+    return [(node.args[0], True) for node in least if _is_none("min", node.args[2])]
+
+
+def _is_none(op: str, node: Node) -> bool:
+    """Tell whether nothing is added by a number, or no least one made by it."""
+    none = {"add": 0.0, "min": NO_NEWS}.get(op)
+    return node.op == "constant" and node.value == none
+
+
 def _load(w: Writer, around: Context, block: str, base: str, kind: str, rest: Sequence[int]) -> str:
     """Write the load of what a body rests on, sums over neighbours apart."""
     plan = around.plan
@@ -216,7 +238,11 @@ def _load(w: Writer, around: Context, block: str, base: str, kind: str, rest: Se
         return load_row(w, base, rest[0], plan.lanes)
     if kind == "told":
         start, row = around.slots["rows"], plan.tell + rest[0]
+        if plan.ahead:
+            start, row = around.told, rest[0]
         return _look_up(w, around, "sources", start, row, block, plan.one_source)
+    if kind == "tape":
+        return load_row(w, tape_of(w, around, block), rest[0], plan.lanes)
     if kind == "leader":
         return _look_up(w, around, "leaders", around.mirror, rest[0], block, plan.one_leader)
     return _same_for_all(w, around, kind, rest)
@@ -226,6 +252,7 @@ def _write(w: Writer, around: Context, body: Body, emitter: Emitter, base: str, 
     """Write what a body leaves: in the rows of its block, and for its neighbours."""
     _write_rows(w, around, body, emitter, base)
     write_mirror(w, around, [emitter.value(node) for node in body.mirror], block)
+    record(w, around, body, emitter, block)
 
 
 def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: str) -> None:
@@ -238,10 +265,27 @@ def _write_rows(w: Writer, around: Context, body: Body, emitter: Emitter, base: 
             store_row(w, base, row, lanes, emitter.value(node))
     for kept, op in ((body.sums, "add"), (body.greatest, "max"), (body.least, "min")):
         for row, node in kept.items():
-            if op == "add" and node.op == "constant" and node.value == 0.0:
+            if _is_none(op, node):
                 continue
-            both = [load_row(w, base, row, lanes), emitter.value(node)]
-            store_row(w, base, row, lanes, w.operation(op, both, False, False))
+            with _sometimes(w, emitter, op, node) as value:
+                both = [load_row(w, base, row, lanes), value]
+                store_row(w, base, row, lanes, w.operation(op, both, False, False))
+
+
+@contextlib.contextmanager
+def _sometimes(w: Writer, emitter: Emitter, op: str, node: Node) -> Iterator[str]:
+    """Write what is done where a number is not none, by what is the same for all agents."""
+    if node.op == "select" and node.args[0].uniform:
+        which, *sides = node.args
+        for k, side in enumerate(sides):
+            if _is_none(op, side):
+                wanted = emitter.value(which, uniform=True)
+                wanted = w.put(f"xor i1 {wanted}, true") if k == 0 else wanted
+                value = emitter.value(sides[1 - k])
+                with only_if(w, w.put(f"zext i1 {wanted} to i64")):
+                    yield value
+                return
+    yield emitter.value(node)
 
 
 def _same_for_all(w: Writer, around: Context, kind: str, rest: Sequence[int]) -> str:
@@ -269,8 +313,10 @@ def _look_up(
         return load_row(w, far_block(w, places, block, start), row, plan.lanes)
     # What is told stands in rows, and what is shown agent by agent or in lines.
     offset = row * plan.lanes if which == "sources" else row
+    if plan.ahead and which == "leaders":
+        start = around.ahead
     if plan.lines and which == "leaders":
-        start, offset = line(w, around, row), 0
+        start, offset = led(w, around, row) if plan.ahead else line(w, around, row), 0
     first = w.put(f"mul i64 {block}, {plan.lanes}")
     if not one:
         return gather(w, start, load_places(w, places, first), offset)

@@ -2,28 +2,37 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
-from echelon.kernels.scalar import Node
+from echelon.kernels.scalar import Node, needed
 from echelon.kernels.vector_ir import Writer
+
+NO_NEWS = 2**31 - 1
+"""The least that a row keeps where it keeps none: no step has that number."""
 
 
 class Body(NamedTuple):
     """What some of the agents do in a step; the same code for all of them.
 
-    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), or, the
-    same for all, ("time",), ("step",), ("steady",), ("table", c).
+    A leaf is ("row", r), ("z", k), ("told", k), ("leader", k), ("own", k), ("their", k), on the way
+    back ("tape", r) and ("fed", k), or, the same for all, ("time",), ("step",), ("steady",),
+    ("table", c).
 
     Attributes:
         stores: row -> what it becomes.
         sums: row -> what is added to it.
         greatest: row -> a value; the row keeps the largest that it ever was.
-        least: row -> a value; the row keeps the smallest.
+        least: row -> a value; the row keeps the smallest, from `NO_NEWS` on.
         shown: row -> what it becomes where `shown` is asked for, since every store costs time.
         now: what neighbours read at the step, entry by entry.
         mirror: what they read after it.
         difference: of what stands in the leaves `own` and `their`, entry by entry; z_k is the
             weighted sum of entry k over the neighbours.
+        tape: row of the tape -> what is kept there of each step, where it is asked for.
+        totals: place -> what is added up there over all agents and steps.
+        to_sources: what is added to the `fed` of who told an agent what it was told, from 0 on.
+        to_leaders: what is added to the `fed` of its leader, behind that.
     """
 
     stores: dict[int, Node]
@@ -34,20 +43,31 @@ class Body(NamedTuple):
     now: Sequence[Node]
     mirror: Sequence[Node]
     difference: Sequence[Node]
+    tape: Mapping[int, Node] = MappingProxyType({})
+    totals: Mapping[int, Node] = MappingProxyType({})
+    to_sources: Sequence[Node] = ()
+    to_leaders: Sequence[Node] = ()
 
     def results(self) -> list[Node]:
         """Return all that is written."""
         rows = (self.stores, self.sums, self.greatest, self.least, self.shown)
-        return [*(node for row in rows for node in row.values()), *self.mirror]
+        listed = (*self.mirror, *self.to_sources, *self.to_leaders)
+        kept = (*self.tape.values(), *self.totals.values())
+        return [*(node for row in rows for node in row.values()), *listed, *kept]
 
     def all(self) -> list[Node]:
         """Return all that is written, and what of it is made of what neighbours read."""
         return [*self.results(), *self.now, *self.difference]
 
+    @property
+    def hears(self) -> bool:
+        """Whether anything rests on what neighbours show."""
+        return any(n.op == "leaf" and n.value[0] == "z" for n in needed(self.results()))
+
     def become(self, made: Mapping[Node, Node]) -> "Body":
         """Return the body whose nodes have become others, where they have."""
 
-        def rows(of: dict[int, Node]) -> dict[int, Node]:
+        def rows(of: Mapping[int, Node]) -> dict[int, Node]:
             return {row: made.get(node, node) for row, node in of.items()}
 
         def listed(of: Sequence[Node]) -> list[Node]:
@@ -62,6 +82,10 @@ class Body(NamedTuple):
             now=listed(self.now),
             mirror=listed(self.mirror),
             difference=listed(self.difference),
+            tape=rows(self.tape),
+            totals=rows(self.totals),
+            to_sources=listed(self.to_sources),
+            to_leaders=listed(self.to_leaders),
         )
 
 
@@ -76,7 +100,8 @@ class Plan(NamedTuple):
         lines: whether what neighbours read of a swarm lies row by row, since most vectors of
             neighbours are agents that follow each other: rings, paths, grids.
         rows: of a block.
-        width: numbers that neighbours read of an agent; they stand in whole vectors.
+        width: numbers that neighbours read of an agent, which stand in whole vectors, with the one
+            of `neighbours.winds` where it is true.
         first: the body of those that act first.
         others: the body of all others, level by level.
         tell: the first row of what an agent tells others.
@@ -87,6 +112,11 @@ class Plan(NamedTuple):
         edges: which of the numbers that neighbours read make a distance; none for none.
         table: numbers that each step has in the table.
         dt: s.
+        ahead: whether the leaders may take many steps before the others take the first, since they
+            hear nobody: what they show and tell is kept of each step.
+        taped: rows that the tape has of a block at each step.
+        backward: whether the steps are taken from the last to the first, the followers before the
+            leaders, the deepest level first: for derivatives.
     """
 
     bits: int
@@ -105,6 +135,9 @@ class Plan(NamedTuple):
     edges: tuple[int, ...]
     table: int
     dt: float
+    ahead: bool = False
+    taped: int = 0
+    backward: bool = False
 
     @property
     def mirror(self) -> int:
@@ -118,7 +151,7 @@ SLOTS = (
     "mirror",
     "next_mirror",
     "table",
-    "segments",
+    "turns",
     "neighbour_starts",
     "neighbours",
     "weights",
@@ -129,32 +162,48 @@ SLOTS = (
     "common",
     "smooth",
     "smooth_edges",
-    "starts",
-    "ends",
-    "met",
+    "ahead",
+    "told",
+    "done",
     "rest",
+    "tape",
+    "totals",
+    "fed",
     "first_step",
     "steps",
-    "levels",
+    "count",
+    "blocks",
     "edge_blocks",
     "first_steady",
     "shown",
     "groups",
     "line",
+    "led_blocks",
     "threads",
-    "first_edge",
+    "thread",
+    "tape_step",
 )
-"""What a kernel is called with: 19 addresses and 10 whole numbers of 64 bits.
+"""What a kernel is called with: 22 addresses and 13 whole numbers of 64 bits.
 
 Formations stand in groups of as many as a vector has lanes; `rows`, the mirrors and `edges` are
-those of the first of some groups. A swarm is one group. `common` has room for the numbers of
-`common.shared` at each step. `line` is how many numbers lie between two rows of a mirror in lines;
-`smooth` tells of each block, and `smooth_edges` of each block of edges, whether its others follow
-each other there. A thread steps the blocks of each level from `starts` to `ends`, and its blocks of
-edges, and waits for the others after each level: `met` counts how many came, and `rest` is a
-function that leaves the processor to others.
+those of the first of some groups, which have so many `blocks` and `edge_blocks` each. A swarm is
+one group. `common` has room for the numbers of `common.shared` at each step. `line` is how many
+numbers lie between two rows of a mirror in lines; `smooth` tells of each block, and `smooth_edges`
+of each block of edges, whether its others follow each other there, or elsewhere whether no leader
+ahead is among them. `ahead` and `told` keep what the leaders in so many blocks show and tell of
+each step. Inputs are stored of the step `shown`.
+
+`turns` are `count` rows of `TURN`: blocks of one level and blocks of edges that take a step. Before
+it a thread waits for the others: until each before it has done as many turns as `before` says, and
+each behind it as many as `after`. `done` counts the turns of each, a line of memory apart, and
+`rest` is a function that leaves the processor to others.
+
+`tape` is 0 where none is kept, and `tape_step` how many numbers lie between its steps; `totals` has
+a vector for each, and `fed` what was added for each agent.
 """
-ADDRESSES = 19
+TURN = ("passed", "level", "start", "end", "first_edge", "last_edge", "before", "after")
+"""Of a turn: the steps before it in this call, the level, and where its blocks begin and end."""
+ADDRESSES = 22
 
 
 def stride(width: int, lanes: int) -> int:
@@ -172,6 +221,10 @@ class Context(NamedTuple):
     step: str
     table: str
     common: str
+    ahead: str = ""
+    told: str = ""
+    led: str = ""
+    tape: str = ""
 
 
 @contextlib.contextmanager
@@ -218,10 +271,14 @@ def only_if(w: Writer, wanted: str) -> Iterator[None]:
     w.label(after)
 
 
-def either(w: Writer, truths: str, place: str, makes: Callable[[bool], Sequence[str]]) -> list[str]:
-    """Write vectors in one of two ways, by entry `place` of a list of bytes."""
+def flag(w: Writer, truths: str, place: str) -> str:
+    """Write the load of a truth from a list of bytes."""
     at = w.put(f"getelementptr i8, ptr {truths}, i64 {place}")
-    which = w.put(f"icmp ne i8 {w.put(f'load i8, ptr {at}')}, 0")
+    return w.put(f"icmp ne i8 {w.put(f'load i8, ptr {at}')}, 0")
+
+
+def either(w: Writer, which: str, makes: Callable[[bool], Sequence[str]]) -> list[str]:
+    """Write vectors in one of two ways, by a truth."""
     ways, after = {True: w.fresh("so"), False: w.fresh("else")}, w.fresh("both")
     w.do(f"br i1 {which}, label %{ways[True]}, label %{ways[False]}")
     made, ends = dict[bool, Sequence[str]](), dict[bool, str]()

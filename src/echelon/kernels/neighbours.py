@@ -8,6 +8,7 @@ from echelon.kernels.frame import (
     bytes_of,
     either,
     far_block,
+    flag,
     gather,
     load_places,
     load_row,
@@ -17,6 +18,7 @@ from echelon.kernels.frame import (
 )
 from echelon.kernels.scalar import Node, needed
 from echelon.kernels.vector_ir import Emitter, Writer
+from echelon.kernels.winding import largeness, limits, winds, zeros
 
 
 def exchange(
@@ -32,20 +34,38 @@ def exchange(
     at = w.put(f"getelementptr i64, ptr {slots['neighbour_starts']}, i64 {block}")
     after = w.put(f"getelementptr i64, ptr {at}, i64 1")
     start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
-    wanted = [body.difference[k] for k in heard]
-    agent_by_agent = not (plan.together or plan.lines)
-    if all(_is_plain(node) for node in wanted) and agent_by_agent:
-        first = w.put(f"mul i64 {block}, {plan.lanes}")
-        return _subtract(w, around, (start, end), first, heard)
-    leaves = [n for n in needed(wanted) if n.op == "leaf"]
-    own = {leaf: body.now[leaf.value[1]] for leaf in leaves if leaf.value[0] == "own"}
-    mine = _own(w, around, own, block, load)
+    first = w.put(f"mul i64 {block}, {plan.lanes}")
+    alone = 0.0 not in limits(plan).values()
+    some = _AT_ONCE if alone else len(heard)
 
     def add_up(smooth: bool) -> list[str]:
-        return _sums(w, around, (start, end), wanted, mine, smooth)
+        found = list[str]()
+        for part in (heard[k : k + some] for k in range(0, len(heard), some)):
+            wanted = [body.difference[k] for k in part]
+            leaves = [n for n in needed(wanted) if n.op == "leaf" and n.value[0] == "own"]
+            own = {leaf: body.now[leaf.value[1]] for leaf in leaves}
+            mine = _own(w, around, own, block, load)
+            found += _sums(w, around, (start, end), wanted, mine, smooth)
+        return found
 
-    totals = either(w, slots["smooth"], block, add_up) if plan.lines else add_up(False)
+    if plan.lines:
+        totals = either(w, flag(w, slots["smooth"], block), add_up)
+    elif plan.together or not alone:
+        totals = add_up(False)
+    elif not (winds(plan) or plan.ahead):
+        totals = _subtract(w, around, (start, end), first, heard)
+    else:
+        last = [plan.width - 1] * winds(plan)
+        sums = _subtract(w, around, (start, end), first, [*heard, *last])
+        plain = zeros(w, sums.pop()) if last else "true"
+        if plan.ahead:
+            plain = w.put(f"and i1 {plain}, {flag(w, slots['smooth'], block)}")
+        totals = either(w, plain, lambda plain: sums if plain else add_up(False))
     return dict(zip(heard, totals, strict=True))
+
+
+_AT_ONCE = 6
+"""Entries that are added up at once, where none rests on another: so many stay in registers."""
 
 
 def _sums(
@@ -118,14 +138,60 @@ def _shown(
         }
     if around.plan.lines:
         places = load_places(w, around.slots[which], first)
-        return {k: gather(w, line(w, around, k), places, 0) for k in entries}
-    others = [_their(w, around.mirror, at, lane) for lane in range(w.lanes)]
+        return {k: gather(w, line(w, around, k), _kept(w, around, k, places), 0) for k in entries}
+    others = [_their(w, around, at, lane, around.plan.ahead) for lane in range(w.lanes)]
     found = dict[int, str]()
-    for piece in sorted({k // w.lanes for k in entries}):
-        # A gather of one number a lane would cost more than turning whole rows about.
-        rows = [_load_at(w, other, piece * w.lanes) for other in others]
-        found |= enumerate(_transposed(w, rows), piece * w.lanes)
+    for piece in sorted({k // 4 for k in entries}):
+        # A gather of one number a lane would cost more than turning rows about, four by four.
+        rows = [_joined(w, [_four(w, a, piece) for a in others[j::4]]) for j in range(4)]
+        found |= enumerate(transposed(w, rows), 4 * piece)
     return found
+
+
+def led(w: Writer, around: Context, row: int) -> str:
+    """Write the address of a row of what leaders ahead show."""
+    far = w.put(f"mul i64 {around.led}, {row}")
+    return w.put(f"getelementptr {w.scalar}, ptr {around.ahead}, i64 {far}")
+
+
+def _kept(w: Writer, around: Context, row: int, places: str) -> str:
+    """Write the places in a row of a mirror, of leaders ahead where they are kept."""
+    if not around.plan.ahead:
+        return places
+    there, here = (
+        w.put(f"ptrtoint ptr {at} to i64") for at in (led(w, around, row), line(w, around, row))
+    )
+    shift = 3 if w.bits == 64 else 2
+    far = w.put(f"ashr exact i64 {w.put(f'sub i64 {there}, {here}')}, {shift}")
+    kind = f"<{w.lanes} x i64>"
+
+    def spread(value: str) -> str:
+        first = w.put(f"insertelement {kind} poison, i64 {value}, i32 0")
+        zeros = f"<{w.lanes} x i32> zeroinitializer"
+        return w.put(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
+
+    leads = w.put(f"icmp slt {kind} {places}, {spread(around.led)}")
+    moved = w.put(f"add {kind} {places}, {spread(far)}")
+    return w.put(f"select {w.kind(True, False)} {leads}, {kind} {moved}, {kind} {places}")
+
+
+def _four(w: Writer, start: str, piece: int) -> str:
+    at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {4 * piece}")
+    return w.put(f"load <4 x {w.scalar}>, ptr {at}, align {4 * bytes_of(w)}")
+
+
+def _joined(w: Writer, parts: Sequence[str]) -> str:
+    """Write short vectors as one."""
+    size = w.lanes // len(parts)
+    while len(parts) > 1:
+        order = ", ".join(f"i32 {k}" for k in range(2 * size))
+        kind = f"<{size} x {w.scalar}>"
+        parts = [
+            w.put(f"shufflevector {kind} {a}, {kind} {b}, <{2 * size} x i32> <{order}>")
+            for a, b in zip(parts[::2], parts[1::2], strict=True)
+        ]
+        size *= 2
+    return parts[0]
 
 
 def line(w: Writer, around: Context, row: int, place: str = "0", start: str = "") -> str:
@@ -135,46 +201,65 @@ def line(w: Writer, around: Context, row: int, place: str = "0", start: str = ""
     return w.put(f"getelementptr {w.scalar}, ptr {begin}, i64 {place}")
 
 
-def _is_plain(node: Node) -> bool:
-    """Tell whether an entry of the difference is that of two numbers, and winds no angle."""
-    leaves = [a.value[0] for a in node.args if a.op == "leaf"]
-    return node.op == "sub" and leaves == ["own", "their"]
-
-
 def _subtract(
     w: Writer, around: Context, slots: tuple[str, str], first: str, heard: Sequence[int]
-) -> dict[int, str]:
+) -> list[str]:
     """Write the sums of plain differences, agent by agent: their numbers lie in whole vectors."""
     plan, lanes = around.plan, w.lanes
     pieces = sorted({k // lanes for k in heard})
-    far = stride(plan.width, lanes)
+    far, found = stride(plan.width, lanes), dict[int, str]()
     begin = w.put(f"mul i64 {first}, {far}")
     start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
-    places = [(lane, piece) for lane in range(lanes) for piece in pieces]
+    # So many agents at once that their numbers and sums stay in registers.
+    some = max(1, 8 // 2 ** (len(pieces) - 1).bit_length())
+    totals = dict[tuple[int, int], str]()
+    for agent in range(0, lanes, some):
+        places = [(lane, piece) for lane in range(agent, agent + some) for piece in pieces]
+        totals |= zip(places, _subtract_some(w, around, slots, start, places), strict=True)
+    for piece in pieces:
+        rows = [totals[lane, piece] for lane in range(lanes)]
+        found |= enumerate(transposed(w, rows), piece * lanes)
+    return [found[k] for k in heard]
+
+
+def _subtract_some(
+    w: Writer,
+    around: Context,
+    slots: tuple[str, str],
+    start: str,
+    places: Sequence[tuple[int, int]],
+) -> list[str]:
+    """Write the sums of some agents' whole vectors: (lane, piece) each."""
+    far = stride(around.plan.width, w.lanes)
+    own = [_load_at(w, start, lane * far + piece * w.lanes) for lane, piece in places]
     zero = [(w.vector, "zeroinitializer")] * len(places)
     with loop(w, *slots, zero) as (slot, totals, on):
-        place = w.put(f"mul i64 {slot}, {lanes}")
+        place = w.put(f"mul i64 {slot}, {w.lanes}")
         at = w.put(f"getelementptr i32, ptr {around.slots['neighbours']}, i64 {place}")
         heavy = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
-        other, weight = "", ""
+        lanes = dict.fromkeys(lane for lane, _ in places)
+        others = {lane: _their(w, around, at, lane) for lane in lanes}
+        weighted = around.plan.weighted
+        weights = {lane: _weight(w, heavy, lane) for lane in lanes if weighted}
         for k, (lane, piece) in enumerate(places):
-            if piece == pieces[0]:
-                other = _their(w, around.mirror, at, lane)
-                weight = _weight(w, heavy, lane) if plan.weighted else ""
-            own = _load_at(w, start, lane * far + piece * lanes)
-            away = w.operation("sub", [own, _load_at(w, other, piece * lanes)], False, False)
-            away = w.operation("mul", [away, weight], False, False) if weight else away
+            their = _load_at(w, others[lane], piece * w.lanes)
+            away = w.operation("sub", [own[k], their], False, False)
+            if weighted:
+                away = w.operation("mul", [away, weights[lane]], False, False)
             on[k] = w.operation("add", [totals[k], away], False, False)
-    found = dict[int, str]()
-    for piece in pieces:
-        rows = [totals[k] for k, (_, p) in enumerate(places) if p == piece]
-        found |= enumerate(_transposed(w, rows), piece * lanes)
-    return found
+    return totals
 
 
-def _their(w: Writer, mirror: str, places: str, lane: int) -> str:
-    """Write the address of what a lane's neighbour shows."""
-    return far_block(w, places, str(lane), mirror)
+def _their(w: Writer, around: Context, places: str, lane: int, ahead: bool = False) -> str:
+    """Write the address of what a lane's neighbour shows, who may be a leader ahead."""
+    start = around.mirror
+    if ahead:
+        at = w.put(f"getelementptr i32, ptr {places}, i64 {lane}")
+        place = w.put(f"sext i32 {w.put(f'load i32, ptr {at}, align 4')} to i64")
+        end = w.put(f"mul i64 {around.led}, {stride(around.plan.width, w.lanes)}")
+        leads = w.put(f"icmp slt i64 {place}, {end}")
+        start = w.put(f"select i1 {leads}, ptr {around.ahead}, ptr {start}")
+    return far_block(w, places, str(lane), start)
 
 
 def _weight(w: Writer, weights: str, lane: int) -> str:
@@ -189,7 +274,7 @@ def _load_at(w: Writer, start: str, place: int) -> str:
 
 def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) -> None:
     """Write what neighbours will read: of formations row by row, else agent after agent."""
-    lanes, far = w.lanes, stride(len(values), w.lanes)
+    lanes, far = w.lanes, stride(around.plan.width, w.lanes)
     if around.plan.lines:
         first = w.put(f"mul i64 {block}, {lanes}")
         for k, value in enumerate(values):
@@ -202,20 +287,21 @@ def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) 
         for k, value in enumerate(values):
             store_row(w, start, k, lanes, value)
         return
-    padded = [*values, *["zeroinitializer"] * (far - len(values))]
+    shown = [*values, *([largeness(w, around.plan, values)] if winds(around.plan) else [])]
+    padded = [*shown, *["zeroinitializer"] * (far - len(shown))]
     for piece in range(0, far, lanes):
-        for lane, column in enumerate(_transposed(w, padded[piece : piece + lanes])):
+        for lane, column in enumerate(transposed(w, padded[piece : piece + lanes])):
             at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + piece}")
             w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * bytes_of(w)}")
 
 
-def _transposed(w: Writer, rows: Sequence[str]) -> list[str]:
-    """Write the transpose of as many vectors as a vector has lanes, in log2 of them stages."""
+def transposed(w: Writer, rows: Sequence[str]) -> list[str]:
+    """Write the transposes of squares side by side in some vectors, in log2 of them stages."""
     lanes, rows = w.lanes, list(rows)
     distance = 1
-    while distance < lanes:
+    while distance < len(rows):
         mixed = list(rows)
-        for k in range(lanes):
+        for k in range(len(rows)):
             if k & distance:
                 continue
             a, b = rows[k], rows[k + distance]
@@ -233,7 +319,7 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
     return w.put(f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>")
 
 
-def measure_edges(w: Writer, around: Context) -> None:
+def measure_edges(w: Writer, around: Context, start: str, end: str) -> None:
     """Write the loop that adds up how far distances along edges are from those of the formation.
 
     A block of edges has the differences of their goals, row by row, the distances that these make,
@@ -242,7 +328,7 @@ def measure_edges(w: Writer, around: Context) -> None:
     plan, slots = around.plan, around.slots
     axes = plan.edges
     size = (len(axes) + 2) * plan.lanes
-    with loop(w, slots["first_edge"], slots["edge_blocks"], []) as (block, _, _):
+    with loop(w, start, end, []) as (block, _, _):
         begin = w.put(f"mul i64 {block}, {size}")
         base = w.put(f"getelementptr {w.scalar}, ptr {slots['edges']}, i64 {begin}")
         first = w.put(f"mul i64 {block}, 2")
@@ -253,7 +339,7 @@ def measure_edges(w: Writer, around: Context) -> None:
             return [end[axis] for axis in axes for end in found]
 
         smooth = slots["smooth_edges"]
-        found = either(w, smooth, block, ends) if plan.lines else ends(False)
+        found = either(w, flag(w, smooth, block), ends) if plan.lines else ends(False)
         squares = "zeroinitializer"
         for k in range(len(axes)):
             apart = w.operation("sub", found[2 * k : 2 * k + 2], False, False)

@@ -161,11 +161,12 @@ class Graph:
 
 def needed(results: Iterable[Node]) -> list[Node]:
     """Return the nodes that results rest on, operands first."""
-    found, todo = set[Node](), list(results)
+    # In an order that is the same everywhere, since nodes of two graphs have the same numbers.
+    found, todo = dict[Node, None](), list(results)
     while todo:
         node = todo.pop()
         if node not in found:
-            found.add(node)
+            found[node] = None
             todo += node.args
     return sorted(found, key=lambda node: node.number)
 

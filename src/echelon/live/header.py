@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.live.knobs import Panel
 from echelon.live.swarm import Swarm
@@ -38,14 +37,13 @@ def live_header(swarm: Swarm, panel: Panel, name: str, badge: dict[str, Any]) ->
 
 def _foreseen(swarm: Swarm, name: str, badge: dict[str, Any]) -> Recording:
     parts, states = swarm.parts, np.asarray(swarm.states)
-    return foreseen(parts, swarm.settings, states, name, _silent(badge, parts))
+    return foreseen(parts, swarm.settings, states, name, _silent(badge))
 
 
-def _silent(badge: dict[str, Any], parts: Parts) -> dict[str, Any]:
+def _silent(badge: dict[str, Any]) -> dict[str, Any]:
     """Return a promise of nothing, as what is promised stands in the badge."""
-    gain = parts.drive.gain
-    coupling = None if gain is None else gain.coupling
-    told = {"promised": False, "rate": None, "coupling": coupling, "theorem": None}
+    # How the coupling stands is told by its knob.
+    told = {"promised": False, "rate": None, "coupling": None, "theorem": None}
     return {**told, "sentence": badge["whole"], "kind": "", "hypotheses": []}
 
 

@@ -11,6 +11,7 @@ from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.gains.gain import Gain
+from echelon.gains.riccati import Riccati
 from echelon.laws.stopping_point import StoppingPoint
 from echelon.live.choices import AS_GIVEN, shapes_of
 from echelon.models.linearization import linearize
@@ -42,6 +43,7 @@ class Knobs(NamedTuple):
 
     Attributes:
         coupling: c; None of a law without one.
+        weight: of the inputs in the Riccati equation of the gain, times the scenario's R.
         feedforward: 1 where followers are sent what the scenario says, 0 where nothing.
         size: of the formation, times the scenario's.
         turn: of it, degrees.
@@ -52,6 +54,7 @@ class Knobs(NamedTuple):
     """
 
     coupling: float | None
+    weight: float = 1.0
     feedforward: float = 1.0
     size: float = 1.0
     turn: float = 0.0
@@ -78,10 +81,13 @@ class Panel:
         self.start = Knobs(_coupling(built))
         self.ranges: dict[str, Range] = {}
         self.gains: dict[str | None, Gain | None] = {None: gain}
+        self.weighed: tuple[Any, Gain | None] = None, None
         self.methods = _METHODS if gain is not None else ()
         if self.start.coupling is not None:
             c = self.start.coupling
             self.ranges["coupling"] = Range(0.02 * c, 8.0 * c, True)
+        if gain is not None and gain.method == Riccati.name and "file" not in self._own_gain():
+            self.ranges["weight"] = Range(0.02, 50.0, True)
         if str(parts.drive.feedforward.name) != "NONE":
             self.ranges["feedforward"] = Range(0.0, 1.0)
         self.axes = list(model.position_indices())
@@ -126,6 +132,7 @@ class Panel:
         wind = "" if self.windward is None else units[self.windward]
         texts = {
             "coupling": ("coupling c", ""),
+            "weight": ("input weight R", "\u00d7"),
             "feedforward": ("feed-forward", ""),
             "size": ("formation size", "\u00d7"),
             "turn": ("formation turn", "\u00b0"),
@@ -157,6 +164,12 @@ class Panel:
             )
         if isinstance(value, bool) or not isinstance(value, int | float) or value != value:
             raise SimulationError(f"`{name}` got `{value}`, and must be a number.")
+        gain = self.gains[knobs.method]
+        if name == "weight" and gain is not None and gain.method != Riccati.name:
+            raise SimulationError(
+                f"`weight` is of the inputs in a Riccati equation, and the gain is by "
+                f"`{gain.method}`; choose the scenario's or `{Riccati.name}` first."
+            )
         return knobs._replace(**{name: round(self.ranges[name].clamp(value), 9)})
 
     def with_method(self, knobs: Knobs, name: object) -> Knobs:
@@ -167,9 +180,9 @@ class Panel:
             ScenarioError: it finds no gain for these agents.
         """
         if name == AS_GIVEN:
-            return knobs._replace(method=None, coupling=self.start.coupling)
+            return knobs._replace(method=None, weight=1.0, coupling=self.start.coupling)
         check_choice("method", name, self.methods)
-        changed = knobs._replace(method=str(name))
+        changed = knobs._replace(method=str(name), weight=1.0)
         gain = self.gain(changed)
         return changed if gain is None else changed._replace(coupling=round(gain.coupling, 9))
 
@@ -193,7 +206,21 @@ class Panel:
         if knobs.method not in self.gains:
             plain = self.start._replace(method=knobs.method, coupling=None)
             self.gains[knobs.method] = build(self.standing(plain)).parts.drive.gain
-        return self.gains[knobs.method]
+        gain = self.gains[knobs.method]
+        if gain is None or knobs.weight == 1.0:
+            return gain
+        asked = knobs.method, knobs.weight
+        if self.weighed[0] != asked:
+            self.weighed = asked, self._weighed(gain, *asked)
+        return self.weighed[1]
+
+    def _weighed(self, gain: Gain, method: str | None, weight: float) -> Gain:
+        """Return a Riccati gain with another weight of the inputs, without a new certificate."""
+        given = self.scenario.follower.gain if method is None else None
+        with precision("float64"):
+            linear = linearize(self.parts.model)
+            found = Riccati(given and given.Q, weight * gain.R).feedback(self.parts.model, linear)
+        return Gain(found.P, found.R, gain.coupling, gain.method, gain.certificate)
 
     def offsets(self, knobs: Knobs) -> Array:
         """Return the offsets (N, n) of the formation as it stands, about its first leader."""
@@ -217,9 +244,12 @@ class Panel:
         return wind
 
     def slowest(self, knobs: Knobs) -> float | None:
-        """Return the slowest mode (1/s) near the trim under a gain; None without one."""
+        """Return the slowest mode (1/s) near the trim under a gain; None without one.
+
+        None on a graph that switches too, whose modes are none of one matrix.
+        """
         gain, graph = self.gain(knobs), self.parts.graph
-        if gain is None or knobs.coupling is None:
+        if gain is None or knobs.coupling is None or graph.schedule is not None:
             return None
         kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
         i, j = graph.edges[kept].T
@@ -248,16 +278,16 @@ class Panel:
         data = self._data()
         if knobs.method is not None:
             data.setdefault("follower", {})["gain"] = {"method": knobs.method}
+        if knobs.weight != 1.0:
+            told = data.setdefault("follower", {}).setdefault("gain", {})
+            told |= {"method": Riccati.name, "R": self._given_weight(knobs)}
         # With another graph a method would choose another coupling.
         if knobs.coupling is not None and (knobs.cut or knobs.coupling != self.start.coupling):
             self._couple(data.setdefault("follower", {}), knobs.coupling)
         if not knobs.feedforward:
             data.setdefault("follower", {})["feedforward"] = "none"
         if knobs.cut:
-            graph = self.parts.graph
-            told = {"leaders": list(graph.leaders), "agents": graph.agents}
-            told |= {"directed": True} if graph.directed else {}
-            data["graph"] = {"edges": self._edges(knobs), **told}
+            data["graph"] = self._graph(knobs)
         if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
             offsets = self.offsets(knobs)
             rows = {i: offsets[i, self.axes].tolist() for i in np.flatnonzero(offsets.any(axis=1))}
@@ -267,6 +297,29 @@ class Panel:
             constant = data.setdefault("disturbance", {}).setdefault("constant", {})
             constant[name] = constant.get(name, 0.0) + knobs.wind
         return scenario_from_mapping(data, self.scenario.folder)
+
+    def _given_weight(self, knobs: Knobs) -> list[list[float]]:
+        """Return R of the knobs as a scenario has it."""
+        gain = self.gains[knobs.method]
+        assert gain is not None
+        return (knobs.weight * gain.R).tolist()
+
+    def _own_gain(self) -> dict[str, Any]:
+        """Return what the scenario says of the followers' gain."""
+        return (self.scenario.data.get("follower") or {}).get("gain") or {}
+
+    def _graph(self, knobs: Knobs) -> dict[str, Any]:
+        """Return the graph without what is cut as a scenario has it."""
+        graph, schedule = self.parts.graph, self.parts.graph.schedule
+        told: dict[str, Any] = {"leaders": list(graph.leaders), "agents": graph.agents}
+        told |= {"directed": True} if graph.directed else {}
+        if schedule is None:
+            return {"edges": self._edges(knobs, graph.weights), **told}
+        rows = [self._edges(knobs, weights) for weights in schedule.weights]
+        later = zip(schedule.starts[1:].tolist(), rows[1:], strict=True)
+        told["schedule"] = [{"at": at, "edges": edges} for at, edges in later]
+        told |= {} if schedule.period is None else {"period": schedule.period}
+        return {"edges": rows[0], **told}
 
     def _couple(self, follower: dict[str, Any], coupling: float) -> None:
         """Write a coupling where the followers' law has it."""
@@ -296,13 +349,14 @@ class Panel:
             GraphError: it is in two parts.
         """
         graph = self.parts.graph
-        return Graph(self._edges(knobs), graph.leaders, graph.agents, graph.directed)
+        edges = self._edges(knobs, graph.weights)
+        return Graph(edges, graph.leaders, graph.agents, graph.directed)
 
-    def _edges(self, knobs: Knobs) -> list[list[Any]]:
-        """Return the edges that are not cut, with their weights."""
-        graph = self.parts.graph
-        kept = [k for k in range(len(graph.edges)) if k not in knobs.cut]
-        pairs = zip(graph.edges[kept].tolist(), graph.weights[kept].tolist(), strict=True)
+    def _edges(self, knobs: Knobs, weights: Array) -> list[list[Any]]:
+        """Return the edges with weights that are not cut."""
+        edges = self.parts.graph.edges
+        kept = [k for k in np.flatnonzero(weights) if k not in knobs.cut]
+        pairs = zip(edges[kept].tolist(), weights[kept].tolist(), strict=True)
         return [[*pair, weight] for pair, weight in pairs]
 
     def saved(self, events: Sequence[Mapping[str, Any]]) -> str:

@@ -15,7 +15,9 @@ from echelon.live.header import drawn
 from echelon.live.knobs import Knobs, Panel, check_choice
 from echelon.live.promiser import Promiser
 from echelon.live.swarm import Picture, Swarm
+from echelon.results.foreseen import heard_in
 from echelon.scenario.scenario import Scenario
+from echelon.viewer.replay import heard_by
 
 _PICTURE, _WORDS = 0, 1
 _NOTHING = struct.pack("<I", _WORDS) + b"{}"
@@ -187,6 +189,8 @@ class Session:
             seen, heard = -1, len(self.words)
         # A page that comes later hears how things stand.
         self.promiser.ask(self.panel, self.knobs)
+        if self.panel is not self.first:
+            self.say(self._law_told())
         self.say(self.standing())
         try:
             while not self.ended:
@@ -210,6 +214,11 @@ class Session:
         cut = [graph.edges[k].tolist() for k in sorted(self.knobs.cut)]
         chosen = {"law": self.panel.law, "method": self.knobs.method, "shape": self.knobs.shape}
         return {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
+
+    def _law_told(self) -> dict[str, Any]:
+        """Return what another law brings: its knobs, and who hears whom."""
+        heard = heard_by(heard_in(self.swarm.parts))
+        return {"panel": self.panel.told(), "choices": self.panel.choices(), "heard": heard}
 
     # ---- what is done ---------------------------------------------------------------------------
 
@@ -330,7 +339,7 @@ class Session:
         before, self.swarm = self.swarm, self.loops[law][1]
         self.panel = self.loops[law][0]
         self.swarm.restart(np.asarray(before.now.states, float), before.steps)
-        self.say({"panel": self.panel.told(), "choices": self.panel.choices()})
+        self.say(self._law_told())
         kept = {name for name in self.panel.ranges if name not in ("coupling",)}
         told = {name: getattr(knobs, name) for name in {"shape", "cut", *kept}}
         return self.panel.start._replace(**told)

@@ -7,12 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.errors import GraphError, SimulationError
+from echelon.core.errors import GraphError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
-from echelon.engine.loop import Loop, Moment, assemble
+from echelon.engine.loop import Loop, Moment, Switches, assemble
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
@@ -21,14 +21,15 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.live.knobs import Knobs, Panel
 from echelon.live.mover import mover_of
 from echelon.models.model import ControlAffine
-from echelon.network.exchange import Exchange
-from echelon.network.graph import Graph
+from echelon.network.hearing import edges_of
 from echelon.results.lyapunov import goes_both_ways, potential
 from echelon.world.disturbance import Disturbance
 from echelon.world.world import World
 
 PICTURE = 0.04
 """Seconds of a picture."""
+_AHEAD = 60.0
+"""Seconds for which it is known when the graph switches."""
 
 
 @final
@@ -106,16 +107,7 @@ class Swarm:
     """
 
     def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
-        """Prepare what the steps need.
-
-        Raises:
-            SimulationError: the graph switches at times of its own.
-        """
-        if parts.graph.schedule is not None:
-            raise SimulationError(
-                "the graph has a `schedule`, and a live run has links cut by hand; use `echelon "
-                "run`, or leave the schedule out."
-            )
+        """Prepare what the steps need."""
         world = World(parts.world.plant, parts.world.disturbance or Disturbance())
         prepared = prepare(parts.replace(world=world), settings)
         problem, drive = prepared.problem, prepared.parts.drive
@@ -136,10 +128,12 @@ class Swarm:
         self.states, self.measured = problem.states, list(problem.meter.measured)
         self.nearest = np.array(parts.graph.nearest_leader())
         self.weights = np.asarray(loop.exchange.weights, np.float64)
-        self.edge = _edges_of(loop.exchange, parts.graph)
+        self.edge = edges_of(parts.graph, loop.exchange)[0]
         self.count = max(1, round(PICTURE / settings.dt))
         self.offsets = panel.offsets(panel.start)
         self.potential = self._potential(panel.start)
+        self.ahead = range(0)
+        self._look_ahead(0)
         self.mover = mover_of(self.loop, self._unlike(), self.states, settings)
         self.restart()
 
@@ -157,6 +151,19 @@ class Swarm:
             return follower.share, follower.law.coupling
         own = follower.law.gain
         return follower.share, own.coupling, own.P, own.R, own.R_inverse, own.inner
+
+    def _look_ahead(self, step: int) -> None:
+        """Let the loop know when the graph switches in the periods about a step."""
+        schedule, dt = self.parts.graph.schedule, self.settings.dt
+        if schedule is None or schedule.period is None or step in self.ahead:
+            return
+        first = max(0, int(step * dt / schedule.period) - 1)
+        horizon = max(_AHEAD, 4.0 * schedule.period)
+        switches = Switches(*schedule.switches(dt, horizon, first))
+        self.loop = eqx.tree_at(lambda each: each.switches, self.loop, switches)
+        # A whole period before its end, which no picture is as long as.
+        last = int(first + horizon / schedule.period) * schedule.period
+        self.ahead = range(int(switches.steps[0]), int(last / dt) - self.count)
 
     @property
     def span(self) -> float:
@@ -208,13 +215,15 @@ class Swarm:
         # Of a law that turns, P stands in axes that turn too.
         if P is None or self.loop.follower.turning or not goes_both_ways(self.parts.graph):
             return None
-        if (knobs.cut, knobs.method) not in self.potentials:
+        asked = knobs.cut, knobs.method, knobs.weight
+        if asked not in self.potentials:
             try:
-                graph = self.panel.graph(knobs)
-                self.potentials[knobs.cut, knobs.method] = potential(self.parts.model, graph, P)
+                found = potential(self.parts.model, self.panel.graph(knobs), P)
             except GraphError:
                 return None
-        return self.potentials[knobs.cut, knobs.method]
+            # A weight that is turned passes many values.
+            self.potentials = {**dict(list(self.potentials.items())[-16:]), asked: found}
+        return self.potentials[asked]
 
     def kick(self, agent: int, by: Array) -> None:
         """Change the state of an agent by (n,), all at once."""
@@ -224,6 +233,7 @@ class Swarm:
 
     def advance(self, still: bool = False) -> Picture:
         """Go on to the next picture, or look at the present one, and return it."""
+        self._look_ahead(self.steps)
         self.now, states, inputs = self.mover.move(self.loop, self.now, 0 if still else self.count)
         y = states - self.offsets
         with np.errstate(over="ignore", invalid="ignore"):
@@ -233,14 +243,6 @@ class Swarm:
         time = self.steps * self.settings.dt
         V = float(self.potential(y[None])[0]) if known.all() and self.potential else np.nan
         return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(known))
-
-
-def _edges_of(heard: Exchange, graph: Graph) -> Array:
-    """Return which edge each of the ways goes along on which agents hear each other."""
-    places = {tuple(pair): k for k, pair in enumerate(graph.edges.tolist())}
-    # A directed edge (i, j) is heard by j, and an undirected one stands once.
-    pairs = zip(np.asarray(heard.senders).tolist(), np.asarray(heard.receivers).tolist())
-    return np.array([places[p] if p in places else places[p[::-1]] for p in pairs])
 
 
 def _inner(gain: Gain) -> Array:

@@ -187,9 +187,9 @@ class Formation:
 
     def coincident(self) -> tuple[tuple[int, int], ...]:
         """Return pairs of agents (lowest number first) that have the same goal."""
-        _, first, group = np.unique(self.offsets, axis=0, return_index=True, return_inverse=True)
-        group = group.ravel()
-        return tuple((int(first[g]), k) for k, g in enumerate(group) if first[g] != k)
+        first, group = _distinct(self.offsets)
+        others = np.flatnonzero(first[group] != np.arange(len(group)))
+        return tuple(zip(first[group[others]].tolist(), others.tolist(), strict=True))
 
     def broken_symmetries(
         self, model: ControlAffine, lower: Array | float = -0.5, upper: Array | float = 0.5
@@ -206,20 +206,35 @@ class Formation:
             upper: up to where.
         """
         offsets = self.offsets - self.offsets[0] + 0.0  # which makes -0.0 the same as 0.0
-        distinct = np.unique(offsets, axis=0)
-        tested = distinct[:: max(1, -(-len(distinct) // _TESTED))]
+        first, group = _distinct(offsets)
+        tested = range(0, len(first), max(1, -(-len(first) // _TESTED)))
         # In float32 rounding alone would exceed the tolerance.
         with precision("float64"):
-            reasons = {
-                d.tobytes(): _describe_change(model, d, lower, upper) if d.any() else None
-                for d in tested
+            found = {
+                k: _describe_change(model, offsets[first[k]], lower, upper)
+                for k in tested
+                if offsets[first[k]].any()
             }
-        found = {agent: reasons.get(offset.tobytes()) for agent, offset in enumerate(offsets)}
-        return {agent: reason for agent, reason in found.items() if reason}
+        reasons = {k: reason for k, reason in found.items() if reason}
+        agents = np.flatnonzero(np.isin(group, [*reasons])) if reasons else np.zeros(0, int)
+        return {agent: reasons[int(group[agent])] for agent in agents.tolist()}
 
     def is_invariant(self, model: ControlAffine) -> bool:
         """Tell whether every offset is a symmetry of the model, by the sampled test above."""
         return not self.broken_symmetries(model)
+
+
+def _distinct(rows: Array) -> tuple[Array, Array]:
+    """Return the first of each kind of equal rows, in their order, and which kind each is of.
+
+    `numpy.unique` takes some seconds for a million.
+    """
+    varying = rows[:, np.ptp(rows, axis=0) > 0.0]
+    order = np.lexsort(varying.T[::-1]) if varying.size else np.arange(len(rows))
+    changed = (varying[order[1:]] != varying[order[:-1]]).any(axis=1)
+    kinds, group = np.concatenate([[0], np.cumsum(changed)]), np.empty(len(rows), int)
+    group[order] = kinds
+    return order[np.concatenate([[True], changed])], group
 
 
 def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> np.ndarray:

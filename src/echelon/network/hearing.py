@@ -1,4 +1,4 @@
-"""Who follows whom: which leaders each follower hears, directly or through whom, in words."""
+"""Who hears whom: along which edges, and in words through whom each hears which leaders."""
 
 from collections.abc import Iterator, Sequence
 
@@ -6,10 +6,35 @@ import numpy as np
 import scipy.sparse.csgraph as csgraph
 
 from echelon.core.types import Array
+from echelon.network.exchange import Exchange
 from echelon.network.graph import Graph
 
 _NAMED = 12
 """Up to so many followers, or leaders of a flock, have words of their own."""
+
+
+def edges_of(graph: Graph, heard: Exchange) -> tuple[Array, Array]:
+    """Return along which edge each of the ways goes (K,), and which end of it, 0 or 1, hears."""
+    hears, said = np.asarray(heard.receivers), np.asarray(heard.senders)
+    # A directed edge (i, j) is heard by j, and an undirected one has the lower number first.
+    end = np.ones(len(hears), int) if graph.directed else (hears > said).astype(int)
+    keys = graph.edges @ (graph.agents, 1)
+    order = np.argsort(keys)
+    wanted = np.where(end, said, hears) * graph.agents + np.where(end, hears, said)
+    return order[np.searchsorted(keys, wanted, sorter=order)], end
+
+
+def heard_along(graph: Graph, leaderward: bool, leaders_hear: bool) -> Array:
+    """Return whether each end of each edge hears the other, (E, 2).
+
+    Args:
+        graph: of all.
+        leaderward: whether those alone are heard who are nearer to a leader.
+        leaders_hear: whether leaders act on what they hear.
+    """
+    found = np.zeros((len(graph.edges), 2), bool)
+    found[edges_of(graph, graph.exchange(leaderward))] = True
+    return found & (leaders_hear | ~np.isin(graph.edges, graph.leaders))
 
 
 def who_hears_whom(graph: Graph) -> str:

@@ -31,6 +31,8 @@ def check_reached(graph: "Graph") -> None:
                 f"({_name_leaders(graph)}) from {schedule.starts[-1]:g} s on, after the last "
                 "switch; add edges there, or give a `period` after which the schedule begins again."
             )
+    if len(graph.leaders) == 1:
+        return
     count, label = csgraph.connected_components(graph.adjacency(), directed=False)
     if count > 1:
         # Each piece has a leader of its own, and would be a formation of its own.

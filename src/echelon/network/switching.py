@@ -35,13 +35,17 @@ class Schedule(NamedTuple):
 
     def row(self, t: float) -> int:
         """Return which row holds at a time (s)."""
-        t = t if self.period is None else t % self.period
-        return int(np.searchsorted(self.starts, t + _ROUNDED, side="right")) - 1
+        # Rounded before the period is taken off, or what is just short of its end would be last.
+        t = t + _ROUNDED if self.period is None else (t + _ROUNDED) % self.period
+        return int(np.searchsorted(self.starts, t, side="right")) - 1
 
-    def switches(self, dt: float, horizon: float) -> tuple[Array, Array]:
-        """Return from which steps on (K,) which rows (K,) hold, in steps of dt (s)."""
+    def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
+        """Return from which steps on (K,) which rows (K,) hold, in steps of dt (s).
+
+        They are those of a horizon (s) from the first of its periods on.
+        """
         rounds = 1 if self.period is None else int(np.floor(horizon / self.period)) + 1
-        begins = np.arange(rounds) * (self.period or 0.0)
+        begins = (first + np.arange(rounds)) * (self.period or 0.0)
         times = (begins[:, None] + self.starts).reshape(-1)
         steps = np.ceil(times / dt - _ROUNDED).astype(np.int64)
         rows = np.tile(np.arange(len(self.starts)), rounds)

@@ -11,6 +11,9 @@ from echelon.results.recording import Recording
 # Broad and pale under a thin leader, it shows where the two coincide.
 REFERENCE = {"color": draw.REFERENCE, "linestyle": (0, (1.6, 0.9)), "linewidth": 3.0, "zorder": 2}
 
+MOST = 2000
+"""Agents that a figure draws one by one: more would hide each other, and take minutes."""
+
 
 def name_of(run: Recording, agent: int, short: bool = False) -> str | None:
     """Return an agent's name; where `short`, None for the many of a swarm but its first leader."""
@@ -33,6 +36,17 @@ def leaders_first(run: Recording, agents: Iterable[int]) -> list[int]:
     """Return agents in the order in which they are drawn."""
     # First drawn are first in the legend; `zorder` and not this decides who is on top.
     return sorted(agents, key=lambda agent: agent not in run.leaders)
+
+
+def drawn(run: Recording) -> list[int]:
+    """Return the agents that get lines of their own: all, or evenly spread ones of a huge swarm."""
+    step = -(-run.agents // MOST)
+    return leaders_first(run, sorted({*range(0, run.agents, step), *run.leaders[:MOST]}))
+
+
+def told_of(run: Recording, count: int) -> str:
+    """Return how many agents are drawn where that is not all of them, as a title."""
+    return "" if count == run.agents else f"{count:,} of {run.agents:,} agents"
 
 
 def label(run: Recording, k: int) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.result import Result
 from echelon.plots import style as draw
+from echelon.plots.files import save
 from echelon.results.metrics import SETTLED, formation_errors, output_errors
 from echelon.studies.compare import Comparison, Row
 
@@ -39,7 +40,7 @@ def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
     Raises:
         OSError: the folder or a file cannot be written.
     """
-    draw.save(comparison_figures(comparison), folder / "figures")
+    save(comparison_figures(comparison), folder / "figures")
 
 
 _Flown = list[tuple[int, Row]]

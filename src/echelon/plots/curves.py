@@ -7,13 +7,22 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.plots import style as draw
-from echelon.plots.agents import REFERENCE, label, leaders_first, name_of, pen_of, reference_of
+from echelon.plots.agents import (
+    REFERENCE,
+    drawn,
+    label,
+    leaders_first,
+    name_of,
+    pen_of,
+    reference_of,
+)
 from echelon.results.metrics import SETTLED
 from echelon.results.recording import Recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_LINKS = 20_000  # of which the distances of many are taken, evenly spread
 _PANELS = 12  # what fits above each other on a page
 _START = 3.0
 """Seconds of a run in which inputs are quick."""
@@ -77,7 +86,7 @@ def formation(run: Recording) -> "Figure":
     return draw.finish(figure)
 
 
-def _bands(ax: Any, times: Array, values: Array) -> None:
+def _bands(ax: Any, times: Array, values: Array, of: str = "follower") -> None:
     """Draw where nine in ten and half of a flock are, (T, N), and the median."""
     with np.errstate(invalid="ignore"):
         # Where all agree to the bit there is nothing to draw, and nothing to warn of.
@@ -87,7 +96,7 @@ def _bands(ax: Any, times: Array, values: Array) -> None:
     look = {"color": draw.COLOURS[0], "linewidth": 0.0, "zorder": 1.5}
     ax.fill_between(times, ends[0], ends[4], alpha=0.18, label="5 to 95 % of them", **look)
     ax.fill_between(times, ends[1], ends[3], alpha=0.35, label="25 to 75 %", **look)
-    draw.plot(ax, times, ends[2], label="median follower", color=draw.COLOURS[0])
+    draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
 
 
 def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) -> None:
@@ -217,7 +226,7 @@ def _agents_over(ax: Any, run: Recording, times: Array, values: Array) -> None:
 
 def states(run: Recording) -> "Figure":
     """Return every state over time, twelve at most."""
-    return states_over_time(run, range(run.agents))
+    return states_over_time(run, drawn(run))
 
 
 def states_over_time(run: Recording, chosen: Iterable[int]) -> "Figure":
@@ -251,14 +260,16 @@ def distances(run: Recording) -> "Figure | None":
     if not run.position:
         return None
     places, columns = run.states[:, :, list(run.position)], list(run.position)
-    keep = draw.thin(len(run.times), max(1, len(run.edges)))
-    i, j = run.edges.T
+    chosen = slice(None, None, -(-len(run.edges) // _LINKS) or 1)
+    i, j = run.edges[chosen].T
+    keep = draw.thin(len(run.times), max(1, len(i)))
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.linalg.norm(places[keep][:, i] - places[keep][:, j], axis=2)
         wanted = np.linalg.norm(run.offsets[i][:, columns] - run.offsets[j][:, columns], axis=1)
+    apart[~np.stack([run.linked(t)[chosen] for t in run.times[keep]])] = np.nan
     figure, (linked, nearest) = _panels(run, 2, 1.9)
-    _edges(linked, run, run.times[keep], apart, wanted)
     linked.set_ylabel(draw.label("between linked", "m"))
+    _edges(linked, run, run.times[keep], apart, wanted)
     few = draw.thin(len(run.times), run.agents)
     draw.plot(nearest, run.times[few], _least(places[few]), color=draw.LEADER, label="any two")
     nearest.set_ylabel(draw.label("least distance", "m"))
@@ -270,8 +281,8 @@ def _edges(ax: Any, run: Recording, times: Array, apart: Array, wanted: Array) -
     """Draw the distance of each edge, or of many how far they are off."""
     if len(run.edges) > draw.NAMED:
         off = np.abs(apart - wanted)
-        _bands(ax, times, draw.above_zero(off))
-        ax.set_ylabel("off the wanted (m)")
+        _bands(ax, times, draw.above_zero(off), "link")
+        ax.set_ylabel("links off wanted (m)")
         draw.logarithmic(ax, off)
         return
     for place, (i, j) in enumerate(run.edges):

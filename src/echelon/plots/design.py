@@ -9,6 +9,7 @@ from echelon.core.types import Array
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.plots import style as draw
+from echelon.plots.files import save
 from echelon.plots.network import poles
 from echelon.promises.promise import promise
 from echelon.results.recording import Modes
@@ -53,7 +54,7 @@ def save_design_figures(
         made["modes"] = poles(Modes(loop.poles, loop.eigenvalues))
         if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
             made["certified_set"], radii = _certified_set(parts, settings, states)
-    return draw.save(made, folder), radii
+    return save(made, folder), radii
 
 
 # ---- sets -------------------------------------------------------------------------------------

@@ -45,10 +45,11 @@ class Moving(abc.ABC):
         self.size, self.offsets = body_width(run, space), scene_offsets(run, space)
         thick = 1.1 if run.agents <= _FEW else 0.4
         self.links = _stroke(ax, color=_LINK, linewidth=thick, alpha=0.8)
+        self.heads = _heads_on(ax) if run.agents <= _FEW and len(run.arrows) else None
         self.clock = ax.text(14, ax.get_ylim()[1] - 26, "", size=13)
         self.artists: list[Any] = []
         self.prepare()
-        self.artists.append(self.clock)
+        self.artists += [self.clock] if self.heads is None else [self.heads, self.clock]
 
     @abc.abstractmethod
     def prepare(self) -> None:
@@ -61,11 +62,28 @@ class Moving(abc.ABC):
     def show(self, time: float, now: Array, passed: Array, angles: Array | None) -> None:
         """Put everything where it is at a time."""
         self.clock.set_text(f"{time:.2f} s")
-        _put(self.links, self.camera.project(now[self.run.edges])[0])
+        there = self.run.linked(time)
+        _put(self.links, self.camera.project(now[self.run.edges[there]])[0])
+        if self.heads is not None:
+            self.heads.set_verts(self._heads(now, there))
         goals = now[self.run.nearest] + self.offsets - self.offsets[self.run.nearest]
         if self.space.kind == "time":
             goals[:, 0] = now[:, 0]
         self.draw(now, passed, goals, angles)
+
+    def _heads(self, now: Array, there: Array) -> list[Array]:
+        """Return the heads of arrows to those who alone hear along a link, off their bodies."""
+        arrows = self.run.arrows[there[self.run.heard.sum(axis=1) == 1]]
+        first, second = (self.camera.project(now[ends])[0] for ends in arrows.T)
+        beside = now[arrows[:, 1]] + 0.6 * self.size * self.camera.axes[0]
+        body = np.linalg.norm(self.camera.project(beside)[0] - second, axis=1)
+        whole = np.maximum(np.linalg.norm(second - first, axis=1), 1e-9)
+        way = ((second - first) / whole[:, None])[:, None]
+        gap, tall = np.minimum(body, 0.5 * whole), np.minimum(11.0, 0.4 * whole)
+        aside = np.stack([-way[..., 1], way[..., 0]], axis=-1)
+        back, out = np.array([[0.0], [1.0], [1.0]]), np.array([[0.0], [0.4], [-0.4]])
+        tip = (second - gap[:, None] * way[:, 0])[:, None]
+        return list(tip + tall[:, None, None] * (out * aside - back * way))
 
 
 @final
@@ -162,6 +180,13 @@ class _Flock(Moving):
         dots.set_offsets(middle)
         # Of a marker the area of the square about it is told, in points.
         dots.set_sizes((2.0 * points * (beside - middle)[:, 0]) ** 2)
+
+
+def _heads_on(ax: Any) -> Any:
+    """Return what draws heads of arrows."""
+    from matplotlib.collections import PolyCollection
+
+    return ax.add_collection(PolyCollection([], facecolors=_LINK, edgecolors="none", zorder=1.1))
 
 
 def _stroke(ax: Any, **pen: Any) -> Any:

@@ -1,12 +1,13 @@
 """Who hears whom, and the poles into which the disagreement splits."""
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from echelon.core.types import Array
 from echelon.plots import style as draw
-from echelon.plots.agents import pen_of
+from echelon.plots.agents import MOST, pen_of, told_of
 from echelon.results.recording import Modes, Recording
 
 if TYPE_CHECKING:
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 _NUMBERED = 60
 """With more agents than this, numbers would cover each other."""
+_STRETCHES = 6
+"""Of a graph that switches, drawn beside each other."""
 
 
 def modes(run: Recording) -> "Figure | None":
@@ -45,29 +48,39 @@ def poles(found: Modes) -> "Figure":
     ax.set_xlabel("real part (1/s)")
     ax.set_ylabel("imaginary part (rad/s)")
     _name_slowest(ax, slowest)
-    bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
-    bar.set_label("eigenvalue \u03bb of the graph")
-    _label_bar(bar, values)
+    # One eigenvalue has no scale.
+    if len(np.unique(values)) > 1:
+        bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
+        bar.set_label("eigenvalue \u03bb of the graph")
+        _label_bar(bar, values)
     return figure
 
 
 def _name_slowest(ax: Any, slowest: float) -> None:
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
     near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
-    look = {"va": "top", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
-    ax.annotate(f"slowest: {slowest:.3g} 1/s", (slowest, 1.0), (4, -4), **look, **near)
+    look = {"va": "bottom", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
+    # Above the poles and the axis, and within the paper on whichever side there is room.
+    place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
+    side = {"ha": "right" if place > 0.5 else "left"}
+    text = f"slowest: {slowest:.3g} 1/s".replace("-", "\u2212")
+    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near, **side)
 
 
 def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
     """Use scales that show slow and fast poles alike, and end a little right of the axis."""
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FixedLocator, FuncFormatter
 
     sizes, heights = np.abs(real), np.abs(imaginary)
     least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
     right = max(0.0, float(real.max()))
     if most > 30.0 * least:
         ax.set_xscale("symlog", linthresh=least, linscale=0.6)
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        told = FuncFormatter(lambda x, _: f"{x:g}".replace("-", "\u2212"))
+        ax.xaxis.set_major_formatter(told)
+        powers = 10.0 ** np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1.0)
+        # Nearer to 0 their numbers would cover each other.
+        ax.xaxis.set_major_locator(FixedLocator([*-powers[powers > 1.6 * least][::-1], 0.0]))
         ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
     else:
         ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
@@ -93,19 +106,73 @@ def _label_bar(bar: Any, values: Array) -> None:
 def network(run: Recording) -> "Figure":
     """Return who hears whom: agents where the formation puts them, or around a circle.
 
-    An arrow goes to who hears: in directed graphs, and from leaders; a line without one is heard
-    both ways.
+    An arrow goes to who hears; a line without one is heard both ways, a dotted one by nobody. A
+    graph that switches has a panel for each stretch of time, six at most; of a huge swarm it is
+    those about the leaders.
     """
     from matplotlib.figure import Figure
 
+    whole, run = run, _about_leaders(run)
     places, units = _places(run)
     size = np.ptp(places, axis=0)
-    width = draw.page().width * (1.0 if draw.page().narrow else 0.75)
+    stretches = _stretches(run)
+    columns = min(len(stretches), 2 if draw.page().narrow else 3)
+    rows = -(-len(stretches) // columns)
+    width = draw.page().width * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
     tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
-    figure = Figure((width, 0.75 + 0.85 * width * tall), layout="constrained")
-    ax = figure.add_subplot()
-    small = draw.crowding(run.agents) ** 0.3
-    _links(ax, run, places, small)
+    height = rows * (0.75 + 0.85 * width / columns * tall)
+    figure = Figure((width, height), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, (title, weights) in zip(panels, stretches, strict=False):
+        _agents_and_links(ax, run, places, weights, columns)
+        _finish_network(ax, places, units)
+        told = ", ".join(filter(None, [title, told_of(whole, run.agents)]))
+        ax.set_title(told, size=draw.page().letters)
+    for ax in panels[len(stretches) :]:
+        ax.axis("off")
+    return figure
+
+
+def _about_leaders(run: Recording) -> Recording:
+    """Return a recording of the agents that the fewest links part from a leader."""
+    if run.agents <= MOST:
+        return run
+    from scipy import sparse
+
+    (i, j), ones = run.edges.T, np.ones(len(run.edges), np.int8)
+    links = sparse.csr_array(sparse.coo_array((ones, (i, j)), (run.agents, run.agents)))
+    far = sparse.csgraph.dijkstra(
+        links, directed=False, indices=run.leaders, unweighted=True, min_only=True
+    )
+    kept = np.sort(np.argsort(far, kind="stable")[:MOST])
+    there = np.isin(run.edges, kept).all(axis=1)
+    schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, there])
+    return dataclasses.replace(
+        run,
+        **{name: getattr(run, name)[:, kept] for name in ("states", "inputs", "errors")},
+        **{name: getattr(run, name)[kept] for name in ("offsets", "limited")},
+        leaders=tuple(np.flatnonzero(np.isin(kept, run.leaders)).tolist()),
+        nearest=np.zeros(len(kept), int),
+        edges=np.searchsorted(kept, run.edges[there]),
+        weights=run.weights[there],
+        heard=run.heard[there],
+        schedule=schedule,
+    )
+
+
+def _stretches(run: Recording) -> list[tuple[str, Array]]:
+    """Return the weights (E,) of each stretch of time, with when that is."""
+    if run.schedule is None:
+        return [("", run.weights)]
+    spans = list(run.schedule.spans())[:_STRETCHES]
+    if len(run.schedule.starts) > _STRETCHES:
+        spans[-1] += f", of {len(run.schedule.starts)} stretches"
+    return list(zip(spans, run.schedule.weights, strict=False))
+
+
+def _agents_and_links(ax: Any, run: Recording, places: Array, weights: Array, columns: int) -> None:
+    small = draw.crowding(run.agents) ** 0.3 / columns**0.4
+    _links(ax, run, places, weights, small)
     for agent in range(run.agents):
         leads = agent in run.leaders
         look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
@@ -113,8 +180,6 @@ def network(run: Recording) -> "Figure":
     for agent in range(run.agents if run.agents <= _NUMBERED else 0):
         text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
         ax.annotate(str(agent), places[agent], ha="center", va="center", **text)
-    _finish_network(ax, places, units)
-    return figure
 
 
 def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
@@ -131,22 +196,37 @@ def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
     return np.column_stack([np.sin(turn), np.cos(turn)]), ()
 
 
-def _links(ax: Any, run: Recording, places: Array, small: float) -> None:
+def _links(ax: Any, run: Recording, places: Array, weights: Array, small: float) -> None:
     """Draw the edges, thicker where they weigh more."""
-    from matplotlib.collections import LineCollection
+    from matplotlib.collections import LineCollection, PolyCollection
 
-    heavy = np.sqrt(run.weights / run.weights.max())
-    wide = np.clip(1.6 * heavy, 0.3, 1.6) * small
-    pairs = places[run.edges]
-    ax.add_collection(LineCollection(list(pairs), linewidths=wide, colors="0.55", zorder=1))
-    leads = {*run.leaders}
-    if run.agents > _NUMBERED or (run.mutual and not run.directed):
+    wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
+    there, unheard = weights > 0.0, ~run.heard.any(axis=1)
+    for kept, dash in ((there & ~unheard, "-"), (there & unheard, (0, (1.0, 2.0)))):
+        lines = list(places[run.edges[kept]])
+        look = {"linewidths": wide[kept], "colors": "0.55", "linestyles": [dash], "zorder": 1}
+        ax.add_collection(LineCollection(lines, **look))
+    one = run.heard.sum(axis=1) == 1
+    arrows, pens = run.arrows[there[one]], wide[one & there]
+    if run.agents > _NUMBERED:
+        tall = 0.4 * float(np.sqrt(np.ptp(places, axis=0).prod() / run.agents))
+        heads = PolyCollection(_heads(places[arrows], tall), facecolors="0.35", zorder=2)
+        ax.add_collection(heads)
         return
-    for (i, j), line in zip(run.edges, wide, strict=True):
-        first, second = (i, j) if i in leads or run.directed else (j, i)
-        if run.directed or (first in leads and second not in leads):
-            arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0}
-            ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+    for (first, second), line in zip(arrows, pens, strict=True):
+        arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0 * small}
+        ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+
+
+def _heads(ends: Array, tall: float) -> list[Array]:
+    """Return triangles on the way between ends (K, 2, 2), a little nearer to the second."""
+    way = ends[:, 1] - ends[:, 0]
+    whole = np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+    aside = np.stack([-way[:, 1], way[:, 0]], axis=1) / whole
+    tall_each = np.minimum(tall, 0.3 * whole)
+    tip = ends[:, 0] + 0.7 * way
+    back, out = tip - tall_each * way / whole, 0.4 * tall_each * aside
+    return list(np.stack([tip, back + out, back - out], axis=1))
 
 
 def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.plots import agents
 from echelon.plots import style as draw
-from echelon.plots.agents import label, leaders_first, name_of, pen_of, reference_of
+from echelon.plots.agents import label, name_of, pen_of, reference_of
 from echelon.plots.curves import states_over_time
 from echelon.results.recording import Recording
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SNAPSHOTS = 6  # times at which the graph of a few agents is drawn
+_DENSE = 60  # With more edges than this, so many times would hide each other.
 _EDGES = 5000  # A graph with more edges than this would be a black patch.
 
 
@@ -39,14 +40,14 @@ def leader(run: Recording) -> "Figure":
             look = draw.dots(shape, draw.LEADER, hollow=name == "start")
             draw.plot(ax, place, label=name if named else None, **look)
     shown = np.concatenate([*paths, *known])
-    draw.frame(ax, shown, alike=bool(run.position))
+    draw.frame(ax, shown, alike=len(run.position) > 1)
     return draw.finish(figure, cut)
 
 
 def trajectories(run: Recording) -> "Figure":
     """Return the paths of all agents, with the graph drawn at a few times."""
     axes = _space(run)
-    return _paths(run, axes) if axes else states_over_time(run, range(run.agents))
+    return _paths(run, axes) if axes else states_over_time(run, agents.drawn(run))
 
 
 def top_view(run: Recording) -> "Figure | None":
@@ -56,28 +57,30 @@ def top_view(run: Recording) -> "Figure | None":
 
 
 def _paths(run: Recording, axes: list[int]) -> "Figure":
-    paths, wanted = run.states[:, :, axes], reference_of(run, run.leaders[0])
+    shown, wanted = agents.drawn(run), reference_of(run, run.leaders[0])
+    paths = run.states[:, shown][:, :, axes]
     paths, cut = draw.drop_runaways(paths, paths[0], *([] if wanted is None else [wanted[:, axes]]))
     figure, ax = _canvas(run, axes)
-    keep = draw.thin(len(paths), run.agents)
-    for agent in leaders_first(run, range(run.agents)):
+    keep = draw.thin(len(paths), len(shown))
+    for agent, path in zip(shown, paths[keep].swapaxes(0, 1), strict=True):
         look = pen_of(run, agent)
-        draw.plot(ax, paths[keep, agent], label=name_of(run, agent, short=True), **look)
-    _snapshots(ax, run, paths)
+        draw.plot(ax, path, label=name_of(run, agent, short=True), **look)
+    _snapshots(ax, run, shown, paths)
     draw.frame(ax, paths, alike=bool(run.position))
+    ax.set_title(agents.told_of(run, len(shown)), size=draw.page().letters)
     return draw.finish(figure, cut)
 
 
-def _snapshots(ax: Any, run: Recording, paths: Array) -> None:
+def _snapshots(ax: Any, run: Recording, shown: list[int], paths: Array) -> None:
     """Draw the graph at a few times, agents hollow at the start and square at the end."""
-    crowd, last = run.agents, len(paths) - 1
+    crowd, last = len(shown), len(paths) - 1
     # More snapshots of a swarm would hide each other.
-    count = 2 if crowd > 50 else _SNAPSHOTS
+    count = 2 if crowd > 50 or len(run.edges) > _DENSE else _SNAPSHOTS
     frames = np.unique(np.linspace(0, last, count).round().astype(int))
-    if len(run.edges) <= _EDGES:
-        _graph(ax, run, paths[frames], run.times[frames])
+    if len(run.edges) <= _EDGES and crowd == run.agents:
+        _graph(ax, run, paths[frames][:, np.argsort(shown)], run.times[frames])
     size = 4.5 * draw.crowding(crowd) ** 0.25
-    for colour, group in _colours(run).items():
+    for colour, group in _colours(run, shown).items():
         places = paths[:, group]
         draw.plot(ax, _flatten(places[frames[1:-1]]), **draw.dots(".", colour, size))
         draw.plot(ax, places[0], **draw.dots("o", colour, size, hollow=True))
@@ -95,9 +98,11 @@ def _graph(ax: Any, run: Recording, places: Array, times: Array) -> None:
     # NaN lifts the pen, so that all edges of a time are one line and not thousands.
     gaps = np.full_like(ends[:, :, :1], np.nan)
     links = np.concatenate([ends, gaps], axis=2)
+    links[~np.stack([run.linked(t) for t in times])] = np.nan
     text = "graph" if len(times) < 3 else f"graph, every {times[1] - times[0]:.3g} s"
     crowd = draw.crowding(run.agents)
     look = {"linewidth": 0.9 * crowd**0.18, "rasterized": run.agents > 100, "zorder": 3}
+    look |= {"alpha": min(1.0, (_DENSE / len(run.edges)) ** 0.5)}
     for k, shade in enumerate(np.linspace(0.65, float(draw.EDGE), len(times))):
         name = text if k == len(times) - 1 else None
         draw.plot(ax, _flatten(links[k]), label=name, color=str(shade), **look)
@@ -107,11 +112,11 @@ def _flatten(points: Array) -> Array:
     return points.reshape(-1, points.shape[-1])
 
 
-def _colours(run: Recording) -> dict[str, list[int]]:
-    """Return the agents of each colour."""
+def _colours(run: Recording, shown: list[int]) -> dict[str, list[int]]:
+    """Return the places in a list of the agents of each colour."""
     groups: dict[str, list[int]] = {}
-    for agent in range(run.agents):
-        groups.setdefault(pen_of(run, agent)["color"], []).append(agent)
+    for place, agent in enumerate(shown):
+        groups.setdefault(pen_of(run, agent)["color"], []).append(place)
     return groups
 
 

@@ -8,6 +8,7 @@ from echelon.core.errors import OutputError, did_you_mean, listing
 from echelon.engine.result import Result
 from echelon.plots import curves, network, paths
 from echelon.plots import style as draw
+from echelon.plots.files import save
 from echelon.results.dataset import dataset
 from echelon.results.recording import Recording, recording
 
@@ -87,4 +88,4 @@ def save_figures(
         OSError: the folder or a file cannot be written.
         OutputError: there is no figure of a name.
     """
-    return draw.save(figures(run, what), Path(folder) / "figures")
+    return save(figures(run, what), Path(folder) / "figures")

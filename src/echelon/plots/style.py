@@ -1,15 +1,13 @@
 """How figures look, and the canvases and lines that they share: no pyplot, so no shared state."""
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from echelon.core.files import make_whole
 from echelon.core.types import Array
 
 if TYPE_CHECKING:
@@ -174,7 +172,12 @@ def drop_runaways(values: Array, *anchors: Array) -> tuple[Array, bool]:
 def label(name: str, unit: str) -> str:
     """Return the text of an axis: the name, with the unit where there is one."""
     name = name.replace("_", " ")
-    return f"{name} ({unit})" if unit else name
+    return f"{name} ({raised(unit)})" if unit else name
+
+
+def raised(unit: str) -> str:
+    """Return a unit with its powers as print has them, m/s\u00b2 for m/s^2."""
+    return unit.replace("^2", "\u00b2").replace("^3", "\u00b3")
 
 
 def panels(times: Array, horizon: float, rows: int, height: float) -> "tuple[Figure, list[Any]]":
@@ -228,7 +231,7 @@ def frame(ax: Any, points: Array, alike: bool = True) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     size = high - low
     # A flat path still needs a box with some height; a lone point one of any size.
-    least = np.full_like(size, 0.25 * size.max()) if alike else 1e-3 * np.abs(high)
+    least = np.full_like(size, 0.25 * size.max()) if alike else 0.05 * np.abs(high)
     half = 0.54 * np.maximum(size, np.where(least > 0.0, least, 1.0))
     for name, middle, reach in zip("xyz", 0.5 * low + 0.5 * high, half, strict=False):
         getattr(ax, f"set_{name}lim")(middle - reach, middle + reach)
@@ -314,32 +317,6 @@ def logarithmic(ax: Any, *values: Array) -> None:
     ax.yaxis.set_minor_locator(NullLocator())
 
 
-def save(
-    figures: "Mapping[str, Figure]",
-    folder: Path,
-    kinds: Sequence[str] = ("png", "pdf"),
-    dpi: int = 150,
-) -> list[Path]:
-    """Write each figure as PNG and PDF into a folder, made if need be; return the paths.
-
-    Raises:
-        OSError: the folder or a file cannot be written.
-    """
-    paths = []
-    folder.mkdir(parents=True, exist_ok=True)
-    # Without its date, the same run writes the same file.
-    dates: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    for name, figure in figures.items():
-        for kind in kinds:
-            path, told = folder / f"{name}.{kind}", dates.get(kind)
-            with style():
-                make_whole(
-                    path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=told)
-                )
-            paths.append(path)
-    return paths
-
-
 def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any = None) -> "Figure":
     """Add legends, only the first where `once`, or one at `corner`, and what is left out.
 
@@ -352,6 +329,8 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any 
     if cut:
         text = "The run grew beyond these axes; what lies farther is not drawn."
         figure.suptitle(text, size=page().letters - 1.0, wrap=True)
+    for ax in figure.axes:
+        _tell_power(ax)
     engine: Any = figure.get_layout_engine()
     if engine is not None:
         figure.align_ylabels()
@@ -361,6 +340,23 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any 
             engine.execute(figure)
         figure.set_layout_engine("none")
     return figure
+
+
+def _tell_power(ax: Any) -> None:
+    """Put the power of ten of a value axis into its label, since above it stands the legend."""
+    from matplotlib.ticker import ScalarFormatter
+
+    told = ax.yaxis.get_major_formatter()
+    if ax.name == "3d" or not isinstance(told, ScalarFormatter):
+        return
+    told.set_useOffset(False)
+    told.set_locs(ax.get_yticks())
+    offset = told.get_offset().replace("\u2212", "-")
+    if offset:
+        ax.yaxis.get_offset_text().set_visible(False)
+        name, _, unit = ax.get_ylabel().partition(" (")
+        power = f"$10^{{{int(offset.removeprefix('1e'))}}}$"
+        ax.set_ylabel(f"{name} ({power} {unit}" if unit else f"{name} ({power})")
 
 
 def _add_legend(figure: "Figure", ax: Any) -> None:

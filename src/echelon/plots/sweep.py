@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.plots import style as draw
+from echelon.plots.files import save
 from echelon.sweeps.axes import SEED
 from echelon.sweeps.dataset import share_bounds, succeeded
 
@@ -44,7 +45,7 @@ def save_sweep_figures(data: "xr.Dataset", folder: Path) -> None:
     Raises:
         OSError: the folder or a file cannot be written.
     """
-    draw.save(sweep_figures(data), folder / "figures")
+    save(sweep_figures(data), folder / "figures")
 
 
 def _is_line(data: "xr.Dataset", key: str) -> bool:

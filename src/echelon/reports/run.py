@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, TypeVar
 from echelon.engine.result import Result
 from echelon.reports.explain import explain
 from echelon.reports.printed import PRINTED, ROUNDING, is_papers_experiment
-from echelon.results.metrics import FollowerMetrics, LeaderMetrics, Metrics, metrics
+from echelon.results.metrics import (
+    FollowerMetrics,
+    LeaderMetrics,
+    Metrics,
+    metrics,
+    representatives,
+    steady_error,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -101,19 +108,10 @@ def _labelled(
     """Yield all of a role, or of many the best, the median and the worst, each with its label."""
     kinds, chosen = [""] * len(each), each
     if len(each) > _MANY:
-        kinds, chosen = ["best ", "median ", "worst "], _representatives(each)
+        kinds, chosen = ["best ", "median ", "worst "], representatives(each, steady_error)
     names = labels or [f"{role} {one.agent}" for one in chosen]
     for kind, name, one in zip(kinds, names, chosen, strict=True):
         yield (f"{kind}({name})" if kind else name), one
-
-
-def _representatives(all_: Sequence[_Row]) -> list[_Row]:
-    def key(each: _Row) -> float:
-        # Whoever has no steady error has not come so far, and stands with the worst.
-        return float("inf") if each.steady_rmse is None else each.steady_rmse
-
-    ordered = sorted(all_, key=key)
-    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
 
 
 def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:

@@ -4,8 +4,9 @@ The dataset is one netCDF file, the summary is JSON.
 """
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -13,12 +14,24 @@ from echelon.core.files import write_whole
 from echelon.engine.result import Result
 from echelon.models.model import ControlAffine
 from echelon.promises.promise import promise
+from echelon.results.foreseen import heard_in
 from echelon.results.lyapunov import lyapunov
-from echelon.results.metrics import Metrics, metrics, output_errors
+from echelon.results.metrics import (
+    EdgeMetrics,
+    Metrics,
+    metrics,
+    output_errors,
+    representatives,
+    steady_error,
+)
 from echelon.results.recording import FORMAT
 
 if TYPE_CHECKING:
     import xarray as xr
+
+_LISTED = 5_000
+"""Rows of a list in the summary. The dataset has what all of them are made of."""
+_Row = TypeVar("_Row")
 
 
 def dataset(result: Result) -> "xr.Dataset":
@@ -27,8 +40,10 @@ def dataset(result: Result) -> "xr.Dataset":
     Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
     `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
     references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
-    `edge_weight`, the gain's `P`, `R` and `coupling`, the poles of the modes looked at
-    (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, of which a directed graph may have
+    `edge_weight`, `edge_heard` (whether each end of an edge hears the other), of a graph that
+    switches `edge_weight_then` from each `stretch_start` on with its `graph_period` (infinite
+    where nothing is repeated), the gain's `P`, `R` and `coupling`, the poles of the modes looked
+    at (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, of which a directed graph may have
     an imaginary part in `mode_eigenvalue_imaginary`), and where inputs u are limited
     `limit_low` <= `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format`
     the number of this list.
@@ -47,8 +62,7 @@ def dataset(result: Result) -> "xr.Dataset":
             np.isin(np.arange(result.graph.agents), result.graph.leaders).astype(np.int8),
         ),
         "nearest_leader": ("agent", np.array(result.graph.nearest_leader())),
-        "edge_agents": (("edge", "end"), result.graph.edges),
-        "edge_weight": ("edge", result.graph.weights),
+        **_edges(result),
     }
     v = lyapunov(result)
     if v is not None:
@@ -66,6 +80,22 @@ def dataset(result: Result) -> "xr.Dataset":
         "output_unit": ("output", _output_units(model)),
     }
     return xr.Dataset(variables, coordinates, _attributes(result))
+
+
+def _edges(result: Result) -> dict[str, Any]:
+    """Return the graph: its edges, who hears along them, and when they are there."""
+    graph, schedule = result.graph, result.graph.schedule
+    told: dict[str, Any] = {
+        "edge_agents": (("edge", "end"), graph.edges),
+        "edge_weight": ("edge", graph.weights),
+        "edge_heard": (("edge", "end"), heard_in(result.parts).astype(np.int8)),
+    }
+    if schedule is not None:
+        told["stretch_start"] = ("stretch", schedule.starts, {"units": "s"})
+        told["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
+        period = np.inf if schedule.period is None else schedule.period
+        told["graph_period"] = ((), period, {"units": "s"})
+    return told
 
 
 def _output_units(model: ControlAffine) -> list[str]:
@@ -180,9 +210,12 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
         **result.world.describe(result.model),
         "leader": numbers.leader._asdict(),
         "leaders": [each._asdict() for each in numbers.leaders],
-        "followers": [_follower(each._asdict()) for each in numbers.followers],
+        "followers": [
+            _follower(each._asdict()) for each in _listed(numbers.followers, steady_error)
+        ],
         "edges": [
-            {"edge": list(each.edge), "distance_rmse": each.distance_rmse} for each in numbers.edges
+            {"edge": list(each.edge), "distance_rmse": each.distance_rmse}
+            for each in _listed(numbers.edges, _distance_error)
         ],
         "gain": None
         if gain is None
@@ -206,6 +239,15 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
             key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
         },
     }
+
+
+def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:
+    """Return all rows; of more than a person's tools read, the best, the median and the worst."""
+    return rows if len(rows) <= _LISTED else representatives(rows, error)
+
+
+def _distance_error(edge: EdgeMetrics) -> float:
+    return np.inf if edge.distance_rmse is None else edge.distance_rmse
 
 
 def _follower(entry: dict[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from echelon.core.types import Array
 from echelon.engine.parts import Parts
 from echelon.engine.record import Stretch
 from echelon.engine.settings import Settings
+from echelon.network.hearing import heard_along
 from echelon.results.recording import Bounds, Recording
 
 _AHEAD, _PLACES = 60.0, 121
@@ -52,7 +53,8 @@ def foreseen(
         nearest=np.array(graph.nearest_leader()),
         edges=graph.edges,
         weights=graph.weights,
-        mutual=parts.drive.reacts or "neighbours' states" in parts.drive.information.leader,
+        heard=heard_in(parts),
+        schedule=graph.schedule,
         state_names=model.state_names,
         state_units=model.state_units,
         input_names=model.input_names,
@@ -70,6 +72,15 @@ def foreseen(
         dt=settings.dt,
         attributes={"outcome": "completed", "message": "", "directed": int(graph.directed)},
     )
+
+
+def heard_in(parts: Parts) -> Array:
+    """Return whether each end of each edge hears the other under what drives the agents, (E, 2)."""
+    drive = parts.drive
+    reacts = drive.reacts or "neighbours' states" in drive.information.leader
+    # A drive without laws, such as plans, asks for all neighbours.
+    leaderward = getattr(getattr(drive, "follower", None), "leaderward", False)
+    return heard_along(parts.graph, leaderward, reacts)
 
 
 def _ahead(parts: Parts, start: Array, times: Array) -> Array:

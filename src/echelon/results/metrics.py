@@ -1,6 +1,7 @@
 """The numbers of a run: the errors of the paper's Table II, and what else an engineer asks for."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -78,6 +79,21 @@ class Metrics(NamedTuple):
         """The largest steady error of a follower."""
         values = [f.steady_rmse for f in self.followers if f.steady_rmse is not None]
         return max(values) if values else None
+
+
+_Row = TypeVar("_Row")
+
+
+def representatives(rows: Sequence[_Row], error: Callable[[_Row], float]) -> list[_Row]:
+    """Return the best, the median and the worst of some rows, which have errors."""
+    ordered = sorted(rows, key=error)
+    return [ordered[0], ordered[len(ordered) // 2], ordered[-1]]
+
+
+def steady_error(row: LeaderMetrics | FollowerMetrics) -> float:
+    """Return the steady error of an agent."""
+    # Whoever has none has not come so far, and stands with the worst.
+    return np.inf if row.steady_rmse is None else row.steady_rmse
 
 
 def metrics(result: Result) -> Metrics:

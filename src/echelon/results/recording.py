@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 import numpy as np
 
 from echelon.core.errors import OutputError
+from echelon.network.switching import Schedule
 
 if TYPE_CHECKING:
     import xarray as xr
 
-FORMAT = 2
+FORMAT = 3
 """Of `run.nc`; another one lacks what is read here."""
 
 
@@ -60,8 +61,9 @@ class Recording:
         offsets: (N, n).
         leaders: their numbers.
         nearest: (N,), each agent's nearest leader.
-        edges: (E, 2), with `weights` (E,).
-        mutual: whether leaders hear their followers too.
+        edges: (E, 2), with `weights` (E,); of a graph that switches, all that are there at times.
+        heard: (E, 2), whether each end of an edge hears the other.
+        schedule: when which weights hold; None where they never change.
         state_names, state_units, input_names, input_units: as texts.
         position: indices of the coordinates that a picture shows; none of an abstract agent.
         bounds: of the inputs; None where nothing limits them.
@@ -88,7 +90,8 @@ class Recording:
     nearest: np.ndarray
     edges: np.ndarray
     weights: np.ndarray
-    mutual: bool
+    heard: np.ndarray
+    schedule: Schedule | None
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -111,10 +114,17 @@ class Recording:
         """How many there are."""
         return self.states.shape[1]
 
-    @property
-    def directed(self) -> bool:
-        """Whether edges are arrows: of (i, j) j hears i."""
-        return bool(self.attributes.get("directed", 0))
+    @functools.cached_property
+    def arrows(self) -> np.ndarray:
+        """Edges (K, 2) along which only the second hears the first, turned so where need be."""
+        one = self.heard.sum(axis=1) == 1
+        return np.where(self.heard[one, 1:], self.edges[one], self.edges[one, ::-1])
+
+    def linked(self, time: float) -> np.ndarray:
+        """Return which edges are there at a time (s), (E,)."""
+        if self.schedule is None:
+            return np.ones(len(self.edges), bool)
+        return self.schedule.weights[self.schedule.row(time)] > 0.0
 
     @functools.cached_property
     def followers(self) -> tuple[int, ...]:
@@ -219,7 +229,8 @@ def recording(data: "xr.Dataset") -> Recording:
         nearest=values["nearest_leader"].astype(int),
         edges=values["edge_agents"].astype(int),
         weights=values["edge_weight"],
-        mutual="neighbours' states" in str(told["leader_needs"]),
+        heard=values["edge_heard"].astype(bool),
+        schedule=_schedule(values),
         state_names=names,
         state_units=_texts(data, "state_unit"),
         input_names=_texts(data, "input"),
@@ -253,6 +264,14 @@ def _check_format(data: "xr.Dataset") -> None:
 
 def _texts(data: "xr.Dataset", name: str) -> tuple[str, ...]:
     return tuple(str(text) for text in data[name].values)
+
+
+def _schedule(values: Mapping[str, np.ndarray]) -> Schedule | None:
+    if "stretch_start" not in values:
+        return None
+    period = float(values["graph_period"])
+    weights = values["edge_weight_then"]
+    return Schedule(values["stretch_start"], weights, period if np.isfinite(period) else None)
 
 
 def _bounds(values: Mapping[str, np.ndarray]) -> Bounds | None:

@@ -375,6 +375,8 @@ class LiveSpec(BaseModel, **STRICT):
     """The followers' law from then on; its agents remember nothing of the one before."""
     coupling: Annotated[Positive | None, Unit("1")] = None
     """The coupling from then on."""
+    weight: Annotated[Positive | None, Unit("1")] = None
+    """Weight of the inputs in the Riccati equation of the gain, times that of the scenario."""
     feedforward: Annotated[Annotated[float, Field(ge=0.0, le=1.0)] | None, Unit("1")] = None
     """1 where followers are sent what `follower.feedforward` says, 0 where nothing."""
     method: str | None = None

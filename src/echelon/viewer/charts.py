@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from echelon.core.types import Array
+from echelon.plots import style as draw
 from echelon.plots.style import FLOOR
 from echelon.results.metrics import SETTLED
 from echelon.results.recording import Recording
@@ -31,7 +32,12 @@ class _Sheet:
         self.columns: list[Array] = []
 
     def line(
-        self, name: str | None, values: Array, colour: int | str, log: bool, floor: float = FLOOR
+        self,
+        name: str | None,
+        values: Array,
+        colour: int | str,
+        log: bool,
+        floor: float = FLOOR,
     ) -> dict[str, Any]:
         shown = np.asarray(values, np.float64)[self.keep]
         if log:
@@ -115,12 +121,14 @@ def _inputs(run: Recording, sheet: _Sheet) -> dict[str, Any]:
         sheet.line(_named(run, k, len(units) > 1), sizes[:, k], place, False)
         for place, k in enumerate(range(min(NAMED, sizes.shape[1])))
     ]
-    return _chart("largest |input|", units.pop() if len(units) == 1 else "", False, lines, [])
+    return _chart(
+        "largest |input|", draw.raised(units.pop()) if len(units) == 1 else "", False, lines, []
+    )
 
 
 def _named(run: Recording, k: int, mixed: bool) -> str:
     name, unit = run.input_names[k].replace("_", " "), run.input_units[k]
-    return f"{name} ({unit})" if mixed and unit else name
+    return draw.label(name, unit) if mixed else name
 
 
 def _chart(

@@ -8,6 +8,7 @@ import numpy as np
 from echelon.core.errors import OutputError
 from echelon.core.types import Array
 from echelon.plots.space import Space, body_width, clipped_places, space_of
+from echelon.plots.style import raised
 from echelon.results.recording import Recording
 from echelon.viewer.charts import charts_of
 from echelon.viewer.pack import BYTE, COARSE, Group, pack
@@ -117,12 +118,13 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "leaders": list(run.leaders),
         "nearest": run.nearest.tolist(),
         "edges": run.edges.tolist(),
-        "mutual": run.mutual,
+        "heard": heard_by(run.heard),
+        "schedule": _schedule(run),
         "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
         "space": {
             "kind": space.kind,
             "names": list(space.names),
-            "units": list(space.units),
+            "units": [raised(unit) for unit in space.units],
             "stretch": list(space.stretch),
         },
         "box": {"low": space.low.tolist(), "high": space.high.tolist()},
@@ -132,6 +134,20 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "thrust": False,
         "duration": float(run.times[-1]) if len(run.times) else run.horizon,
     }
+
+
+def heard_by(heard: Array) -> list[int]:
+    """Return who hears along each edge: 1 its second end, 2 its first, 3 both, 0 nobody."""
+    return (heard @ (2, 1)).tolist()
+
+
+def _schedule(run: Recording) -> dict[str, Any] | None:
+    """Return when which edges are there, each stretch as a text of 1 and 0."""
+    if run.schedule is None:
+        return None
+    starts, weights, period = run.schedule
+    rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
+    return {"starts": starts.tolist(), "rows": rows, "period": period}
 
 
 def facts(run: Recording) -> list[str]:

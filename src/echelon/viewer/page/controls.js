@@ -9,6 +9,11 @@ function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// Words of which those between back-ticks are code.
+function prose(words) {
+  return words.split("`").map((part, k) => (k % 2 ? make("code", {}, part) : part));
+}
+
 const ICONS = { play: "M3 1.5l11 6.5-11 6.5z", pause: "M3 1.5h3.5v13H3zM9.5 1.5H13v13H9.5z" };
 
 function icon(name) {
@@ -23,19 +28,19 @@ function tellPromise({ state, short, whole }) {
   badge.classList.remove("holds", "edge", "lost", "asking");
   badge.classList.add(state);
   badge.querySelector("b").textContent = short;
-  badge.querySelector(".whole").textContent = whole;
+  badge.querySelector(".whole").replaceChildren(...prose(whole));
 }
 
 function dress(run) {
   $("h1").textContent = run.title;
   $(".facts").textContent = run.facts.join(" \u00b7 ");
-  $(".notes").textContent = run.notes.join(" ");
+  $(".notes").replaceChildren(...prose(run.notes.join(" ")));
   if (run.promise) tellPromise(run.promise);
   else $(".promise").hidden = true;
   const key = $(".key"), say = (look, words) => key.append(make("span", {}, look, words));
   if (run.thrust) say(make("i"), ""), key.lastChild.append("motor thrust 0", make("i", { class: "thrust" }), "limit");
   if (run.agents > run.leaders.length) say(make("i", { class: "ring" }), "goal");
-  if (!run.mutual && run.agents <= 60) say(make("i", { class: "one" }), "from who is heard to who hears");
+  if (run.heard.some((who) => who === 1 || who === 2)) say(make("i", { class: run.agents > 200 ? "taper" : "arrow" }), "from who is heard to who hears");
   key.append(make("span", {}, run.drawn));
 }
 
@@ -122,8 +127,8 @@ class ViewControls {
     if (selected < 0) return;
     const leads = run.leaders.includes(selected), p = moment.position, g = moment.goal, at = 3 * selected;
     const away = Math.hypot(...[0, 1, 2].map((k) => (p[at + k] - g[at + k]) / [...run.space.stretch, 1][k]));
-    const others = run.edges.flatMap(([i, j], k) => (!this.view.alive[k] ? [] : i === selected ? [j] : j === selected ? [i] : []));
-    const hears = leads && !run.mutual ? "hears nobody" : others.length ? `hears ${others.slice(0, 8).join(", ")}${others.length > 8 ? " \u2026" : ""}` : "hears nobody";
+    const others = this.view.heardBy(selected);
+    const hears = others.length ? `hears ${others.slice(0, 8).join(", ")}${others.length > 8 ? " \u2026" : ""}` : "hears nobody";
     const place = run.space.kind === "time" ? [p[at + 1] / run.space.stretch[1]] : [0, 1, 2].slice(0, run.space.names.length).map((k) => p[at + k] / [...run.space.stretch, 1][k]);
     const unit = run.space.units[run.space.kind === "time" ? 1 : 0];
     card.replaceChildren(make("b", {}, `${leads ? "leader" : "follower"} ${selected}`), make("span", {}, `at ${place.map((v) => v.toFixed(2)).join(", ")} ${unit}`), make("br"));

@@ -34,7 +34,7 @@ class Live {
     this.view = new View($("#scene"), run);
     this.makeCharts();
     this.views = new ViewControls(this.view, () => this.charts, () => this.show());
-    this.views.onlink = (edge) => this.ask(this.view.alive[edge] ? "cut" : "restore", run.edges[edge]);
+    this.views.onlink = (edge) => this.ask(this.view.cut[edge] ? "restore" : "cut", run.edges[edge]);
     this.makeKnobs(run.knobs, run.choices);
     this.makeFooter();
     this.chosenAgent = run.agents > 1 ? [...Array(run.agents).keys()].find((i) => !run.leaders.includes(i)) : 0;
@@ -60,7 +60,7 @@ class Live {
 
   fill(time, numbers) {
     const { run, moment } = this, { agents, axes, turns, loads } = run;
-    const before = moment.position.slice(), [worst, median, most, least, lyapunov, factor, wind] = numbers;
+    const [worst, median, most, least, lyapunov, factor, wind] = numbers;
     let at = 7;
     at = this.places(numbers, at, axes, moment.position, time);
     at = this.places(numbers, at, axes, moment.goal, time);
@@ -68,8 +68,8 @@ class Live {
       if (turns === 3) moment.setAngles(i, numbers[at], numbers[at + 1], numbers[at + 2]);
       else if (turns) moment.setAngles(i, 0, 0, numbers[at]);
     for (let i = 0; i < agents; i++, at += loads) for (let k = 0; k < loads; k++) moment.motors[4 * i + k] = numbers[at + k];
-    if (this.pictures++ && time > moment.time) this.view.trail.push(before, moment.position, time);
-    else this.view.trail.forget();
+    if (this.pictures++ && time < moment.time) this.view.trail.forget();
+    this.view.trail.push(moment.position, time);
     moment.time = time;
     this.numbers = { worst, median, lyapunov, factor, wind };
     // A logarithm has no 0, and below rounding there is nothing to see.
@@ -81,12 +81,12 @@ class Live {
   }
 
   places(numbers, at, axes, out, time) {
-    const { space, agents } = this.run, [sx, sy] = space.stretch;
+    const { space, agents } = this.run, [sx, sy] = space.stretch, stretch = [sx, sy, 1];
     for (let i = 0; i < agents; i++, at += axes) {
       if (space.kind === "time") {
         out[3 * i] = sx * (time % this.run.duration);
         out[3 * i + 1] = sy * numbers[at];
-      } else for (let k = 0; k < axes; k++) out[3 * i + k] = numbers[at + k] * [sx, sy, 1][k];
+      } else for (let k = 0; k < axes; k++) out[3 * i + k] = numbers[at + k] * stretch[k];
     }
     return at;
   }
@@ -115,7 +115,7 @@ class Live {
     if (told.note !== undefined) this.note = told.note;
     if (told.causes) this.causes = told.causes;
     if (told.reset) (this.view.trail.forget(), (this.causes = []));
-    if (told.panel) this.makeKnobs(told.panel, told.choices);
+    if (told.panel) (this.makeKnobs(told.panel, told.choices), this.view.setHeard(told.heard));
     if (told.knobs) this.stand(told);
     this.tellNotes();
   }
@@ -129,13 +129,14 @@ class Live {
   }
 
   tellNotes() {
-    $(".notes").replaceChildren(...[this.note, ...(this.causes ?? []).slice(0, 3)].filter(Boolean).map((words) => make("p", {}, words)));
+    $(".notes").replaceChildren(...[this.note, ...(this.causes ?? []).slice(0, 3)].filter(Boolean).map((words) => make("p", {}, ...prose(words))));
   }
 
   stand(told) {
     for (const [name, value] of Object.entries({ ...told.knobs, ...told.chosen })) this.knobs[name]?.set(value);
     const cut = new Set(told.cut.map(([i, j]) => `${i} ${j}`));
-    this.run.edges.forEach(([i, j], edge) => this.view.setLink(edge, !cut.has(`${i} ${j}`)));
+    this.run.edges.forEach(([i, j], edge) => this.view.cutLink(edge, cut.has(`${i} ${j}`)));
+    this.stood = told;
     this.chosen = told.chosen;
     this.paused = told.paused;
     this.pauseButton.replaceChildren(icon(this.paused ? "play" : "pause"));
@@ -147,13 +148,22 @@ class Live {
     try {
       const answer = await fetch("/knob", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name, value }) });
       const told = await answer.json();
-      if (told.fault) (this.note = told.fault), this.tellNotes();
+      if (told.fault) this.refuse(told.fault);
       return told;
     } catch {
       this.note = "The server has ended.";
       this.tellNotes();
       return {};
     }
+  }
+
+  // What was refused is said for a while, and knobs go back to where they stand.
+  refuse(words) {
+    this.note = words;
+    this.tellNotes();
+    setTimeout(() => this.note === words && ((this.note = ""), this.tellNotes()), 12000);
+    for (const knob of Object.values(this.knobs)) knob.held = -1e9;
+    if (this.stood) this.stand(this.stood);
   }
 
   // Knobs and choices of the law that runs.

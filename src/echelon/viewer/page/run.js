@@ -41,7 +41,8 @@ class Moment {
 
   // Angles about x, y and z, the last one applied first (ZYX), as a quaternion.
   setAngles(i, roll, pitch, yaw) {
-    const [cr, sr, cp, sp, cy, sy] = [roll, pitch, yaw].flatMap((a) => [Math.cos(a / 2), Math.sin(a / 2)]);
+    const cr = Math.cos(roll / 2), cp = Math.cos(pitch / 2), cy = Math.cos(yaw / 2);
+    const sr = Math.sin(roll / 2), sp = Math.sin(pitch / 2), sy = Math.sin(yaw / 2);
     const q = this.turn, at = 4 * i;
     q[at] = sr * cp * cy - cr * sp * sy;
     q[at + 1] = cr * sp * cy + sr * cp * sy;

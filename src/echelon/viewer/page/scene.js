@@ -65,6 +65,7 @@ class View {
       pixels: value(1.6),
       floor_: value(this.run.box.low[2]),
       links: value(shares(this.run).links),
+      tapered: value(this.run.agents > 200 ? 1 : 0),
       goals: value(1),
       trails: value(shares(this.run).trails),
       now: value(0),
@@ -95,21 +96,40 @@ class View {
   }
 
   makeLinks(lines) {
-    const { run } = this, leads = new Set(run.leaders), few = run.agents <= 60;
-    // From who speaks alone to who hears; between two that hear each other the order is nothing.
-    const ends = run.edges.map(([i, j]) => (!run.mutual && leads.has(j) && !leads.has(i) ? [j, i] : [i, j]));
-    const kinds = ends.map(([i, j]) => (!run.mutual && leads.has(i) && !leads.has(j) ? 1 : 0));
+    this.links = this.add(this.linkGeometry(), this.material(LINK, lines), 1);
+    this.cut = this.run.edges.map(() => false);
+    this.alive = this.run.edges.map(() => true);
+  }
+
+  // Ribbons of all edges, then heads of those that are heard one way, then lines to goals and floor.
+  linkGeometry() {
+    const { run } = this, few = run.agents <= 60;
+    // From who speaks to who hears; between two that hear each other the order is nothing.
+    const ends = run.edges.map(([i, j], edge) => (run.heard[edge] === 2 ? [j, i] : [i, j]));
+    const kinds = run.heard.map((who) => (who === 3 ? 0 : who ? 1 : 2));
+    this.heads = new Map();
+    // In a flock thick and thin ends say the same at no cost.
+    if (run.agents <= 200) run.heard.forEach((who, edge) => {
+      if (who === 1 || who === 2) (this.heads.set(edge, ends.length), ends.push(ends[edge]), kinds.push(3));
+    });
     if (few) for (let i = 0; i < run.agents; i++) {
-      if (run.nearest[i] !== i) (ends.push([i, i]), kinds.push(2));
-      if (!this.flat) (ends.push([i, i]), kinds.push(3));
+      if (run.nearest[i] !== i) (ends.push([i, i]), kinds.push(4));
+      if (!this.flat) (ends.push([i, i]), kinds.push(5));
     }
-    const geometry = ribbons(ends.length, {
+    return ribbons(ends.length, {
       ends: [2, (r) => ends[r]],
       kind: [1, (r) => [kinds[r]]],
       alive: [1, () => [1]],
     });
-    this.links = this.add(geometry, this.material(LINK, lines), 1);
-    this.alive = run.edges.map(() => true);
+  }
+
+  // Another law may hear others.
+  setHeard(heard) {
+    this.run.heard = heard;
+    this.links.geometry.dispose();
+    this.links.geometry = this.linkGeometry();
+    this.run.edges.forEach((_, edge) => this.markLink(edge));
+    this.draw();
   }
 
   makeTrails(lines) {
@@ -118,13 +138,37 @@ class View {
     this.shared.window.value = this.trail.seconds;
   }
 
-  setLink(edge, alive) {
-    if (this.alive[edge] === alive) return;
-    this.alive[edge] = alive;
-    const part = this.links.geometry.getAttribute("alive");
-    part.array.fill(alive ? 1 : 0, 4 * edge, 4 * edge + 4);
-    part.needsUpdate = true;
+  cutLink(edge, cut) {
+    if (this.cut[edge] === cut) return;
+    this.cut[edge] = cut;
+    this.markLink(edge);
     this.draw();
+  }
+
+  // Let a link be seen as it is: there, cut, or not there now.
+  markLink(edge) {
+    const there = !this.row || this.row[edge] === "1", part = this.links.geometry.getAttribute("alive");
+    this.alive[edge] = there && !this.cut[edge];
+    for (const at of [edge, this.heads.get(edge)])
+      if (at !== undefined) part.array.fill(this.cut[edge] ? 0 : there ? 1 : -1, 4 * at, 4 * at + 4);
+    part.needsUpdate = true;
+  }
+
+  // A graph that switches has the links of a time alone.
+  switchLinks(time) {
+    const { schedule, edges } = this.run;
+    if (!schedule) return;
+    const { starts, rows, period } = schedule;
+    const row = rows[Math.max(0, upper(starts, period ? (time + 1e-9) % period : time) - 1)];
+    if (row === this.row) return;
+    this.row = row;
+    edges.forEach((_, edge) => this.markLink(edge));
+  }
+
+  // Whom an agent hears now.
+  heardBy(agent) {
+    const { edges, heard } = this.run;
+    return edges.flatMap(([i, j], k) => (!this.alive[k] ? [] : j === agent && heard[k] & 1 ? [i] : i === agent && heard[k] & 2 ? [j] : []));
   }
 
   // ---- camera ----
@@ -257,6 +301,7 @@ class View {
       whose.array.fill(this.selected);
       whose.needsUpdate = true;
     }
+    this.switchLinks(moment.time);
     this.shared.now.value = moment.time;
     this.trail.window(this.trailMesh.geometry, moment.time);
     this.moment = moment;
@@ -317,6 +362,7 @@ class View {
   linkAt(x, y) {
     let found = -1, least = 9;
     this.run.edges.forEach(([i, j], edge) => {
+      if (!this.alive[edge] && !this.cut[edge]) return;
       const [a, b] = [this.projectAgent(i), this.projectAgent(j)];
       if (!a || !b) return;
       const [u, v] = [b[0] - a[0], b[1] - a[1]], length = u * u + v * v || 1;

@@ -73,28 +73,50 @@ vec4 ribbon(vec3 first, vec3 second, vec2 corner, float wide) {
   return end;
 }`;
 
-// Between agents (links), from an agent to its goal, and down to the floor.
+// A head of an arrow on the way to an agent, whose tip stays off its body: a triangle in pixels.
+const HEAD = `
+vec4 head(vec3 first, vec3 second, vec2 corner, float body) {
+  vec4 a = projectionMatrix * modelViewMatrix * vec4(first, 1.0);
+  vec4 b = projectionMatrix * modelViewMatrix * vec4(second, 1.0);
+  if (a.w < 0.01 || b.w < 0.01) return vec4(2.0, 2.0, 2.0, 1.0);
+  vec3 from = a.xyz / a.w, to = b.xyz / b.w;
+  vec2 way = (to.xy - from.xy) * size * 0.5;
+  float whole = length(way), tall = min(14.0, 0.4 * whole);
+  if (whole < 4.0) return vec4(2.0, 2.0, 2.0, 1.0);
+  float gap = min(body * projectionMatrix[1][1] * size.y * 0.5 / b.w, 0.5 * whole);
+  float back = gap + (corner.x < 0.5 ? tall : 0.0);
+  vec3 at = mix(to, from, back / whole);
+  vec2 aside = vec2(-way.y, way.x) / whole * (corner.x < 0.5 ? 0.4 * tall * corner.y : 0.0);
+  return vec4(at.xy + aside / (size * 0.5), at.z, 1.0);
+}`;
+
+// kind of a link: 0 heard both ways, 1 by the second alone, 2 by nobody; 3 a head of an arrow,
+// 4 to the goal of an agent, 5 down to the floor. alive: 1 there, 0 cut, -1 not now.
 const LINK = {
-  vertexShader: `${FETCH}${RIBBON}
+  vertexShader: `${FETCH}${RIBBON}${HEAD}
 in vec2 ends, corner;
 in float kind, alive;
 out vec4 shade;
 out float along;
-uniform float floor_, links, goals;
+uniform float floor_, links, goals, tapered;
 uniform vec3 linkColour, cutColour, goalColour, shadow;
 void main() {
   vec3 first = texel(ends.x, 0).xyz, second = texel(ends.y, 0).xyz;
-  float wide = kind < 0.5 ? 1.1 : 2.4 - 1.9 * corner.x;
+  float wide = kind > 0.5 && kind < 1.5 ? mix(1.1, 2.6 - 2.2 * corner.x, tapered) : 1.1;
   bool cut = alive < 0.5;
-  shade = vec4(cut ? cutColour : linkColour, links * (cut ? 0.55 : 0.9));
+  shade = vec4(cut ? cutColour : linkColour, links * (cut ? 0.55 : kind > 1.5 && kind < 2.5 ? 0.4 : 0.9));
+  if (alive < -0.5 || (cut && kind > 2.5 && kind < 3.5)) shade.a = 0.0;
   along = cut ? corner.x : -1.0;
-  if (kind > 1.5) {
+  if (kind > 3.5) {
     vec4 goal = texel(ends.x, 4);
-    second = kind < 2.5 ? goal.xyz : vec3(first.xy, floor_);
-    wide = kind < 2.5 ? 0.9 : 0.55;
-    shade = kind < 2.5 ? vec4(goalColour, 0.75 * goals * goal.w) : vec4(shadow, 1.0);
+    second = kind < 4.5 ? goal.xyz : vec3(first.xy, floor_);
+    wide = kind < 4.5 ? 0.9 : 0.55;
+    shade = kind < 4.5 ? vec4(goalColour, 0.75 * goals * goal.w) : vec4(shadow, 1.0);
   }
-  gl_Position = shade.a > 0.0 ? ribbon(first, second, corner, wide) : vec4(2.0, 2.0, 2.0, 1.0);
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  if (shade.a <= 0.0) return;
+  if (kind > 2.5 && kind < 3.5) gl_Position = head(first, second, corner, 0.62 * texel(ends.y, 3).w);
+  else gl_Position = ribbon(first, second, corner, wide);
 }`,
   fragmentShader: `in vec4 shade; in float along; out vec4 colour;
 void main() { if (along > 0.0 && fract(along * 14.0) > 0.5) discard; colour = shade; }`,

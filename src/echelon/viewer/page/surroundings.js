@@ -7,12 +7,14 @@ class Trail {
     this.agents = run.agents;
     this.live = !run.positions;
     // A flock's are short: a thousand long ones would hide each other.
-    this.seconds = run.space.kind === "time" ? 1e9 : few ? Math.min(8, 0.4 * run.duration) : run.agents > 200 ? 1 : 3;
+    this.overTime = run.space.kind === "time";
+    this.seconds = this.overTime ? (this.live ? run.duration : 1e9) : few ? Math.min(8, 0.4 * run.duration) : run.agents > 200 ? 1 : 3;
     if (run.space.kind === "phase") this.seconds = Math.max(this.seconds, 0.3 * run.duration);
     const apart = few ? 0.02 : run.agents > 200 ? 0.2 : 0.08;
-    this.stride = this.live ? 1 : Math.max(1, Math.round(apart / run.clock.step));
+    this.stride = Math.max(1, Math.round(apart / run.clock.step));
     if (run.agents * (this.live ? 0 : run.frames / this.stride) > 4e5) this.stride = Math.ceil((run.agents * run.frames) / 4e5);
-    this.steps = this.live ? Math.ceil(this.seconds / run.clock.step) : Math.floor((run.frames - 1) / this.stride);
+    this.apart = this.stride * run.clock.step;
+    this.steps = this.live ? Math.ceil(this.seconds / this.apart) : Math.floor((run.frames - 1) / this.stride);
     this.times = [];
     this.geometry = this.live ? this.empty() : this.recorded(run);
     this.geometry.setDrawRange(0, this.live ? Infinity : 0);
@@ -37,7 +39,7 @@ class Trail {
   }
 
   empty() {
-    this.next = 0;
+    [this.next, this.last, this.before] = [0, NaN, new Float32Array(3 * this.agents)];
     return ribbons(this.steps * this.agents, {
       first: [3, () => [0, 0, 0]],
       second: [3, () => [0, 0, 0]],
@@ -46,17 +48,23 @@ class Trail {
     });
   }
 
-  // In a stream the newest segments take the place of the oldest.
-  push(before, now, time) {
+  // In a stream the newest segments take the place of the oldest, once they are long enough.
+  push(now, time) {
+    const { before } = this;
+    if (!(time < this.last + this.apart - 1e-6)) {
+      // Over time the picture begins again at its left.
+      if (time > this.last && !(this.overTime && now[0] < before[0])) this.pushSegments(before, now, time);
+      before.set(now);
+      this.last = time;
+    }
+  }
+
+  pushSegments(before, now, time) {
     const parts = ["first", "second", "when"].map((name) => this.geometry.getAttribute(name));
-    const [first, second, when] = parts, base = 4 * this.agents * (this.next++ % this.steps);
-    for (let i = 0; i < this.agents; i++)
-      for (let k = 0; k < 4; k++) {
-        const at = base + 4 * i + k;
-        first.array.set(before.subarray(3 * i, 3 * i + 3), 3 * at);
-        second.array.set(now.subarray(3 * i, 3 * i + 3), 3 * at);
-        when.array[at] = time;
-      }
+    const [first, second, when] = parts.map((part) => part.array), base = 4 * this.agents * (this.next++ % this.steps);
+    for (let i = 0; i < 3 * this.agents; i++)
+      for (let k = 0, at = 3 * base + 12 * Math.floor(i / 3) + (i % 3); k < 4; k++, at += 3) (first[at] = before[i]), (second[at] = now[i]);
+    when.fill(time, base, base + 4 * this.agents);
     for (const part of parts) (part.addUpdateRange(base * part.itemSize, 4 * this.agents * part.itemSize), (part.needsUpdate = true));
   }
 
@@ -64,6 +72,7 @@ class Trail {
     const when = this.geometry.getAttribute("when");
     when.array.fill(-1e9);
     when.needsUpdate = true;
+    this.last = NaN;
   }
 
   window(geometry, time) {
@@ -199,7 +208,8 @@ class Backdrop {
     }
     this.pen.fillStyle = themeColour("--ink");
     const at = view.project(x, y, last);
-    if (at) this.text(names[2] + (units[2] ? `, ${units[2]}` : ""), at[0], at[1] - 10, "center");
+    const name = names[2] + (units[2] ? `, ${units[2]}` : ""), half = this.pen.measureText(name).width / 2 + 4;
+    if (at) this.text(name, Math.max(half, Math.min(this.w - half, at[0])), Math.max(8, at[1] - 10), "center");
   }
 }
 
