@@ -38,6 +38,12 @@ FUNCTIONS = {
     "arccos": (jnp.arccos, np.arccos, rng.uniform(-1.0, 1.0, 4000), 3.5),
     "cbrt": (jnp.cbrt, np.cbrt, WIDE, 1.0),
     "erf": (jax.lax.erf, erf, rng.normal(size=4000), 6.0),
+    "rsqrt": (
+        jax.lax.rsqrt,
+        lambda x: 1.0 / np.sqrt(x),
+        10.0 ** rng.uniform(-30.0, 30.0, 4000),
+        2.0,
+    ),
     "sqrt": (jnp.sqrt, np.sqrt, rng.uniform(0.0, 9.0, 4000), 0.5),
     "sigmoid": (jax.nn.sigmoid, lambda x: 1.0 / (1.0 + np.exp(-x)), WIDE, 2.5),
 }
@@ -72,7 +78,21 @@ def test_the_angle_of_a_point_is_right_in_all_quarters(bits):
 
 
 @pytest.mark.parametrize(
-    "name", ["sin", "cos", "exp", "expm1", "log", "log1p", "tanh", "sinh", "arctan", "cbrt", "erf"]
+    "name",
+    [
+        "sin",
+        "cos",
+        "exp",
+        "expm1",
+        "log",
+        "log1p",
+        "tanh",
+        "sinh",
+        "arctan",
+        "cbrt",
+        "erf",
+        "rsqrt",
+    ],
 )
 def test_what_is_no_number_stays_none_and_what_is_infinite_goes_where_it_must(name):
     function, wanted, *_ = FUNCTIONS[name]
@@ -459,3 +479,13 @@ def test_a_folder_without_room_for_code_is_no_fault(tmp_path):
     columns = rng.normal(size=(3, 8))
     found = run(PROGRAMS["a loop"], columns, cache=blocked)
     np.testing.assert_allclose(found, by_jax(PROGRAMS["a loop"], columns), rtol=1e-14)
+
+
+def test_quotients_by_one_number_share_its_inverse_and_stay_whole_where_they_are_cut():
+    x = np.stack([rng.integers(1, 99, 400), rng.integers(1, 99, 400), rng.normal(size=400)])
+    found = run(lambda v: jnp.stack([v[2] / v[1] + 1.0, 2.0 * (v[0] / v[1])]), x.astype(float))
+    np.testing.assert_allclose(found, [x[2] / x[1] + 1.0, 2.0 * (x[0] / x[1])], rtol=1e-15)
+    cut = run(
+        lambda v: jnp.stack([jnp.floor(7.0 * v[1] / v[1]), v[0] / v[1] + 1.0]), x.astype(float)
+    )
+    np.testing.assert_array_equal(cut[0], 7.0)

@@ -21,7 +21,7 @@ from echelon.engine.loop import assemble, begin, control, step
 from echelon.engine.prepare import prepare
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.chains import Chains, chains_of, differentiate, flatten, look_for_chains
-from echelon.promises.arrival import _falling
+from echelon.promises.arrival import _falling, _in_turns
 from echelon.promises.promise import promise
 from echelon.promises.statement import Hypothesis
 from echelon.promises.stopping import stopping_of
@@ -163,6 +163,33 @@ def test_the_time_of_arrival_is_that_of_its_equation():
         ).y[0]
         np.testing.assert_allclose(m, exact, rtol=1e-6, atol=1e-10)
         assert (m >= exact * (1.0 - 1e-8) - 1e-12).all()
+
+
+def test_agreement_does_on_random_graphs_what_the_theorem_says():
+    # Of the equation alone, zeta' = -sigma(c z), with L and w of NumPy.
+    draw = np.random.default_rng(3)
+    for directed in (False, True) * 4:
+        n, c, s = 5, float(draw.uniform(0.3, 4.0)), float(draw.uniform(0.2, 3.0))
+        A = draw.exponential(size=(n, n)) * (draw.random((n, n)) < 0.4) * (1.0 - np.eye(n))
+        A += np.eye(n, k=-1)
+        A = A if directed else np.maximum(A, A.T)
+        led = np.eye(n)[0] + draw.exponential(size=n) * (draw.random(n) < 0.2)
+        L = np.diag(A.sum(axis=1) + led) - A
+        w, d_max = np.linalg.solve(L, np.ones(n)), L.diagonal().max()
+        assert (w > 0.0).all()
+        x = draw.uniform(-3.0, 3.0, n)
+        for _ in range(300):
+            z = L @ x
+            pull = c * z / np.sqrt(1.0 + (c * z / s) ** 2)
+            top, scaled = np.abs(x).argmax(), (np.abs(x) / w).argmax()
+            m = abs(x[scaled]) / w[scaled]
+            # Statements 2, 3 and 5, and V' of the paper's V where both ends of an edge hear.
+            assert pull[top] * np.sign(x[top]) >= 0.0
+            fall = c * m / np.sqrt(1.0 + (c * m / s) ** 2)
+            assert pull[scaled] * np.sign(x[scaled]) >= fall * (1.0 - 1e-9)
+            assert np.abs(x - pull / (c * d_max)).max() <= np.abs(x).max() * (1.0 + 1e-12)
+            assert directed or -(z @ pull) <= 0.0
+            x = x - 0.2 / (c * d_max) * pull
 
 
 # ---- flat coordinates ----------------------------------------------------------------------------
@@ -422,6 +449,35 @@ def test_integrators_are_promised_from_everywhere_and_arrive_in_time(graph, told
     assert flown <= found.tube.arrival.time + 0.02 <= 1.6 * flown
 
 
+def test_stopping_points_stay_within_what_turns_of_graphs_bound():
+    rows = [(0.0, [(0, 3)]), (0.6, [(0, 1), (1, 2), (2, 3)]), (2.6, [(0, 1), (0, 2), (2, 3)])]
+    graph, c, s, dt = ech.Graph.switching(rows), 4.0, 1.5, 1e-3
+    stops, times = np.array([0.5, 4.0, -1.0, 0.3]), 0.01 * np.arange(801)
+    found = _in_turns(stops, graph, StoppingPoint(), c, s, times)
+    Ls, x = [L.toarray() for L in graph.stretches()], stops[1:] - stops[0]
+    assert (np.diff(found.bounds, axis=1) <= 0.0).all()
+    for k in range(8000):
+        if k % 10 == 0:
+            assert (np.abs(x) <= found.bounds[:, k // 10] * (1.0 + 1e-6)).all()
+        z = c * (Ls[graph.schedule.row(k * dt)] @ x)
+        x = x - dt * z / np.sqrt(1.0 + (z / s) ** 2)
+    assert found.bounds[:, -1].max() < 0.2 < 3.0 < found.bounds[:, 60].max()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("told", [True, False])
+def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):
+    chain, star = [(0, 1), (1, 2), (2, 3)], [(0, 1), (0, 2), (2, 3)]
+    cut = [(0, 3), (3, 2)]
+    graph = ech.Graph.switching([(0.0, chain), (1.0, star if told else cut)], period=2.0)
+    parts = flight(graph, rate=3.0)
+    found = promised(parts)
+    assert found.promised and (found.tube.arrival is not None) == told
+    if told:
+        outside = np.flatnonzero((gaps(fly(parts)) >= 0.01).any(axis=1))
+        assert 0.01 * (outside[-1] + 1) <= found.tube.arrival.time + 0.02 <= 0.04 * outside[-1]
+
+
 def test_a_vehicle_is_promised_as_far_as_its_thrust_reaches():
     scenario = ech.load_scenario("paper-global")
     found = promise(*ech.build(scenario))
@@ -510,13 +566,6 @@ def test_speeds_that_are_left_out_are_what_the_thrust_bears(roots):
     assert 0.5 * most < law.speed_of(z) + lead.speed_of(z) < most or law.speed_of(z) == 2.5
     long = StoppingPoint(roots=roots, feedforward="parent")
     assert 0.9 * most < 29 * long.prepared(QUADROTOR, ech.Graph.path(30)).speed_of(z) < most
-
-
-def test_a_model_that_does_not_say_where_it_ends_is_promised_nothing():
-    model, graph = ech.models.Unicycle(), ech.Graph.path(3)
-    drive = ech.Laws(StoppingLeader(reference=CIRCLE), StoppingPoint())
-    found = promised(ech.Parts(model, graph, ech.Formation(np.zeros((3, 3))), drive))
-    assert "does not say where its flat coordinates end" in found.sentence()
 
 
 # ---- bad input -----------------------------------------------------------------------------------

@@ -88,6 +88,7 @@ class NativeStepper(Stepper):
         lines, turned = self.places.lines, unlike is not None
         made = (make or Kernels().of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
+        self._signaled = signals_of(self.loop)
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
@@ -313,7 +314,7 @@ class NativeStepper(Stepper):
 
     def _signals(self, now: Moment, offsets: Array) -> list[Array]:
         """Return what neighbours hear of all agents beside their states, (N, s), if anything."""
-        if not signals_of(self.loop):
+        if not self._signaled:
             return []
         counts = [len(self.loop.offsets), len(self.loop.leaders), len(self.loop.followers)]
         found = list[Array]()

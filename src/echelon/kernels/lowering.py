@@ -102,7 +102,6 @@ def _rules(graph: Graph) -> dict[str, Rule]:
         "ge": lambda a, b: graph.make("le", entry(b), entry(a)),
         "rem": function(elementary.remainder),
         "pow": function(elementary.power),
-        "rsqrt": lambda a: 1.0 / graph.make("sqrt", a),
         "exp2": lambda a: elementary.exp(node(graph, a) * float(np.log(2.0))),
         "clamp": lambda low, x, high: graph.make(
             "min", graph.make("max", entry(low), entry(x)), entry(high)
@@ -132,7 +131,7 @@ def _rules(graph: Graph) -> dict[str, Rule]:
 _SAME = ("abs", "sqrt", "floor", "ceil", "max", "min", "lt", "le", "eq", "ne")
 _ELEMENTARY = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
 _ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "logistic", "erf")
-_ELEMENTARY += ("cbrt", "sign")
+_ELEMENTARY += ("cbrt", "rsqrt", "sign")
 
 
 def _round(graph: Graph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:

@@ -51,12 +51,14 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "bit1": lambda x: int(x) // 2 % 2 == 1,
     "exponent": lambda x: float(np.round(np.log2(x))),
     "mantissa": lambda x: x / 2.0 ** float(np.round(np.log2(x))),
+    # Near to 1 / sqrt(a), from where Newton's steps go on.
+    "root_guess": lambda a: float(1.0 / np.sqrt(a)),
     # A truth that may also be taken to hold always (`usual.py`).
     "rare": lambda a: a,
 }
 TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "rare"}
 _COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
-_NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1"}
+_NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1", "root_guess"}
 
 
 @final

@@ -182,6 +182,16 @@ def _mantissa(w: Writer, x: str, uniform: bool) -> str:
     return w.put(f"bitcast {w._integers(uniform)} {m} to {w.kind(False, uniform)}")
 
 
+def _root_guess(w: Writer, x: str, uniform: bool) -> str:
+    """Write 1 / sqrt(x) to a thirtieth: its bits less half of those of x (Lomont, 2003)."""
+    real, whole = w.kind(False, uniform), w._integers(uniform)
+    start = 0x5FE6EB50C7B537A9 if w.bits == 64 else 0x5F375A86
+    as_bits = w.put(f"bitcast {real} {x} to {whole}")
+    half = w.put(f"lshr {whole} {as_bits}, {w.integer(1, uniform)}")
+    near = w.put(f"sub {whole} {w.integer(start, uniform)}, {half}")
+    return w.put(f"bitcast {whole} {near} to {real}")
+
+
 def _bit(place: int) -> Callable[[Writer, str, bool], str]:
     """Return what writes whether a bit of a number is set."""
 
@@ -198,6 +208,7 @@ _BITS: dict[str, Callable[[Writer, str, bool], str]] = {
     "pow2": _pow2,
     "exponent": _exponent,
     "mantissa": _mantissa,
+    "root_guess": _root_guess,
     "bit0": _bit(0),
     "bit1": _bit(1),
 }

@@ -1,7 +1,7 @@
 """What leaders and followers have in common under the law `stopping-point`."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import equinox as eqx
@@ -32,6 +32,8 @@ CHAIN_SHARE = 0.96
 """Of all links together, of a bounded output: a leader is then to start on its path there."""
 _SPREAD = 0.125
 """Roots of a rate r are r, 1.125 r, 1.25 r, ..: apart, as the certificate wants them."""
+_STILL = 1e-9
+"""Of a bounded length: what floats leave of 0."""
 _LEAST = 1e-3
 """Of the push upward at the trim: what is left of it a thousandth of a radian from the border."""
 
@@ -144,7 +146,13 @@ class FlatLaw(Law):
         return FlatLoop.of(chains, self.roots_for(needed), self.observer)
 
     def speeds_within(
-        self, model: ControlAffine, chains: Chains, most: float, share: float, links: int = 1
+        self,
+        model: ControlAffine,
+        chains: Chains,
+        most: float,
+        share: float,
+        links: int = 1,
+        slowest: Callable[[FlatBound], float] = lambda _: 0.0,
     ) -> Speed:
         """Return s as it is given, or what bounds allow of each link on the way from a leader.
 
@@ -154,23 +162,25 @@ class FlatLaw(Law):
             most: of an output.
             share: of what leads to the bound of an output.
             links: whose speeds add up.
+            slowest: what the leader's path takes a bounded length to, at least.
         """
         if self.speed is not None:
             return self.speed
         each = most if links == 1 else min(most, max(most / links, _CHAINED))
         found = dict.fromkeys(chains.outputs, each)
         for bound in model.flat_bounds or ():
-            degree = chains.degrees[chains.outputs.index(bound.output)]
-            left = _left(self.roots_for(degree - 1), bound)
+            degree = chains.degrees[chains.outputs.index(bound.outputs[0])]
+            left = _left(self.roots_for(degree - 1), bound, slowest(bound))
             cap = most if links == 1 else math.inf
-            found[bound.output] = min(cap, share * left) / links if left > 0.0 else each
+            bounded = min(cap, share * left) / links if left > 0.0 else each
+            found |= dict.fromkeys(bound.outputs, bounded)
         return tuple(found.values())
 
     def bounded(self, x: jax.Array) -> jax.Array:
         """Return sigma(x) = x / sqrt(1 + (x/s)^2): odd, increasing, of slope 1 at 0, below s."""
         # By the inverse, which is 0 where s is infinite and sigma is linear.
         inverse = 1.0 / jnp.asarray(self.speed, x.dtype)
-        return x / jnp.sqrt(1.0 + (x * inverse) ** 2)
+        return x * jax.lax.rsqrt(1.0 + (x * inverse) ** 2)
 
     # ---- what any agent does ----
 
@@ -199,23 +209,49 @@ class FlatLaw(Law):
     def refusals(self, model: ControlAffine, states: Array) -> Iterator[tuple[int, str]]:
         """Yield the starts outside of the model's flat coordinates."""
         for bound in model.flat_bounds or ():
-            yield from _outside(self.ready.chains, model, states, bound)
+            if len(bound.outputs) > 1:
+                yield from self._still(model, states, bound)
+            else:
+                yield from _outside(self.ready.chains, model, states, bound)
+
+    def _still(
+        self, model: ControlAffine, states: Array, bound: FlatBound
+    ) -> Iterator[tuple[int, str]]:
+        """Yield the rows of states (K, n) at which a bounded vector is 0, and has no direction."""
+        chains = self.ready.chains
+        places = np.array([chains.outputs.index(name) for name in bound.outputs])
+
+        def one(x: State) -> jax.Array:
+            return flatten(model, chains, x, self.begin(model, x).chain).values
+
+        found = np.asarray(jax.vmap(one)(jnp.asarray(states)))[:, bound.derivative, places]
+        names = listing(name + "'" * bound.derivative for name in bound.outputs)
+        for k in np.flatnonzero(~(np.linalg.norm(found, axis=1) > bound.above + _STILL)):
+            yield int(k), f"{names} are 0 there, and allowed is {bound.within}"
 
 
 def _moves(speed: object) -> bool:
     return isinstance(speed, int | float) and speed > 0.0
 
 
-def _left(roots: tuple[float, ...], bound: FlatBound) -> float:
-    """Return the speed at which agreement alone leads from rest to a bound; 0 where none does."""
-    if bound.derivative != 2 or len(roots) < 2 or bound.above >= 0.0:
+def waits_for_path(model: ControlAffine) -> bool:
+    """Tell whether what speeds a model bears depends on the leader's path."""
+    return any(len(bound.outputs) > 1 for bound in model.flat_bounds or ())
+
+
+def _left(roots: tuple[float, ...], bound: FlatBound, slowest: float) -> float:
+    """Return the speed of each output at which agreement alone leads to a bound; 0 for none."""
+    allowed = slowest - bound.above
+    if not allowed > 0.0 or bound.derivative > min(2, len(roots)):
         return 0.0
+    if bound.derivative == 1:
+        return allowed / math.sqrt(len(bound.outputs))
     # v' is at most the variation of h over that speed, and h rises once to its largest value.
     apart = [np.prod([b - a for b in roots if b != a]) for a in roots]
     times = np.linspace(0.0, 20.0 / min(roots), 20_000)
     falls = np.exp(-np.outer(roots, times))
     h = (np.prod(roots) / np.array(apart)) @ falls
-    return -bound.above / (2.0 * float(h.max()))
+    return allowed / (2.0 * float(h.max())) / math.sqrt(len(bound.outputs))
 
 
 def _positive(root: object) -> bool:
@@ -226,7 +262,7 @@ def _outside(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
     """Yield the rows of states (K, n) from which the inputs push a bounded output the wrong way."""
-    output = chains.outputs.index(bound.output)
+    output = chains.outputs.index(bound.outputs[0])
     both = np.concatenate([[np.asarray(model.trim[0], float)], states])
     upright, *ways = np.asarray(_pushes(chains, model, jnp.asarray(both), output)).tolist()
     for k, (x, way) in enumerate(zip(states.tolist(), ways, strict=True)):
@@ -234,7 +270,7 @@ def _outside(
         # At the border the thrust that is level is infinite, and beyond it is turned downward.
         if off or not way / upright > _LEAST:
             i = model.state_names.index(off[0]) if off else None
-            why = f"`{bound.output}` is not pushed upward there"
+            why = f"`{bound.outputs[0]}` is not pushed upward there"
             why = why if i is None else f"`{off[0]}` is {x[i]:.4g} {model.state_units[i]}".rstrip()
             yield k, f"{why}, allowed is {bound.within}"
 

@@ -5,6 +5,7 @@ converges from anywhere, over any graph in which the leader reaches everybody, a
 goes through depends on its own start and on a speed alone.
 """
 
+import functools
 from typing import final
 
 import equinox as eqx
@@ -22,10 +23,11 @@ from echelon.laws.flat_law import (
     SHARE,
     SPEED,
     FlatLaw,
+    waits_for_path,
 )
 from echelon.laws.flat_loop import Held
 from echelon.laws.law import Law, LocalView
-from echelon.models.model import ControlAffine
+from echelon.models.model import ControlAffine, FlatBound
 from echelon.network.graph import Graph
 from echelon.references.flatness import follow_at
 from echelon.references.guide import Guide
@@ -33,6 +35,13 @@ from echelon.references.reference import Reference, check_reference
 
 _INSTANT = 1e-9
 """s; a shorter period is none."""
+_SEEN = 60.0
+"""s of the leader's path, for default speeds; what is promised looks at the whole run."""
+
+
+def _share(links: int) -> float:
+    """Return what part of what leads to a border followers may have, of all links together."""
+    return SHARE if links == 1 else CHAIN_SHARE
 
 
 @final
@@ -43,13 +52,17 @@ class Reach(eqx.Module):
         slowest: the smallest eigenvalue of the followers' Laplacian; of a graph that switches, of
             the mean over a period, or of the last one.
         heaviest: d_max, the largest sum of weights that one follower hears.
+        links: how many speeds add up on the way from a leader.
+        waits: whether the speed is left out, and rests on the leader's path.
     """
 
     slowest: float
     heaviest: float
+    links: int = 1
+    waits: bool = False
 
     @classmethod
-    def of(cls, graph: Graph, leaderward: bool) -> "Reach":
+    def of(cls, graph: Graph, leaderward: bool, links: int, waits: bool) -> "Reach":
         """Return it of a graph.
 
         Raises:
@@ -60,7 +73,7 @@ class Reach(eqx.Module):
         if schedule is None:
             # Heard one way the Laplacian is triangular, and its eigenvalues are on its diagonal.
             slowest = float(own.min()) if leaderward else graph.spectrum().low
-            return cls(slowest, float(own.max()))
+            return cls(slowest, float(own.max()), links, waits)
         share = np.eye(len(own))[-1]
         if schedule.period is not None:
             share = np.diff(schedule.starts, append=schedule.period) / schedule.period
@@ -71,7 +84,7 @@ class Reach(eqx.Module):
                 f"the leader does not reach everybody from {schedule.starts[-1]:g} s on where "
                 "neighbours nearer to it alone are heard; set `hears: all`, or add edges there."
             )
-        return cls(slowest, float(own.max()))
+        return cls(slowest, float(own.max()), links, waits)
 
 
 @final
@@ -124,14 +137,14 @@ class StoppingPoint(FlatLaw):
         """Find the model's chains, and what the graph asks of the coupling."""
         if self.loop is not None:
             return self
-        links, share = 1, SHARE
+        links = 1
         if self.feedforward is Feedforward.PARENT:
             # Raises where the graph is no tree.
             graph.parents()
             links = int(graph.depths().max())
-            share = CHAIN_SHARE if links > 1 else SHARE
-        loop, reach = self.found_loop(model), Reach.of(graph, self.leaderward)
-        speed = self.speeds_within(model, loop.chains, SPEED, share, links)
+        waits = self.speed is None and waits_for_path(model)
+        loop, reach = self.found_loop(model), Reach.of(graph, self.leaderward, links, waits)
+        speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
         return eqx.tree_at(
             lambda law: (law.loop, law.reach, law.ahead, law.speed),
             self,
@@ -153,8 +166,15 @@ class StoppingPoint(FlatLaw):
                 "differently; give both the same."
             )
         ahead = np.asarray(leader.begins(model))
+        assert self.reach is not None
         same = np.array_equal(np.asarray(self.ahead), ahead)
-        return self if same else eqx.tree_at(lambda law: law.ahead, self, ahead)
+        law = self if same else eqx.tree_at(lambda law: law.ahead, self, ahead)
+        if not self.reach.waits:
+            return law
+        free = eqx.tree_at(lambda law: law.speed, law, None, is_leaf=lambda x: x is None)
+        links, slowest = self.reach.links, functools.partial(leader.slowest_along, model)
+        speed = free.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
+        return eqx.tree_at(lambda law: law.speed, law, speed)
 
     def begin(self, model: ControlAffine, x: State) -> Held:
         """Return the memory of an agent that begins at x, with its integrators level."""
@@ -208,9 +228,16 @@ class StoppingLeader(FlatLaw):
                     "leader and `consensus` for the followers."
                 )
             self.reference.fit(model)
-        speed = self.speeds_within(model, loop.chains, LEAD_SPEED, LEAD_SHARE)
         none = {"is_leaf": lambda part: part is None}
-        return eqx.tree_at(lambda law: (law.loop, law.speed), self, (loop, speed), **none)
+        law = eqx.tree_at(lambda law: law.loop, self, loop, **none)
+        speed = self.speeds_within(
+            model,
+            loop.chains,
+            LEAD_SPEED,
+            LEAD_SHARE,
+            slowest=functools.partial(law.slowest_along, model),
+        )
+        return eqx.tree_at(lambda law: law.speed, law, speed, **none)
 
     def path(self, model: ControlAffine, t: Scalar) -> jax.Array:
         """Return the flat outputs to follow with their derivatives, (r + 1, m)."""
@@ -220,6 +247,15 @@ class StoppingLeader(FlatLaw):
         there = model.output(jnp.asarray(np.asarray(model.trim[0], float), t.dtype))
         place = jnp.stack([there[model.output_names.index(name)] for name in loop.chains.outputs])
         return jnp.pad(place[None], ((0, len(loop.weights)), (0, 0)))
+
+    def slowest_along(self, model: ControlAffine, bound: FlatBound) -> float:
+        """Return what the path takes a bounded length to, at least, of what is seen of it."""
+        if len(bound.outputs) == 1:
+            return 0.0
+        places = np.array([self.ready.chains.outputs.index(name) for name in bound.outputs])
+        times = jnp.linspace(0.0, _SEEN, 20 * int(_SEEN) + 1)
+        path = np.asarray(jax.vmap(lambda t: self.path(model, t))(times))
+        return float(np.linalg.norm(path[:, bound.derivative, places], axis=1).min())
 
     def begins(self, model: ControlAffine) -> jax.Array:
         """Return the flat outputs at t = 0 with their derivatives, (r, m)."""

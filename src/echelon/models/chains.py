@@ -76,7 +76,7 @@ def flatten(model: ControlAffine, chains: Chains, x: State, e: jax.Array) -> Fla
 
 def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) -> Flattened:
     """Return the same by automatic differentiation alone, whatever the model knows of itself."""
-    values, alphas, betas = _derivatives(model, chains, x, e, max(chains.degrees))
+    values, alphas, betas = derivatives_of(model, chains, x, e, max(chains.degrees))
     last, m = np.array(chains.degrees) - 1, np.arange(len(chains.degrees))
     alpha, beta = alphas[last, m], betas[:, last, m].T
     inside = np.arange(len(values))[:, None] <= last
@@ -85,7 +85,7 @@ def differentiate(model: ControlAffine, chains: Chains, x: State, e: jax.Array) 
     )
 
 
-def _derivatives(
+def derivatives_of(
     model: ControlAffine, chains: Chains, x: State, e: jax.Array, order: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return y .. y^(order - 1), y' .. y^(order) at w = 0, and what each entry of w adds to these.
@@ -120,14 +120,16 @@ def _derivatives(
 def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) -> jax.Array:
     """Return what the integrators hold first, so that agents begin level.
 
-    Where the model has a bound on a flat output, the derivatives of it that the integrators decide
-    are those of what the agent follows, `ahead` (r, m); else the integrators begin at the trim.
+    Where the model has a bound on one flat output, those of its derivatives that the integrators
+    decide are those of what the agent follows, `ahead` (r, m); else the integrators begin at the
+    trim.
     """
     known = model.switch_on(x, ahead)
     e = jnp.zeros(chains.size, x.dtype)
-    if known is not None or not model.flat_bounds:
+    bound = next((b for b in model.flat_bounds or () if len(b.outputs) == 1), None)
+    if known is not None or bound is None:
         return e if known is None else known
-    k = chains.outputs.index(model.flat_bounds[0].output)
+    k = chains.outputs.index(bound.outputs[0])
     for at in chains.places:
         for i, place in enumerate(at):
             order = chains.degrees[k] - len(at) + i
@@ -237,7 +239,7 @@ def _reach(
     e = draw.uniform(0.2, 0.8, (_SAMPLES, sum(integrators)))
 
     def one(x: State, e: jax.Array) -> jax.Array:
-        return _derivatives(model, chains, x, e, order)[2][:, -1].T
+        return derivatives_of(model, chains, x, e, order)[2][:, -1].T
 
     found = np.asarray(jax.jit(jax.vmap(one))(jnp.asarray(x), jnp.asarray(e)))
     return np.where(np.abs(found) > _RANK * np.abs(found).max(initial=1.0), found, 0.0)

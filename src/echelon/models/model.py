@@ -80,12 +80,18 @@ class FlatChains(NamedTuple):
 
 
 class FlatBound(NamedTuple):
-    """A border of the flat coordinates: a derivative of a flat output stays above a value.
+    """A border of the flat coordinates: a derivative of flat outputs stays above a value.
 
-    `within` says in words what else of the state that bounds.
+    Of one output it is the derivative itself, of several the length of their vector.
+
+    Attributes:
+        outputs: whose derivative it is.
+        derivative: its order.
+        above: what it stays above.
+        within: what else of the state that bounds, in words.
     """
 
-    output: str
+    outputs: tuple[str, ...]
     derivative: int
     above: float
     within: str

@@ -80,7 +80,7 @@ class PlanarQuadrotor(ControlAffine):
     @property
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, and roll within 90 deg, where z'' stays above -g."""
-        return (FlatBound("z", 2, -self.gravity, "roll within 90 deg"),)
+        return (FlatBound(("z",), 2, -self.gravity, "roll within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x): the rates, and free fall."""

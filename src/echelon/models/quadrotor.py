@@ -251,7 +251,7 @@ class Quadrotor(ControlAffine):
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
         # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three can pass 0 unless it does.
-        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
+        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def flatten(self, x: State, e: jax.Array) -> Flattened:
         """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""
@@ -267,11 +267,13 @@ class Quadrotor(ControlAffine):
         def invert(tops: jax.Array) -> Input:
             snap = tops[:3] @ axes
             (sr, sp), (cr, cp) = jnp.sin(x[6:8]), jnp.cos(x[6:8])
-            p_dot = q * r - (2.0 * rate * p + snap[1]) / a
-            q_dot = (snap[0] - 2.0 * rate * q) / a - p * r
+            # One quotient for all, which take longest of what is done here.
+            both = 1.0 / (a * cr)
+            p_dot = q * r - (2.0 * rate * p + snap[1]) * (cr * both)
+            q_dot = (snap[0] - 2.0 * rate * q) * (cr * both) - p * r
             # yaw' is (sin(roll) q + cos(roll) r) / cos(pitch), and tops[3] its rate.
             known = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
-            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - known) / cr])
+            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - known) * (a * both)])
             spin = spin - free_spin(self.inertia, x[9:12])
             return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
 

@@ -72,7 +72,7 @@ class QuadrotorEuler(ControlAffine):
     @property
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
+        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
@@ -135,7 +135,7 @@ class QuadrotorThrust(ControlAffine):
     @property
     def flat_bounds(self) -> tuple[FlatBound, ...]:
         """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        return (FlatBound("z", 2, -self.gravity, "roll and pitch within 90 deg"),)
+        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def drift(self, x: State) -> State:
         """Return f(x)."""

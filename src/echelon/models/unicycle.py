@@ -5,7 +5,14 @@ import jax.numpy as jnp
 
 from echelon.core.types import Input, InputMap, State
 from echelon.models.heading import Heading
-from echelon.models.model import ControlAffine, FlatChains, check_positive, diagonal, wound
+from echelon.models.model import (
+    ControlAffine,
+    FlatBound,
+    FlatChains,
+    check_positive,
+    diagonal,
+    wound,
+)
 
 
 def _drive(derivatives: jax.Array) -> tuple[State, Input]:
@@ -34,6 +41,8 @@ class Unicycle(ControlAffine):
     flat_outputs = ("x", "y")
     flat_order = 2
     flat_chains = FlatChains((2, 2), (1, 0))
+    # Where (x', y') is not 0 it has the heading's direction and the speed for its length.
+    flat_bounds = (FlatBound(("x", "y"), 1, 0.0, "a speed above 0"),)
 
     def switch_on(self, x: State, ahead: jax.Array) -> jax.Array:
         """Return the speed of what it follows."""
@@ -63,6 +72,8 @@ class UnicyclePoint(ControlAffine):
 
     With p the point: pdot = R(heading) (v, ahead w), headingdot = w. The normalized input
     (v, ahead w) is the point's velocity in the body frame, so that on positions g g^T is constant.
+    As the inputs move the point at once, its chains leave the heading out: the law `stopping-point`
+    is for `Unicycle`, the same vehicle.
     """
 
     ahead: float = 0.1

@@ -4,10 +4,12 @@ With w = L_g^-1 1 the largest |zeta_i| / w_i falls as m' = -sigma(c m) / max w o
 sigma(x) = x / sqrt(1 + (x/s)^2) that is solved by F(c m / s) = F(c m(0) / s) - c t / max w with
 F(v) = sqrt(1 + v^2) - arsinh(1 / v). Behind it comes the inner loop, delta y = h * zeta and what
 the start leaves, where h is positive. Told by parents each link is e' = -sigma(c a e) by itself, so
-that m is its |e| with w = 1, and what is off the leader is at most the sum along the way.
+that m is its |e| with w = 1, and what is off the leader is at most the sum along the way. Of graphs
+that take turns each has its w, and while the leader does not reach everybody the largest |zeta_i|
+at least does not grow.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +26,11 @@ _WITHIN = 0.01  # m
 _CELL, _MOST = 0.01, 20_000
 """Of time, s; the bound holds all over each cell. So many cells are 200 s."""
 _FEW = 100
-"""Followers that are told by parents: each link is followed by itself."""
+"""Followers that are told by parents, or whose graph switches: each is followed by itself."""
+_TURNS = 200
+"""How often such a graph switches at most, until all are there."""
+_SOLVED = 1e-6
+"""Relative; what a solver may leave of L w = 1."""
 _SLACK = 1e-9
 """m; more than floats leave of the sums."""
 
@@ -49,14 +55,15 @@ def arrival_of(
     """
     told = law.feedforward is Feedforward.PARENT
     apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
-    known = graph.schedule is None and position
-    if not known or apart > _SLACK or told and len(graph.followers) > _FEW:
+    alone = told or graph.schedule is not None
+    if not position or apart > _SLACK or alone and len(graph.followers) > _FEW:
         return None
     loop, followers = law.ready, list(graph.followers)
     away = flat[followers] - flat[list(graph.nearest_leader())][followers]
     times = _CELL * np.arange(_MOST + 1)
     square = np.zeros((len(followers), _MOST))
-    moved = _along_links if told else _all_together
+    moved = _all_together if graph.schedule is None else _in_turns
+    moved = _along_links if told else moved
     for k in position:
         own = np.array(law.roots_for(loop.chains.degrees[k] - 1))
         stops = flat[:, :, k] @ loop.weights[:, k]
@@ -105,10 +112,55 @@ def _along_links(
     return _Reach(np.stack([found[i] for i in followers]), np.arange(count), np.ones(count))
 
 
+def _in_turns(
+    stops: Array, graph: Graph, law: StoppingPoint, c: float, speed: float, times: Array
+) -> _Reach:
+    """Return how far stopping points (N,) are off of a graph that switches, stretch by stretch."""
+    followers = list(graph.followers)
+    off = np.abs(stops[followers] - stops[list(graph.nearest_leader())][followers])
+    weights = [*map(_solved, graph.stretches(law.leaderward)), None]
+    bounds = np.zeros((len(followers), len(times)))
+    for row, begin, end in _turns(graph, float(times[-1])):
+        here, w = (times >= begin) & (times < end), weights[row]
+        clock = np.concatenate([[0.0], times[here] - begin, [end - begin]])
+        each = np.full((len(followers), len(clock)), off.max())
+        if w is not None:
+            m = _falling((off / w).max(), c, w.max(), speed, clock)
+            each = np.minimum(w[:, None] * m, each)
+        bounds[:, here], off = each[:, 1:-1], each[:, -1]
+    # It may rise where neighbours are farther off; what is seen from then on does not.
+    bounds = np.maximum.accumulate(bounds[:, ::-1], axis=1)[:, ::-1]
+    return _Reach(bounds, np.arange(len(followers)), np.ones(len(followers)))
+
+
+def _turns(graph: Graph, horizon: float) -> Iterator[tuple[int, float, float]]:
+    """Yield which graph holds, from when and until when (s), to beyond the horizon; -1 for any."""
+    schedule = graph.schedule
+    assert schedule is not None
+    begin, count = 0.0, len(schedule.starts)
+    ends = [*schedule.starts[1:].tolist(), schedule.period or np.inf]
+    for k in range(_TURNS):
+        end = k // count * (schedule.period or 0.0) + ends[k % count]
+        yield k % count, begin, min(end, 2.0 * horizon)
+        if end > horizon:
+            return
+        begin = end
+    yield -1, begin, 2.0 * horizon
+
+
 def _weights(graph: Graph, leaderward: bool) -> Array:
     """Return w = L_g^-1 1 of the followers, all positive."""
     [L] = graph.stretches(leaderward)
     return spla.splu(sp.csc_array(L)).solve(np.ones(len(graph.followers)))
+
+
+def _solved(L: sp.csr_array) -> Array | None:
+    """Return a little more than L^-1 1, positive; None where the leader reaches not everybody."""
+    try:
+        w = spla.splu(sp.csc_array(L)).solve(np.ones_like(L.diagonal())) * (1.0 + _SOLVED)
+    except RuntimeError:
+        return None
+    return w if np.isfinite(w).all() and (w > 0.0).all() and (L @ w >= 1.0).all() else None
 
 
 def _falling(start: float, c: float, heaviest: float, speed: float, times: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from echelon.core.errors import GainError
 from echelon.core.kept import kept
 from echelon.core.words import Kind
-from echelon.enclosure.interval import Interval, point
+from echelon.enclosure.interval import ELEMENTARY, Interval, point
 from echelon.enclosure.series import enclose_derivatives
 from echelon.laws.stopping_point import StoppingLeader
 from echelon.models.model import ControlAffine
@@ -116,14 +116,28 @@ class Least(NamedTuple):
 
 
 def least_on_path(
-    leader: StoppingLeader, model: ControlAffine, horizon: float, output: int, order: int
+    leader: StoppingLeader,
+    model: ControlAffine,
+    horizon: float,
+    outputs: Sequence[int],
+    order: int,
 ) -> Least:
-    """Return what a derivative of an output of a leader's path is not below until the horizon."""
-    name = leader.ready.chains.outputs[output]
-    found = pieces_of(leader, model, horizon, [name], order)
-    low = min(rows[order][0].lo for rows in found.values)
+    """Return what a derivative on a leader's path is not below until the horizon.
+
+    Of several outputs it is the length of the vector of their derivatives.
+    """
+    names = [leader.ready.chains.outputs[k] for k in outputs]
+    found = pieces_of(leader, model, horizon, names, order)
+    low = min(_least_of(rows[order]) for rows in found.values)
     value = float(low)
     # `float` rounds to nearest, and a bound must not be rounded up.
     return Least(
         value if Fraction(value) <= low else float(np.nextafter(value, -np.inf)), found.kind
     )
+
+
+def _least_of(row: Sequence[Interval]) -> Fraction:
+    if len(row) == 1:
+        return row[0].lo
+    sizes = (Fraction(0) if x.holds(0) else min(abs(x.lo), abs(x.hi)) for x in row)
+    return ELEMENTARY["sqrt"].range(point(sum((size**2 for size in sizes), Fraction(0)))).lo

@@ -7,21 +7,15 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from echelon.certificates.tube import Push, Room, room_of
-from echelon.core.errors import GainError, listing
-from echelon.core.types import Array
+from echelon.core.errors import GainError
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
-from echelon.models.model import FlatBound
 from echelon.promises.arrival import Arrival, arrival_of
+from echelon.promises.borders import Border, border_of
+from echelon.promises.everywhere import bounds_of
 from echelon.promises.motors import Strain, strain_of
-from echelon.promises.paths import least_on_path
 from echelon.promises.statement import Hypothesis, Statement
 from echelon.promises.stopping import Stopping
 
-_ROUNDED = Fraction(1, 10**6)
-"""Of a derivative of a flat output: a thousand times what floats leave of it at a start."""
-_STARTS = 64
-"""Starts of agents that are looked at one by one; those that differ in one speed alone are two."""
 _PROOF = Kind.PROOF
 
 
@@ -106,13 +100,16 @@ def tube_of(run: Stopping) -> _Found:
     try:
         found = run.chain(longest)
         gains = tuple(float(found.gain(k)) for k in range(max(1, len(found.powers) + 1)))
-        borders = None if model.flat_bounds is None else [_room(run, b) for b in model.flat_bounds]
+        bounds = bounds_of(model, chains)
+        borders = None if bounds is None else [border_of(run, b) for b in bounds]
     except GainError as error:
-        return _nothing(str(error).rstrip("."), "choose `roots` of a larger common unit")
+        text = str(error).rstrip(".")
+        remedy = "choose `roots` of a larger common unit" if "unit" in text else "let them be alike"
+        return _nothing(text, remedy)
     shown = ", ".join(f"{gain:.4g}" for gain in gains)
     text = "of what agreement asks, at most, in speed and its derivatives: no size of the formation"
     inner = Statement(Hypothesis.REGION, Verdict.HOLDS, _PROOF, gains[-1], shown, f"T5: {text}")
-    if borders is None or chains.sampled:
+    if borders is None:
         name = f"`{type(model).__name__}`"
         text = f"{name} does not say where its flat coordinates end"
         return _nothing(text, "state `flat_chains` and `flat_bounds` in the model", inner)
@@ -158,86 +155,10 @@ def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
     return _Found(None, (*before, *lines))
 
 
-class _Border(NamedTuple):
-    """A border of the chart: what is left to it, and by which kind of argument."""
-
-    bound: FlatBound
-    left: Fraction
-    steepest: float
-    kind: Kind
-    fastest: float
-    told: dict[str, Any]
-
-
-def _room(run: Stopping, bound: FlatBound) -> _Border:
-    """Return how near to a border the agents of a run may come."""
-    chains = run.law.ready.chains
-    k, order = chains.outputs.index(bound.output), bound.derivative - 1
-    chain = run.chain(k)
-    least = least_on_path(run.leader, run.parts.model, run.settings.horizon, k, bound.derivative)
-    allowed = Fraction(least.value) - Fraction(bound.above) - _ROUNDED
-    own, s = run.own_speed(k), run.speed(k)
-    fastest = float(allowed / chain.gain(order)) if order else math.inf
-    if math.isinf(s) or math.isinf(own):
-        return _Border(bound, Fraction(-1), 0.0, least.kind, fastest, {})
-    leads, p = list(run.parts.graph.leaders), len(chain.powers)
-    led = run.flat[leads, :, k] - run.ahead[:, k]
-    away = run.flat[:, :, k] - run.flat[list(run.parts.graph.nearest_leader()), :, k]
-    ahead = [Push(_exact(start[1 : p + 1]), Fraction(own)) for start in _few(led)]
-    rooms = list[Room]()
-    for lead in ahead:
-        for start in _few(away):
-            push = Push(_exact(start[1 : p + 1]), Fraction(s))
-            rooms.append(room_of(chain, order, (lead, push), allowed))
-    left = min(allowed - room.fall for room in rooms)
-    # Said of agents behind a leader that keeps to the height and the climb of its path.
-    quiet = room_of(chain, order, (Push((), Fraction(0)), Push((), Fraction(s))), allowed)
-    told = {
-        "output": bound.output,
-        "derivative": bound.derivative,
-        "above": bound.above,
-        "path": least.value,
-        "roots": list(run.law.roots_for(p)),
-        "speed": s,
-        "leader_speed": own,
-        "starts": [start[1 : p + 1].tolist() for start in _few(away)],
-        "leader_starts": [start[1 : p + 1].tolist() for start in _few(led)],
-        "gains": [float(chain.gain(order)) for order in range(p + 1)],
-        "left": float(left),
-        "steepest": float(quiet.steepest),
-    }
-    return _Border(bound, left, float(quiet.steepest), least.kind, fastest, told)
-
-
-def _exact(values: Array) -> tuple[Fraction, ...]:
-    return tuple(map(Fraction, values.tolist()))
-
-
-def _few(starts: Array) -> Array:
-    """Return starts (K, r) that stand for all: the extreme ones where the speed alone differs.
-
-    Raises:
-        GainError: there are too many.
-    """
-    starts = starts.copy()
-    starts[:, 0] = 0.0
-    # What floats leave of a level start is far below the slack of the room.
-    starts[np.abs(starts) < 1e-9] = 0.0
-    if not starts[:, 2:].any() and starts.shape[1] > 1:
-        low, high = starts[:, 1].argmin(), starts[:, 1].argmax()
-        return starts[sorted({int(low), int(high)})]
-    found = np.unique(starts, axis=0)
-    if len(found) > _STARTS:
-        raise GainError(
-            f"{len(found)} starts differ in more than a speed, and {_STARTS} are tried."
-        )
-    return found
-
-
 _NO_BORDER = "no border of flat coordinates can be met"
 
 
-def _set_lines(run: Stopping, borders: Sequence[_Border], kind: Kind) -> Iterator[Statement]:
+def _set_lines(run: Stopping, borders: Sequence[Border], kind: Kind) -> Iterator[Statement]:
     """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
         text = "its flat coordinates have no border: any state is a start"
@@ -245,57 +166,61 @@ def _set_lines(run: Stopping, borders: Sequence[_Border], kind: Kind) -> Iterato
         yield Statement(Hypothesis.STARTS, Verdict.HOLDS, kind, 0.0, "inside", _NO_BORDER)
         return
     nearest = min(borders, key=lambda b: b.left)
-    bound = nearest.bound
-    name, s = f"`{bound.output}`", run.speed(_index(run, bound.output))
-    prime = "'" * bound.derivative
-    text = f"any place, with {bound.within}, and `{bound.output}'` so far off that of the leader, "
-    text, remedy, reason = f"which keeps to its path in {name}", "", ""
-    if not nearest.steepest > 0.0:
-        text = f"at a `speed` of {s:.3g} agreement alone may take {bound.output}{prime} to "
-        text = f"{text}{bound.above:.3g}, where the chart ends"
-        remedy = f"lower the `speed` of {name} below {_each(run, nearest.fastest):.3g}"
-        reason = text
-    holds, shown = Verdict.of(nearest.steepest > 0.0), f"{nearest.steepest:.3g} off"
-    yield Statement(Hypothesis.SET, holds, kind, nearest.steepest, shown, text, remedy, reason)
+    yield _room_line(run, nearest, kind)
     if not nearest.steepest > 0.0:
         yield Statement(Hypothesis.STARTS, Verdict.NOT_NEEDED, kind, text="there is no set")
         return
-    far, remedy, reason = float(nearest.left), "", ""
-    text = f"{bound.output}{prime} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
+    far, bound, remedy, reason = float(nearest.left), nearest.bound, "", ""
+    text = f"{nearest.what()} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
     if not nearest.left > 0:
-        text = (
-            f"from these starts {bound.output}{prime} is not proved to stay above {bound.above:.4g}"
-        )
-        remedy = (
-            f"start nearer to the leader's speed in {name}, start the leader on its path there, "
-        )
-        remedy += f"or lower `speed` of {name}, of the leader and the followers"
-        reason = text
+        text = f"from these starts {nearest.what()} is not proved to stay above {bound.above:.4g}"
+        where, reason = nearest.outputs, text
+        remedy = f"start nearer to the leader's speed in {where}, start the leader on its path "
+        remedy += f"there, or lower `speed` of {where}, of the leader and the followers"
     shown, holds = f"{far:.3g} left", Verdict.of(nearest.left > 0)
     yield Statement(Hypothesis.STARTS, holds, kind, far, shown, text, remedy, reason)
 
 
-def _each(run: Stopping, total: float) -> float:
-    """Return what speed of one link a speed against the leader leaves."""
-    return total / run.links
+def _room_line(run: Stopping, border: Border, kind: Kind) -> Statement:
+    """Say how far starts may be off behind a leader that keeps to its path."""
+    bound, steepest, text = border.bound, border.steepest, ""
+    remedy, shown = "", f"{steepest:.3g} off"
+    if not border.fastest > 0.0:
+        text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
+        text, remedy = f"{text}ends at {bound.above:.3g}", "choose a path that keeps away from it"
+    elif not steepest > 0.0:
+        s = run.speed(run.law.ready.chains.outputs.index(bound.outputs[0]))
+        text = f"at a `speed` of {s:.3g} agreement alone may take {border.what()} to "
+        text = f"{text}{bound.above:.3g}, where the chart ends"
+        # What one link may have of a speed against the leader.
+        least = border.fastest / run.links
+        remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
+    holds, reason = Verdict.of(steepest > 0.0), text
+    if not text:
+        text = f"any place, with {bound.within}, and {border.speeds} so far off the leader's, "
+        text = f"{text}which keeps to its path in {border.outputs}"
+    return Statement(Hypothesis.SET, holds, kind, steepest, shown, text, remedy, reason)
 
 
-def _index(run: Stopping, output: str) -> int:
-    return run.law.ready.chains.outputs.index(output)
-
-
-def _who(run: Stopping, borders: Sequence[_Border]) -> str:
+def _who(run: Stopping, borders: Sequence[Border]) -> str:
     """Return which starts are meant, in words."""
     if not borders:
         return "any state of any agent"
-    on = all(run.own_speed(_index(run, b.bound.output)) < 1e-9 for b in borders)
-    outputs = listing(b.bound.output for b in borders)
     within = " and ".join(b.bound.within for b in borders)
-    told = f"any position, heading, sideways speed and turning, with {within}"
-    if not on:
-        return f"{told}, and speeds in {outputs} as at these starts"
-    off = f"within {min(b.steepest for b in borders):.3g} of the leader's"
-    return f"{told}, a speed in {outputs} {off}, which keeps to its path there"
+    free = "any position, heading, sideways speed and turning"
+    free = "any position" if any(b.many for b in borders) else free
+    if not all(b.led for b in borders):
+        speeds = " and ".join(b.speeds for b in borders)
+        return f"{free}, with {within}, and {speeds} as at these starts"
+    off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_turned(b)}" for b in borders)
+    return f"{free}, with {within}, and {off} of the leader's, which keeps to its path there"
+
+
+def _turned(border: Border) -> str:
+    """Return by what angle a velocity of the leader's size may be off it, in words."""
+    if math.isinf(border.turn):
+        return ""
+    return f" (at its speed, {border.turn:.3g} deg to either side)"
 
 
 def _positions(run: Stopping) -> tuple[int, ...]:

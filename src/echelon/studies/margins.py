@@ -30,8 +30,7 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
     """Yield the margins of a loop that decays."""
     loop = promise.loop
     if parts.graph.schedule is not None:
-        text = "they are of one graph, and none is known for graphs that take turns"
-        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        yield from _turns_lines(promise)
         return
     if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
         text = "any coupling; what delay is left depends on c and the graph alone"
@@ -63,6 +62,19 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
     # The bound of the network rests on a symmetric matrix.
     yield from _push_lines(parts.model, loop) if loop.symmetric else ()
     yield from _string_line(parts, loop)
+
+
+def _turns_lines(promise: Promise) -> Iterator[Statement]:
+    """Yield what is known of graphs that take turns: how weak the coupling may get (T8)."""
+    edge, lines = promise.edge, promise.hypotheses
+    anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
+    if not anywhere and edge is not None and not lines[Hypothesis.DECAYS].fails:
+        low = edge / promise.loop.closed.coupling
+        what = "factors on the coupling with which one P serves all graphs, whenever they switch"
+        yield Statement(Line.GAIN, _HOLDS, _KIND, low, f"{low:.3g} to inf", what)
+    text = "any coupling; " if anywhere else ""
+    text += "what delay is left is of one graph, and none is known for graphs that take turns"
+    yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
 
 
 def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:

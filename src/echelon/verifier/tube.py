@@ -41,7 +41,7 @@ def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
     """Yield what is found of each claim of a tube."""
     for border in tube["borders"]:
         roots = _exact(border["roots"])
-        name = f"`{border['output']}`"
+        name = ", ".join(f"`{output}`" for output in border["outputs"])
         for order, stored in enumerate(border["gains"]):
             found = _gain(roots, order)
             yield same(f"gain {order} of {name}", stored, found, 1e-8, "quadrature between roots")
@@ -54,10 +54,13 @@ def _room(border: Mapping[str, Any], roots: Sequence[Fraction], name: str) -> It
     """Yield whether what is left to a border is left, and a start as steep as is claimed fits."""
     order = int(border["derivative"]) - 1
     allowed = float(border["path"]) - float(border["above"])
-    pairs = itertools.product(border["leader_starts"], border["starts"])
-    both = [np.add(_padded(a, len(roots)), _padded(b, len(roots))) for a, b in pairs]
     total = float(border["speed"]) + float(border["leader_speed"])
-    left = min(allowed - _fall(roots, order, start, total) for start in both)
+    if len(border["outputs"]) > 1:
+        left = min(allowed - _length(roots, order, np.array(s), total) for s in border["starts"])
+    else:
+        pairs = itertools.product(border["leader_starts"], border["starts"])
+        both = [np.add(_padded(a, len(roots)), _padded(b, len(roots))) for a, b in pairs]
+        left = min(allowed - _fall(roots, order, start, total) for start in both)
     stored = float(border["left"])
     fine = 0.0 < stored <= left + 1e-9
     yield said(f"room left to {name}", fine, stored, left, "followed over time")
@@ -90,9 +93,21 @@ def _residues(roots: Sequence[Fraction]) -> Array:
 
 def _fall(roots: Sequence[Fraction], order: int, start: Array, speed: float) -> float:
     """Return how far v^(order) falls at most from a start under |w| <= speed, on a fine grid."""
+    free, moved = _followed(roots, order, start[None])
+    return float((speed * moved - free[0]).max())
+
+
+def _length(roots: Sequence[Fraction], order: int, starts: Array, speed: float) -> float:
+    """Return how long v^(order) of some outputs gets, from a start (m, p) each."""
+    free, moved = _followed(roots, order, starts)
+    return float((speed * moved + np.linalg.norm(free, axis=0)).max())
+
+
+def _followed(roots: Sequence[Fraction], order: int, starts: Array) -> tuple[Array, Array]:
+    """Return what starts (m, p) leave of v^(order) on a fine grid, and int |h^(order)| until it."""
     rho = np.array([float(root) for root in roots])
     times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
-    modes = np.linalg.solve(np.vander(-rho, increasing=True).T, start)
+    modes = np.linalg.solve(np.vander(-rho, increasing=True).T, starts.T).T
     free = (modes * (-rho) ** order) @ np.exp(-np.outer(rho, times))
     kernel = _residues(roots) * (-rho) ** order
     # Cells with their middle and ends (Simpson's rule).
@@ -100,7 +115,7 @@ def _fall(roots: Sequence[Fraction], order: int, start: Array, speed: float) -> 
     ends = np.abs(kernel @ np.exp(-np.outer(rho, times)))
     middles = np.abs(kernel @ np.exp(-np.outer(rho, times[:-1] + 0.5 * step)))
     cells = step / 6.0 * (ends[:-1] + 4.0 * middles + ends[1:])
-    return float((speed * np.concatenate([[0.0], np.cumsum(cells)]) - free).max())
+    return free, np.concatenate([[0.0], np.cumsum(cells)])
 
 
 def _gain(roots: Sequence[Fraction], order: int) -> float:
