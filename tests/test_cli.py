@@ -49,7 +49,7 @@ def test_run_writes_what_it_says(here, echelon):
     assert code == 0 and "Verified: " in out
     (here / "o" / "gain.json").unlink()
     code, _, err = echelon("verify", "o")
-    assert code == 2 and "left neither a gain nor a tube to verify" in err
+    assert code == 2 and "`o` has lost its `gain.json`" in err
 
 
 def test_summary_has_the_promised_keys_and_no_nan(here, echelon):
