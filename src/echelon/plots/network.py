@@ -69,7 +69,7 @@ def _name_slowest(ax: Any, slowest: float) -> None:
 
 def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
     """Use scales that show slow and fast poles alike, and end a little right of the axis."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
     sizes, heights = np.abs(real), np.abs(imaginary)
     least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
@@ -80,7 +80,12 @@ def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
         ax.xaxis.set_major_formatter(told)
         powers = 10.0 ** np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1.0)
         # Nearer to 0 their numbers would cover each other.
-        ax.xaxis.set_major_locator(FixedLocator([*-powers[powers > 1.6 * least][::-1], 0.0]))
+        powers = powers[powers > 0.5 * least]
+        ax.xaxis.set_major_locator(FixedLocator([*-powers[::-1], 0.0]))
+        # Between the powers they show that the axis is no straight one.
+        between = np.outer(powers, np.arange(2.0, 10.0)).ravel()
+        ax.xaxis.set_minor_locator(FixedLocator(-between[between < 1.6 * most]))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
     else:
         ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
@@ -114,18 +119,22 @@ def network(run: Recording) -> "Figure":
 
     whole, run = run, _about_leaders(run)
     places, units = _places(run)
-    size = np.ptp(places, axis=0)
     stretches = _stretches(run)
     columns = min(len(stretches), 2 if draw.page().narrow else 3)
     rows = -(-len(stretches) // columns)
-    width = draw.page().width * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
+    width = draw.page().width
+    # A lone panel of a wide page would be needlessly high.
+    room = 0.85 * width / columns * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
+    size = np.ptp(places, axis=0)
+    least = _dot(run, columns) / 144.0 * max(size[0] / room, size[1] / (0.8 * room))
+    lines = curves_of(places, run.edges, least)
+    size = np.ptp(np.concatenate([places, *lines]), axis=0)
     tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
-    height = rows * (0.75 + 0.85 * width / columns * tall)
-    figure = Figure((width, height), layout="constrained")
+    figure = Figure((width, rows * (0.75 + room * tall)), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, (title, weights) in zip(panels, stretches, strict=False):
-        _agents_and_links(ax, run, places, weights, columns)
-        _finish_network(ax, places, units)
+        _agents_and_links(ax, run, places, lines, weights, columns)
+        _finish_network(ax, np.concatenate([places, *lines]), units)
         told = ", ".join(filter(None, [title, told_of(whole, run.agents)]))
         ax.set_title(told, size=draw.page().letters)
     for ax in panels[len(stretches) :]:
@@ -170,9 +179,16 @@ def _stretches(run: Recording) -> list[tuple[str, Array]]:
     return list(zip(spans, run.schedule.weights, strict=False))
 
 
-def _agents_and_links(ax: Any, run: Recording, places: Array, weights: Array, columns: int) -> None:
-    small = draw.crowding(run.agents) ** 0.3 / columns**0.4
-    _links(ax, run, places, weights, small)
+def _dot(run: Recording, columns: int) -> float:
+    """Return the size of an agent's dot, in points."""
+    return 12.0 * draw.crowding(run.agents) ** 0.3 / columns**0.4
+
+
+def _agents_and_links(
+    ax: Any, run: Recording, places: Array, lines: list[Array], weights: Array, columns: int
+) -> None:
+    small = _dot(run, columns) / 12.0
+    _links(ax, run, places, lines, weights, small)
     for agent in range(run.agents):
         leads = agent in run.leaders
         look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
@@ -196,26 +212,89 @@ def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
     return np.column_stack([np.sin(turn), np.cos(turn)]), ()
 
 
-def _links(ax: Any, run: Recording, places: Array, weights: Array, small: float) -> None:
+_BENDS = tuple(side * height for height in (0.16, 0.24, 0.1, 0.34) for side in (1.0, -1.0))
+"""How far a link may bend aside, in its lengths; those that look best first."""
+_ALONG = np.linspace(0.0, 1.0, 25)[:, None]
+
+
+def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
+    """Return the line (K, 2) of each edge: straight, or bent where it would hide behind an agent.
+
+    A straight one passes no third of the places (N, 2) nearer than `least`; of a link that has to
+    bend it is the first bend that does so, or where none does the one that keeps the farthest off.
+    Of more agents than have numbers all are straight.
+    """
+    straight = list(places[edges])
+    if len(places) > _NUMBERED:
+        return straight
+    return [
+        line if _gap(places, edge, line) > least else _bend(places, edge, least)
+        for edge, line in zip(edges, straight, strict=True)
+    ]
+
+
+def _bend(places: Array, edge: Array, least: float) -> Array:
+    # Links that begin at agents beside each other go to different sides.
+    bends = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
+    lines = [_arc(*places[edge], bend) for bend in bends]
+    gaps = [_gap(places, edge, line) for line in lines]
+    clear = [line for line, gap in zip(lines, gaps, strict=True) if gap > least]
+    return clear[0] if clear else lines[int(np.argmax(gaps))]
+
+
+def _arc(first: Array, second: Array, bend: float) -> Array:
+    """Return a parabola (K, 2) between two places, `bend` of their distance aside in its middle."""
+    way = second - first
+    aside = 4.0 * bend * _ALONG * (1.0 - _ALONG)
+    return first + _ALONG * way + aside * np.array([-way[1], way[0]])
+
+
+def _gap(places: Array, edge: Array, line: Array) -> float:
+    """Return how near a line (K, 2) comes to a place (N, 2) of no end of its edge."""
+    others = np.delete(places, edge, axis=0)[:, None]
+    if not len(others):
+        return np.inf
+    begin, way = line[:-1], np.diff(line, axis=0)
+    share = ((others - begin) * way).sum(axis=2) / np.maximum((way**2).sum(axis=1), 1e-300)
+    nearest = begin + np.clip(share, 0.0, 1.0)[:, :, None] * way
+    return float(np.linalg.norm(others - nearest, axis=2).min())
+
+
+def _links(
+    ax: Any, run: Recording, places: Array, curves: list[Array], weights: Array, small: float
+) -> None:
     """Draw the edges, thicker where they weigh more."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
     there, unheard = weights > 0.0, ~run.heard.any(axis=1)
     for kept, dash in ((there & ~unheard, "-"), (there & unheard, (0, (1.0, 2.0)))):
-        lines = list(places[run.edges[kept]])
+        lines = [curves[k] for k in np.flatnonzero(kept)]
         look = {"linewidths": wide[kept], "colors": "0.55", "linestyles": [dash], "zorder": 1}
         ax.add_collection(LineCollection(lines, **look))
     one = run.heard.sum(axis=1) == 1
     arrows, pens = run.arrows[there[one]], wide[one & there]
+    ways = [curves[k] for k in np.flatnonzero(one & there)]
     if run.agents > _NUMBERED:
         tall = 0.4 * float(np.sqrt(np.ptp(places, axis=0).prod() / run.agents))
         heads = PolyCollection(_heads(places[arrows], tall), facecolors="0.35", zorder=2)
         ax.add_collection(heads)
         return
-    for (first, second), line in zip(arrows, pens, strict=True):
+    for (first, second), line, way in zip(arrows, pens, ways, strict=True):
         arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0 * small}
+        arrow["connectionstyle"] = f"arc3,rad={_bulge(places[first], places[second], way)}"
         ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+
+
+def _bulge(first: Array, second: Array, line: Array) -> float:
+    """Return how far right of its way an arrow's middle handle stands, in lengths of the way."""
+    way, aside = second - first, line.mean(axis=0) - 0.5 * (first + second)
+    whole = float(way @ way)
+    if len(line) == 2 or whole <= 0.0:
+        return 0.0
+    # Samples of 4 s (1 - s) have this mean, and the handle stands twice as far as the middle.
+    mean = float((4.0 * _ALONG * (1.0 - _ALONG)).mean())
+    return 2.0 * float(aside @ [way[1], -way[0]]) / (mean * whole)
 
 
 def _heads(ends: Array, tall: float) -> list[Array]:
