@@ -61,7 +61,8 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "promise": PROMISE,
         "horizon": float(times[-1]),
         "dt": 0.01,
-        "attributes": {"outcome": "completed", "message": "The run reached its horizon."},
+        "attributes": {"outcome": "completed", "message": "The run reached its horizon."}
+        | {"steady_window": 0.2 * float(times[-1])},
     } | more
     own.setdefault("weights", np.ones(len(own["edges"])))
     # Both ends hear each other, but for leaders.

@@ -26,6 +26,7 @@ _LINKS = 20_000  # of which the distances of many are taken, evenly spread
 _PANELS = 12  # what fits above each other on a page
 _START = 3.0
 """Seconds of a run in which inputs are quick."""
+_WANTED = {"color": "0.4", "linewidth": 0.9, "linestyle": (0, (1.0, 1.5)), "zorder": 1}
 _SLOPE = {"color": draw.EDGE, "linewidth": 1.0, "linestyle": (0, (5.0, 2.0)), "zorder": 2.2}
 
 
@@ -82,7 +83,9 @@ def formation(run: Recording) -> "Figure":
     if run.unit:
         ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(draw.label("formation error", run.unit))
-    draw.logarithmic(ax, errors[keep], np.array([SETTLED] if run.unit else []))
+    marks = [SETTLED] if run.unit else []
+    # The bound's end may lie far below all errors, its start is what is compared with theirs.
+    draw.logarithmic(ax, errors[keep], np.array(marks if bound is None else [*marks, bound[0]]))
     return draw.finish(figure)
 
 
@@ -100,9 +103,13 @@ def _bands(ax: Any, times: Array, values: Array, of: str = "follower") -> None:
 
 
 def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) -> None:
-    """Draw the follower that is worst over the whole run, by name, and the largest at each time."""
+    """Draw the follower of the largest steady error, by name, and the largest at each time.
+
+    Of a run that ended before its steady window it is the largest over all of it.
+    """
+    steady = run.times >= run.horizon - float(run.attributes["steady_window"])
     with np.errstate(over="ignore", invalid="ignore"):
-        place = int(np.argmax((errors**2).sum(axis=0)))
+        place = int(np.argmax((errors[steady if steady.any() else ...] ** 2).sum(axis=0)))
     name = f"worst: follower {run.followers[place]}"
     own = {"color": draw.COLOURS[1], "zorder": 3}
     draw.plot(ax, times, draw.above_zero(errors[keep, place]), label=name, **own)
@@ -124,8 +131,16 @@ def _slope(ax: Any, run: Recording, values: Array, times: float) -> None:
     if line[1] <= 0.0:
         t[1] = t[0] + 600.0 / (times * rate)
         line[1] = finite[first] * np.exp(-600.0)
-    text = f"slope promised: \u2212{times * rate:.3g} 1/s"
+    # Equal eigenvalues, as a chain of arrows has, make t^k e^(-rt): no slope holds from the start.
+    name = "slope promised in the long run" if _tells_one_way(run) else "slope promised"
+    text = f"{name}: \u2212{times * rate:.3g} 1/s"
     draw.plot(ax, t, line, label=text, **_SLOPE)
+
+
+def _tells_one_way(run: Recording) -> bool:
+    """Tell whether a follower is heard by another one that it does not hear."""
+    inner = ~np.isin(run.edges, run.leaders).any(axis=1)
+    return bool((run.heard[inner].sum(axis=1) == 1).any())
 
 
 def lyapunov(run: Recording) -> "Figure | None":
@@ -151,7 +166,19 @@ def lyapunov(run: Recording) -> "Figure | None":
                 draw.plot(ax, times, shown, label=f"V {name}", color=colour, linewidth=0.8)
         ax.set_ylabel("|dV/dt| (1/s)")
         draw.logarithmic(ax, np.abs(rate[moves]))
+        if _rises_between(run):
+            text = f"at each frame; V rises in between, inputs held for dt = {run.dt:.3g} s"
+            ax.set_title(text, size=draw.page().letters - 1.0, loc="right")
     return draw.finish(figure)
+
+
+def _rises_between(run: Recording) -> bool:
+    """Tell whether V rises between frames of which both say that it falls."""
+    assert run.lyapunov is not None and run.lyapunov_rate is not None
+    value, falls = run.lyapunov, run.lyapunov_rate < 0.0
+    # So far below the start V is nothing but rounding.
+    rises = np.diff(value) > 1e-9 * value[:-1] + 1e-20 * value[0]
+    return bool((rises & falls[:-1] & falls[1:]).any())
 
 
 # ---- what is done -----------------------------------------------------------------------------
@@ -175,8 +202,9 @@ def inputs(run: Recording) -> "Figure | None":
                 _limits(ax, values[part])
             ax.set_xlim(run.times[part][0], max(run.times[part][-1], 1e-9))
         line[0].set_ylabel(name)
-    for ax in axes[-1]:
-        ax.set_xlabel("time (s)")
+    for part, ax in zip(parts, axes[-1], strict=True):
+        end, whole = run.times[part][-1], run.times[-1]
+        ax.set_xlabel("time (s)" if end == whole else f"time (s), of {whole:.4g} s")
     return draw.finish(figure, once=True, corner=axes[0][-1])
 
 
@@ -236,7 +264,10 @@ def states_over_time(run: Recording, chosen: Iterable[int]) -> "Figure":
     times, wanted = run.times[keep], [reference_of(run, agent) for agent in agents]
     # Behind followers too it would hide their lines.
     guides = wanted if set(agents) <= {*run.leaders} else []
-    figure, panels = _panels(run, min(len(run.state_names), _PANELS), 1.4)
+    count = min(len(run.state_names), _PANELS)
+    # On a narrow page panels beside each other would be all labels.
+    columns = 1 if draw.page().narrow or count <= 4 else 2 if count <= 6 else 3
+    figure, panels = draw.panels(run.times, run.horizon, count, 1.4, columns)
     for k, ax in enumerate(panels):
         paths = run.states[:, agents, k, None]
         known = [wanted[0][:, k, None]] if wanted[0] is not None else []
@@ -249,7 +280,7 @@ def states_over_time(run: Recording, chosen: Iterable[int]) -> "Figure":
             draw.plot(ax, times, line, label=name, **pen_of(run, agent))
         ax.set_ylabel(label(run, k))
         cut |= over
-    return draw.finish(figure, cut, once=True)
+    return draw.finish(figure, cut, once=True, corner=panels[columns - 1])
 
 
 def distances(run: Recording) -> "Figure | None":
@@ -286,12 +317,12 @@ def _edges(ax: Any, run: Recording, times: Array, apart: Array, wanted: Array) -
         draw.logarithmic(ax, off)
         return
     for place, (i, j) in enumerate(run.edges):
-        colour = draw.COLOURS[place % len(draw.COLOURS)]
+        look = draw.pen(place, len(run.edges))
         line, _ = draw.drop_runaways(apart[:, place, None], apart[:1, place, None])
-        draw.plot(ax, times, line, label=f"{i} to {j}", color=colour)
-        name = "wanted" if place == len(run.edges) - 1 else None
-        look = {"color": colour, "linewidth": 0.8, "linestyle": (0, (4, 2)), "zorder": 1}
-        ax.axhline(wanted[place], label=name, **look)
+        draw.plot(ax, times, line, label=f"{i} to {j}", **look)
+        ax.axhline(wanted[place], **_WANTED | {"color": look["color"]})
+    # In the legend it is of no link's colour.
+    ax.plot([], [], label="wanted", **_WANTED)
 
 
 def _least(places: Array) -> Array:

@@ -25,6 +25,7 @@ NAMED = 10
 """With more agents than this, followers look alike and the legend names none of them."""
 
 _TOP = 1e9  # A logarithmic axis that reached further would flatten what is of interest.
+_HIGHEST = 9.0  # inches: a page of a journal, less a caption
 _POINTS = 2000  # a line's, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
@@ -99,7 +100,7 @@ def crowding(agents: int) -> float:
     return min(1.0, NAMED / agents)
 
 
-# Leaders share their colour, so that nobody takes one for a follower.
+# Leaders share their colour, so that nobody takes one for a follower; others past the palette.
 _DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)))
 
 
@@ -116,8 +117,8 @@ def pen(place: int, agents: int) -> dict[str, Any]:
     if crowd < 1.0:
         thinner = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
         return {"color": COLOURS[0]} | thinner
-    dash = "-" if place < len(COLOURS) else (0, (3, 1.2))
-    return {"color": COLOURS[place % len(COLOURS)], "linestyle": dash}
+    again, colour = divmod(place, len(COLOURS))
+    return {"color": COLOURS[colour], "linestyle": _DASHES[again % len(_DASHES)]}
 
 
 def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> dict[str, Any]:
@@ -180,19 +181,28 @@ def raised(unit: str) -> str:
     return unit.replace("^2", "\u00b2").replace("^3", "\u00b3")
 
 
-def panels(times: Array, horizon: float, rows: int, height: float) -> "tuple[Figure, list[Any]]":
-    """Return panels above each other that share the axis of time, `height` inches each."""
+def panels(
+    times: Array, horizon: float, count: int, height: float, columns: int = 1
+) -> "tuple[Figure, list[Any]]":
+    """Return panels row by row that share the axis of time, `height` inches each where they fit."""
     from matplotlib.figure import Figure
 
+    rows = -(-count // columns)
     # Smaller letters need less height too.
     height *= page().letters / 10.0 if page().narrow else 1.0
     least = 2.3 if page().narrow else 3.2
-    figure = Figure((page().width, max(least, height * rows)), layout="constrained")
-    axes = list(figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+    size = (page().width, float(np.clip(height * rows, least, _HIGHEST)))
+    figure = Figure(size, layout="constrained")
+    axes = list(figure.subplots(rows, columns, sharex=True, squeeze=False).ravel())
     # A lone frame stands on no axis, where half of its dots would be cut off.
     limits = (0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon)
-    axes[-1].set(xlabel="time (s)", xlim=limits)
-    return figure, axes
+    axes[0].set_xlim(limits)
+    for ax in axes[count:]:
+        ax.remove()
+    for ax in axes[max(0, count - columns) : count]:
+        ax.set_xlabel("time (s)")
+        ax.tick_params(labelbottom=True)
+    return figure, axes[:count]
 
 
 def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Any]]]":
@@ -335,8 +345,9 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any 
     if engine is not None:
         figure.align_ylabels()
         engine.set(w_pad=0.07, h_pad=0.07)
-        # Axes of equal scales change their shape, and so their labels' places, with each pass.
-        for _ in range(1 if figure.axes[0].get_aspect() == "auto" else 4):
+        # Axes of equal scales change their shape, and so their labels' places, with each pass; on a
+        # narrow page the first one changes which ticks have labels.
+        for _ in range(4 if figure.axes[0].get_aspect() != "auto" else 2 if page().narrow else 1):
             engine.execute(figure)
         figure.set_layout_engine("none")
     return figure

@@ -94,10 +94,12 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
             "s) although V' <= 0 where they begin; the step `dt` is too long: halve it."
         )
     elif rises:
-        grows = any(found.hypotheses[h].fails for h in (Hypothesis.DECAYS, Hypothesis.STEP))
+        grows = found.hypotheses[Hypothesis.DECAYS].fails
         # Of a loop that grows by itself nobody can tell what part the wind has.
         excuse = "the loop grows by itself" if grows else "the disturbance pushes it up"
-        if result.world.disturbance is None:
+        if found.hypotheses[Hypothesis.STEP].fails:
+            excuse = "the input is held over a `dt` too long, and V' is that of one that follows"
+        elif result.world.disturbance is None:
             excuse = f"theory allows it, since {_excuse(v, found)}"
         yield f"V rises at {rises} of {len(v.value) - 1} frames; {excuse}."
     else:
