@@ -8,6 +8,7 @@ from recordings import PROMISE, flown, tracked
 
 from echelon.core.errors import OutputError
 from echelon.network.switching import Schedule
+from echelon.plots.network import curves_of
 from echelon.plots.run import NAMES, figures
 from echelon.plots.style import ONE_COLUMN, TWO_COLUMNS
 
@@ -168,6 +169,17 @@ def test_a_flock_is_bands_a_median_and_its_worst_by_name(flock):
     assert f"worst: follower {worst}" in lines
 
 
+def test_the_worst_of_a_flock_is_that_of_the_steady_window_as_in_the_table(flock):
+    errors = np.zeros_like(flock.errors)
+    errors[:, 7, 0] = np.where(flock.times < 0.8 * flock.horizon - 1e-9, 9.0, 0.1)
+    errors[:, 9, 0] = 1.0
+    told = lines_of(figures(dataclasses.replace(flock, errors=errors), ["formation"])["formation"])
+    assert "worst: follower 9" in told
+    # Ended before that window, it is the worst of all that there is.
+    early = dataclasses.replace(flock, errors=errors, horizon=9.0)
+    assert "worst: follower 7" in lines_of(figures(early, ["formation"])["formation"])
+
+
 def test_an_error_of_zero_is_no_tiny_number(flock):
     still = dataclasses.replace(flock, errors=np.zeros_like(flock.errors))
     (ax,) = figures(still, ["formation"])["formation"].axes
@@ -180,7 +192,7 @@ def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, 
 
     for own, names in ((run, NAMES), (flock, ("formation", "inputs", "trajectories"))):
         for name, figure in figures(own, names, page).items():
-            assert figure.get_figwidth() <= width
+            assert figure.get_figwidth() == width and figure.get_figheight() <= 9.0, name
             assert all(ax.yaxis.label.get_size() == 8.0 for ax in figure.axes)
             renderer = FigureCanvasAgg(figure).get_renderer()
             figure.draw(renderer)
@@ -188,6 +200,82 @@ def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, 
                 parts = [*ax._axis_map.values(), *filter(None, [ax.get_legend()])]
                 for box in filter(None, (part.get_tightbbox(renderer) for part in parts)):
                     assert box.x0 >= -1 and box.x1 <= figure.bbox.x1 + 1, (name, own.agents)
+
+
+def test_the_last_time_stands_on_the_paper_whatever_style_draws_it(flock):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    longer = dataclasses.replace(flock, times=7.5 * flock.times, horizon=15.0)
+    figure = figures(longer, ["formation"], ONE_COLUMN)["formation"]
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    assert figure.axes[0].xaxis.get_tightbbox(renderer).x1 <= figure.bbox.x1
+
+
+def test_a_link_that_would_hide_behind_an_agent_is_bent_around_it():
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [1.5, 0.4]])
+    edges = np.array([[0, 1], [0, 2], [1, 3], [3, 0], [0, 4]])
+    lines = curves_of(places, edges, 0.15)
+    assert [len(line) == 2 for line in lines] == [True, False, False, False, True]
+    for edge, line in zip(edges, lines, strict=True):
+        np.testing.assert_allclose(line[[0, -1]], places[edge])
+        fine = np.stack(
+            [
+                np.interp(np.arange(0, 1, 1e-3), s := np.linspace(0, 1, len(line)), c)
+                for c in line.T
+            ],
+            axis=1,
+        )
+        for other in np.delete(places, edge, axis=0):
+            assert np.linalg.norm(fine - other, axis=1).min() > 0.15
+
+
+def test_the_arrow_of_a_bent_link_lies_on_it(run):
+    offsets = np.zeros_like(run.offsets)
+    offsets[:, :2] = [[0, 0], [1, 0], [2, 0], [1, 1]]
+    edges = np.array([[2, 0], [0, 1], [1, 3]])
+    straight = dataclasses.replace(run, offsets=offsets, edges=edges, heard=~np.isin(edges, [0]))
+    figure = figures(straight, ["network"])["network"]
+    figure.canvas.draw()
+    (ax,) = figure.axes
+    (drawn,) = [part for part in ax.collections if len(part.get_segments()) == 3]
+    line = ax.transData.transform(drawn.get_segments()[0])
+    arrows = [text.arrow_patch for text in ax.texts if getattr(text, "arrow_patch", None)]
+    paths = [arrow.get_transform().transform_path(arrow.get_path()) for arrow in arrows]
+    # Its shaft runs along the link: each of its points is within a pixel of the link's.
+    shafts = [path.interpolated(1).to_polygons(closed_only=False)[0] for path in paths]
+    gaps = [np.linalg.norm(s[:, None] - line, axis=2).min(axis=1) for s in shafts]
+    assert min(gap[: len(gap) // 2].max() for gap in gaps) < 8.0
+
+
+def test_links_past_the_palette_are_dashed_and_what_is_wanted_has_no_links_colour(run):
+    edges = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3], [3, 1]])
+    more = dataclasses.replace(
+        run, edges=edges, weights=np.ones(7), heard=np.ones((7, 2), bool), schedule=None
+    )
+    ax = figures(more, ["distances"])["distances"].axes[0]
+    named = {line.get_label(): line for line in ax.lines}
+    looks = {
+        (named[f"{i} to {j}"].get_color(), named[f"{i} to {j}"].get_linestyle()) for i, j in edges
+    }
+    assert len(looks) == 7
+    assert named["wanted"].get_color() not in {colour for colour, _ in looks}
+
+
+def test_the_start_of_a_bound_stands_within_the_axes(run):
+    proved = dataclasses.replace(run, metric=1e4 * np.diag([1.0] + [1e-4] * 11), promise=CERTIFIED)
+    bound = proved.error_bound()
+    (ax,) = figures(proved, ["formation"])["formation"].axes
+    assert bound[0] > 10.0 * run.formation_errors.max()
+    assert ax.get_ylim()[1] >= bound[0]
+
+
+def test_axes_of_derivatives_say_when_v_rises_between_frames_that_fall(run):
+    rising = dataclasses.replace(
+        run, lyapunov=np.exp(run.times), lyapunov_rate=-np.ones(len(run.times))
+    )
+    below = figures(rising, ["lyapunov"])["lyapunov"].axes[1]
+    assert "V rises in between" in below.get_title(loc="right")
+    assert not figures(run, ["lyapunov"])["lyapunov"].axes[1].get_title(loc="right")
 
 
 def test_a_figure_that_is_none_is_refused_with_a_guess(run):

@@ -100,7 +100,7 @@ def crowding(agents: int) -> float:
     return min(1.0, NAMED / agents)
 
 
-# Leaders share their colour, so that nobody takes one for a follower; others past the palette.
+# Of leaders, who share their colour, and of followers past the palette.
 _DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)))
 
 
@@ -115,10 +115,10 @@ def pen(place: int, agents: int) -> dict[str, Any]:
     """Return the look of the line of a follower of some place among the followers."""
     crowd = crowding(agents)
     if crowd < 1.0:
-        thinner = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
-        return {"color": COLOURS[0]} | thinner
-    again, colour = divmod(place, len(COLOURS))
-    return {"color": COLOURS[colour], "linestyle": _DASHES[again % len(_DASHES)]}
+        look = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
+        return {"color": COLOURS[0]} | look
+    again, hue = divmod(place, len(COLOURS))
+    return {"color": COLOURS[hue], "linestyle": _DASHES[again % len(_DASHES)]}
 
 
 def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> dict[str, Any]:
@@ -190,13 +190,11 @@ def panels(
     rows = -(-count // columns)
     # Smaller letters need less height too.
     height *= page().letters / 10.0 if page().narrow else 1.0
-    least = 2.3 if page().narrow else 3.2
-    size = (page().width, float(np.clip(height * rows, least, _HIGHEST)))
-    figure = Figure(size, layout="constrained")
+    tall = float(np.clip(height * rows, 2.3 if page().narrow else 3.2, _HIGHEST))
+    figure = Figure((page().width, tall), layout="constrained")
     axes = list(figure.subplots(rows, columns, sharex=True, squeeze=False).ravel())
     # A lone frame stands on no axis, where half of its dots would be cut off.
-    limits = (0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon)
-    axes[0].set_xlim(limits)
+    axes[0].set_xlim((0.0, times[-1]) if len(times) > 1 else (-0.02 * horizon, horizon))
     for ax in axes[count:]:
         ax.remove()
     for ax in axes[max(0, count - columns) : count]:
@@ -340,14 +338,15 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any 
         text = "The run grew beyond these axes; what lies farther is not drawn."
         figure.suptitle(text, size=page().letters - 1.0, wrap=True)
     for ax in figure.axes:
+        # By the letters' size ticks are chosen: at that of a later style they would be others.
+        ax.tick_params(labelsize=page().letters - 1.0)
         _tell_power(ax)
     engine: Any = figure.get_layout_engine()
     if engine is not None:
         figure.align_ylabels()
         engine.set(w_pad=0.07, h_pad=0.07)
-        # Axes of equal scales change their shape, and so their labels' places, with each pass; on a
-        # narrow page the first one changes which ticks have labels.
-        for _ in range(4 if figure.axes[0].get_aspect() != "auto" else 2 if page().narrow else 1):
+        # Axes of equal scales change their shape, and so their labels' places, with each pass.
+        for _ in range(1 if figure.axes[0].get_aspect() == "auto" else 4):
             engine.execute(figure)
         figure.set_layout_engine("none")
     return figure
