@@ -218,13 +218,8 @@ def test_a_link_that_would_hide_behind_an_agent_is_bent_around_it():
     assert [len(line) == 2 for line in lines] == [True, False, False, False, True]
     for edge, line in zip(edges, lines, strict=True):
         np.testing.assert_allclose(line[[0, -1]], places[edge])
-        fine = np.stack(
-            [
-                np.interp(np.arange(0, 1, 1e-3), s := np.linspace(0, 1, len(line)), c)
-                for c in line.T
-            ],
-            axis=1,
-        )
+        share = np.linspace(0.0, 1.0, len(line))
+        fine = np.stack([np.interp(np.arange(0, 1, 1e-3), share, c) for c in line.T], axis=1)
         for other in np.delete(places, edge, axis=0):
             assert np.linalg.norm(fine - other, axis=1).min() > 0.15
 
@@ -238,13 +233,13 @@ def test_the_arrow_of_a_bent_link_lies_on_it(run):
     figure.canvas.draw()
     (ax,) = figure.axes
     (drawn,) = [part for part in ax.collections if len(part.get_segments()) == 3]
-    line = ax.transData.transform(drawn.get_segments()[0])
-    arrows = [text.arrow_patch for text in ax.texts if getattr(text, "arrow_patch", None)]
-    paths = [arrow.get_transform().transform_path(arrow.get_path()) for arrow in arrows]
-    # Its shaft runs along the link: each of its points is within a pixel of the link's.
-    shafts = [path.interpolated(1).to_polygons(closed_only=False)[0] for path in paths]
-    gaps = [np.linalg.norm(s[:, None] - line, axis=2).min(axis=1) for s in shafts]
-    assert min(gap[: len(gap) // 2].max() for gap in gaps) < 8.0
+    begin, *_, end = ways = ax.transData.transform(drawn.get_segments()[0])[::-1]
+    arrow = next(filter(None, (getattr(text, "arrow_patch", None) for text in ax.texts)))
+    handle = arrow.get_connectionstyle().connect(begin, end).vertices[1]
+    # Of a parabola with this handle the middle.
+    middle = 0.25 * (begin + 2.0 * handle + end)
+    np.testing.assert_allclose(middle, ways[len(ways) // 2], atol=1.0)
+    assert np.linalg.norm(middle - 0.5 * (begin + end)) > 20.0
 
 
 def test_links_past_the_palette_are_dashed_and_what_is_wanted_has_no_links_colour(run):

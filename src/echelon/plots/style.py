@@ -113,8 +113,7 @@ def leader_pen(place: int, agents: int) -> dict[str, Any]:
 
 def pen(place: int, agents: int) -> dict[str, Any]:
     """Return the look of the line of a follower of some place among the followers."""
-    crowd = crowding(agents)
-    if crowd < 1.0:
+    if (crowd := crowding(agents)) < 1.0:
         look = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
         return {"color": COLOURS[0]} | look
     again, hue = divmod(place, len(COLOURS))
