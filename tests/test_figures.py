@@ -225,13 +225,15 @@ def test_a_link_that_would_hide_behind_an_agent_is_bent_around_it():
 
 
 def test_the_arrow_of_a_bent_link_lies_on_it(run):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     offsets = np.zeros_like(run.offsets)
     offsets[:, :2] = [[0, 0], [1, 0], [2, 0], [1, 1]]
     edges = np.array([[2, 0], [0, 1], [1, 3]])
     straight = dataclasses.replace(run, offsets=offsets, edges=edges, heard=~np.isin(edges, [0]))
     figure = figures(straight, ["network"])["network"]
-    figure.canvas.draw()
     (ax,) = figure.axes
+    FigureCanvasAgg(figure).draw()
     (drawn,) = [part for part in ax.collections if len(part.get_segments()) == 3]
     begin, *_, end = ways = ax.transData.transform(drawn.get_segments()[0])[::-1]
     arrow = next(filter(None, (getattr(text, "arrow_patch", None) for text in ax.texts)))
