@@ -84,7 +84,7 @@ def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
         ax.xaxis.set_major_locator(FixedLocator([*-powers[::-1], 0.0]))
         # Between the powers they show that the axis is no straight one.
         between = np.outer(powers, np.arange(2.0, 10.0)).ravel()
-        ax.xaxis.set_minor_locator(FixedLocator(-between[between < 1.6 * most]))
+        ax.xaxis.set_minor_locator(FixedLocator([*-between[between < 1.6 * most]]))
         ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
     else:
@@ -236,7 +236,7 @@ def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
 def _bend(places: Array, edge: Array, least: float) -> Array:
     # Links that begin at agents beside each other go to different sides.
     bends = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
-    lines = [_arc(*places[edge], bend) for bend in bends]
+    lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in bends]
     gaps = [_gap(places, edge, line) for line in lines]
     clear = [line for line, gap in zip(lines, gaps, strict=True) if gap > least]
     return clear[0] if clear else lines[int(np.argmax(gaps))]
