@@ -107,7 +107,8 @@ def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) ->
 
     Of a run that ended before its steady window it is the largest over all of it.
     """
-    steady = run.times >= run.horizon - float(run.attributes["steady_window"])
+    window = float(run.attributes.get("steady_window", 0.2 * run.horizon))
+    steady = run.times >= run.horizon - window
     with np.errstate(over="ignore", invalid="ignore"):
         place = int(np.argmax((errors[steady if steady.any() else ...] ** 2).sum(axis=0)))
     name = f"worst: follower {run.followers[place]}"
