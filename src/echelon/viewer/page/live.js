@@ -113,8 +113,7 @@ class Live {
   hear(told) {
     if (told.promise) this.tellPromise(told.promise);
     if (told.note !== undefined) this.note = told.note;
-    if (told.causes) this.causes = told.causes;
-    if (told.reset) (this.view.trail.forget(), (this.causes = []));
+    if (told.reset) this.view.trail.forget();
     if (told.panel) (this.makeKnobs(told.panel, told.choices), this.view.setHeard(told.heard));
     if (told.knobs) this.stand(told);
     this.tellNotes();
