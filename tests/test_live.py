@@ -380,11 +380,11 @@ def test_the_badge_is_green_only_where_what_is_promised_reaches():
 def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
     for errors in ([0.0, 0.5, 1.0, 1.9, 1.0], [1e-9, 1e-9, 1e-9, 1e-3, 9e-3]):
         assert len(badges_of(ech.models.DoubleIntegrator(), errors)) == 1
-    # What is done to the loop has a swing of its own.
-    assert (
-        len(badges_of(ech.models.DoubleIntegrator(), [1e-9, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4))
-        == 1
-    )
+    # What is done has a swing of its own, and errors without equal are doubted until they halve.
+    model = ech.models.DoubleIntegrator()
+    assert len(badges_of(model, [0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
+    fallen = badges_of(model, [0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
+    assert [each["state"] for each in fallen] == ["holds", "lost", "edge", "holds"]
 
 
 # ---- the server and the page ------------------------------------------------------------------

@@ -132,15 +132,14 @@ class Reach:
         if self.stood == 0:
             return self.badge
         if self.stood == 1:
-            short = f"{self.badge['short']}, if near enough"
-            return {**self.badge, "state": "edge", "short": short, "whole": self._whole([_DOUBT])}
+            short, causes = f"{self.badge['short']}, if near enough", [_DOUBT]
+            return self._instead("edge", short, causes)
         causes = [each for each in (*self.badge["beyond"], self.left) if each]
-        short = "what is promised does not reach here"
-        whole = self._whole(causes)
-        return {**self.badge, "state": "lost", "short": short, "whole": whole, "causes": causes}
+        return self._instead("lost", "what is promised does not reach here", causes)
 
-    def _whole(self, first: list[str]) -> str:
-        return f"{' '.join(first)} {self.badge['whole']}"
+    def _instead(self, state: str, short: str, causes: list[str]) -> Mapping[str, Any]:
+        whole = f"{' '.join(causes)} {self.badge['whole']}"
+        return {**self.badge, "state": state, "short": short, "whole": whole, "causes": causes}
 
 
 def lost(picture: Picture) -> str:
