@@ -8,7 +8,8 @@ const MARGIN = { left: 46, right: 14, top: 6, bottom: 20 };
 function brief(value) {
   if (!Number.isFinite(value)) return "\u2013";
   const size = Math.abs(value);
-  if (size && (size < 1e-3 || size >= 1e5)) {
+  if (!size) return "0";
+  if (size < 1e-3 || size >= 1e5) {
     const power = Math.floor(Math.log10(size));
     return `${(value / 10 ** power).toFixed(1)}\u00b7${raise(power)}`.replace("-", "\u2212");
   }
