@@ -18,9 +18,10 @@ from echelon.live import server as served
 from echelon.live import swarm as looked
 from echelon.live.knobs import Panel
 from echelon.live.promiser import badge_of, first_look
+from echelon.live.reach import Reach
 from echelon.live.server import live, serve_live
 from echelon.live.session import Session
-from echelon.live.swarm import Swarm
+from echelon.live.swarm import Picture, Swarm
 from echelon.results.lyapunov import lyapunov
 from echelon.scenario.build import build
 from echelon.scenario.scenario import scenario_from_mapping
@@ -342,6 +343,48 @@ def test_a_growing_mode_is_told_at_once(panel):
     assert look["state"] == found["state"] == "lost"
     assert look["short"] == found["short"] and "a mode grows, +" in look["short"]
     assert any("raise `coupling`" in cause for cause in found["causes"])
+
+
+HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0, "causes": []}
+
+
+def badges_of(model, errors, pitch=None, begins=None):
+    """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
+    told, names = [], model.state_names
+    reach = Reach(model, ech.Graph.path(2), told.append)
+    reach.hear(HELD | {"beyond": ["what is promised does not reach this run: far"]})
+    for second, error in enumerate(errors):
+        if second == begins:
+            reach.begin()
+        states = np.zeros((2, len(names)))
+        if pitch is not None:
+            states[1, names.index("pitch")] = pitch[second]
+        size, none = np.array([0.0, error]), np.zeros(2, bool)
+        reach.look(Picture(float(second), states, states, size, states, np.nan, none))
+    return told
+
+
+def test_the_badge_is_green_only_where_what_is_promised_reaches():
+    grown = badges_of(
+        ech.models.DoubleIntegrator(), [1.0, 1.5, 1.0, 2.9, 3.1, 4.0, 3.0, 2.1, 2.0, 1.0]
+    )
+    assert [each["state"] for each in grown] == ["holds", "lost", "holds"]
+    assert "does not reach this run" in grown[1]["causes"][0]
+    out = badges_of(
+        ech.models.Quadrotor(), [2.0, 8.0, 8.0, 5.0, 4.0], pitch=[0.0, 1.6, 0.0, 0.0, 0.0]
+    )
+    assert [each["state"] for each in out] == ["holds", "lost", "holds"]
+    assert "Agent 1 left the chart of its equations at t = 1.00 s: `pitch`" in out[1]["causes"][1]
+
+
+def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
+    for errors in ([0.0, 0.5, 1.0, 1.9, 1.0], [1e-9, 1e-9, 1e-9, 1e-3, 9e-3]):
+        assert len(badges_of(ech.models.DoubleIntegrator(), errors)) == 1
+    # What is done has a swing of its own, and errors without equal are doubted until they halve.
+    model = ech.models.DoubleIntegrator()
+    assert len(badges_of(model, [0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
+    fallen = badges_of(model, [0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
+    assert [each["state"] for each in fallen] == ["holds", "lost", "edge", "holds"]
 
 
 # ---- the server and the page ------------------------------------------------------------------

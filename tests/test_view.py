@@ -20,7 +20,7 @@ from echelon.results.dataset import dataset
 from echelon.results.recording import recording
 from echelon.viewer.growing import Growing, serve_growing
 from echelon.viewer.pack import Group, pack
-from echelon.viewer.replay import frames_of, replay_data, replay_page
+from echelon.viewer.replay import frames_of, header, promise_badge, replay_data, replay_page
 from echelon.viewer.serve import Handler, serve, serving
 
 
@@ -511,3 +511,16 @@ def test_a_page_that_is_served_is_drawn_too(browser, run):
 
     with serving(serve(Page, 0)) as address, opened(browser, address) as page:
         assert page.evaluate("echelon.last") == 300
+
+
+def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_lost(run):
+    told = {"promised": True, "sentence": "Promised.", "theorem": None, "kind": "linearization"}
+    slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
+    assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
+    turns = promise_badge(told | {"rate": 0.452, "slowest_mode": -1.32})
+    assert "0.452 1/s is kept whichever graph holds" in turns["whole"]
+    promise = dict(run.promise) | told | {"rate": 0.5, "slowest_mode": -0.5}
+    for outcome, state in (("completed", "holds"), ("left_chart", "lost"), ("diverged", "lost")):
+        ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}
+        drawn = dataclasses.replace(run, promise=promise, attributes=ended)
+        assert header(drawn, space_of(run))["promise"]["state"] == state

@@ -4,46 +4,57 @@ import base64
 import dataclasses
 import html
 import io
-
-import numpy as np
+from collections.abc import Iterator
 
 from echelon.engine.result import Result
 from echelon.plots.run import figures
+from echelon.promises.promise import promise
+from echelon.reports.causes import causes, grows
+from echelon.reports.run import labelled
 from echelon.results.foreseen import foreseen
+from echelon.results.metrics import formation_errors, metrics
 from echelon.results.recording import Recording
 
-_SHOWN = 12
-"""Agents that the table names."""
 _PICTURES = ("trajectories", "formation")
 
 
 def result_page(result: Result) -> str:
-    """Return how a run ended, its first agents as a table, and its pictures, as HTML."""
+    """Return how a run ended and why, its agents as a table, and its pictures, as HTML.
+
+    Of many agents the table has the best, the median and the worst, as the report has.
+    """
     title = result.provenance.get("scenario") or type(result.model).__name__
     told = f"<b>{html.escape(title)}</b>: {html.escape(result.message)}"
-    return f"<p>{told}</p>{_table(result)}{_pictures(result)}"
+    return f"<p>{told}</p>{_causes(result)}{_table(result)}{_pictures(result)}"
+
+
+def _causes(result: Result) -> str:
+    """Return why a run was lost, or ends farther from its goals than it began."""
+    # A promise takes seconds to be found, and a run that did well has nothing to explain.
+    if not len(result.times) or not grows(result):
+        return ""
+    found = causes(result, metrics(result), promise(result.parts, result.settings))
+    told = "".join(f"<li>{html.escape(each.sentence())}</li>" for each in found)
+    return f"<ul>{told}</ul>" if told else ""
 
 
 def _table(result: Result) -> str:
     unit = " (m)" if result.unit == "m" else ""
     heads = ("agent", f"error at the start{unit}", f"at the end{unit}", "limited (% of steps)")
     rows = "".join(_row(cells) for cells in _cells(result))
-    more = result.graph.agents - _SHOWN
-    rest = f"<p>and {more} agents more</p>" if more > 0 else ""
     head = "".join(f"<th>{each}</th>" for each in heads)
-    return f"<table><tr>{head}</tr>{rows}</table>{rest}"
+    return f"<table><tr>{head}</tr>{rows}</table>"
 
 
-def _cells(result: Result) -> list[tuple[str, ...]]:
-    leads, found = {*result.graph.leaders}, []
-    with np.errstate(over="ignore", invalid="ignore"):
-        sizes = np.linalg.norm(result.errors[:, :_SHOWN, list(result.measured)], axis=2)
-    for agent in range(sizes.shape[1]):
-        role = "leader" if agent in leads else "follower"
-        ends = () if agent in leads or not len(sizes) else sizes[[0, -1], agent]
-        shown = [f"{each:.3g}" for each in ends] or ["", ""]
-        found.append((f"{role} {agent}", *shown, f"{100.0 * result.saturated[agent]:.3g}"))
-    return found
+def _cells(result: Result) -> Iterator[tuple[str, ...]]:
+    """Yield the leaders and the followers as the report names them."""
+    numbers, errors = metrics(result), formation_errors(result)
+    for label, each in labelled("leader", numbers.leaders):
+        yield label, "", "", f"{100.0 * each.saturated:.3g}"
+    for label, each in labelled("follower", numbers.followers):
+        ends = errors[[0, -1], each.agent] if len(errors) else ()
+        shown = [f"{size:.3g}" for size in ends] or ["", ""]
+        yield label, *shown, f"{100.0 * each.saturated:.3g}"
 
 
 def _row(cells: tuple[str, ...]) -> str:

@@ -111,6 +111,12 @@ class Result:
         """The unit of errors: m for a position, `state` for abstract states."""
         return "m" if self.model.position else "state"
 
+    def __repr__(self) -> str:
+        """Return who ran, for how long, and how it ended."""
+        # Arrays would fill the screen, and have names to ask for.
+        who = f"{self.graph.agents} x {type(self.model).__name__}"
+        return f"Result({who}, {len(self.times)} frames, {self.message!r})"
+
     def _repr_html_(self) -> str:
         """Return the run as a notebook shows it: a table, with its picture."""
         return page_of("result", self)

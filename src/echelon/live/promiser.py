@@ -27,7 +27,6 @@ class Promiser:
         """Start the thread, which waits for a question."""
         self.answer = answer
         self.asked: tuple[Panel, Knobs] | None = None
-        self.beyond = list[str]()
         self.woken, self.ended = threading.Condition(), False
         self.thread = threading.Thread(target=self._work, daemon=True)
         self.thread.start()
@@ -59,7 +58,6 @@ class Promiser:
             found = badge_of(*asked)
             # A knob that was turned meanwhile has made it an answer to no question.
             if self.asked is None and not self.ended:
-                self.beyond = found.get("beyond", [])
                 self.answer(found)
 
 
@@ -75,7 +73,9 @@ def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
     badge: dict[str, Any] = promise_badge(found.as_mapping())
     badge["causes"] = [each.sentence() for each in found.causes]
     badge["edge"] = found.edge
-    # Told where the formation flies apart all the same.
+    badge["rate"], certified = found.rate, found.certified
+    badge["anywhere"] = certified is not None and certified.radius == float("inf")
+    # Told where the promise does not reach.
     badge["beyond"] = [each.sentence() for each in beyond(0.0, found)]
     if found.promised and _near(found, knobs):
         badge |= {"state": "edge", "short": f"{badge['short']}, at its edge"}

@@ -14,6 +14,7 @@ from echelon.live.choices import under
 from echelon.live.header import drawn
 from echelon.live.knobs import Knobs, Panel, check_choice
 from echelon.live.promiser import Promiser
+from echelon.live.reach import Reach, lost
 from echelon.live.swarm import Picture, Swarm
 from echelon.results.foreseen import heard_in
 from echelon.scenario.scenario import Scenario
@@ -49,7 +50,8 @@ class Session:
         self.first, self.loops = panel, {panel.law: (panel, swarm)}
         self.origin = swarm.states
         self._check()
-        self.promiser = Promiser(self.say_promise)
+        self.reach = Reach(swarm.parts.model, swarm.parts.graph, self.say_promise)
+        self.promiser = Promiser(self.reach.hear)
 
     def _check(self) -> None:
         """Check what the scenario does live, and compile the laws that it takes.
@@ -136,8 +138,10 @@ class Session:
         """Make a picture the latest one."""
         if picture.beyond.any():
             self.lost = True
-            self.say({"note": _lost(picture), "causes": self.promiser.beyond})
+            self.say({"note": lost(picture)})
+            self.reach.lose()
             return
+        self.reach.look(picture)
         frame = self._packed(picture)
         with self.changed:
             self.frame, self.number = frame, self.number + 1
@@ -292,6 +296,7 @@ class Session:
         knobs = self.knobs
         for name, value in event.items():
             if name == "kick":
+                self.reach.begin()
                 for agent, by in value.items():
                     self.swarm.kick(int(agent), np.asarray(by, float))
             elif name in ("cut", "restore"):
@@ -310,6 +315,7 @@ class Session:
 
     def _stand(self, knobs: Knobs) -> None:
         self.knobs = knobs
+        self.reach.begin()
         self.swarm.turn(knobs)
         self.promiser.ask(self.panel, knobs)
         self.say(self.standing())
@@ -340,6 +346,7 @@ class Session:
         before, self.swarm = self.swarm, self.loops[law][1]
         self.panel = self.loops[law][0]
         self.swarm.restart(np.asarray(before.now.states, float), before.steps)
+        self.reach.begin()
         self.say(self._law_told())
         kept = {name for name in self.panel.ranges if name not in ("coupling",)}
         told = {name: getattr(knobs, name) for name in {"shape", "cut", *kept}}
@@ -352,6 +359,7 @@ class Session:
     def _reset(self) -> None:
         """Begin again, with the knobs as they stand."""
         self.swarm.restart(self.origin)
+        self.reach.restart()
         self.lost, self.events, self.future = False, [], []
         names = [name for name in (*_CHOSEN, *self.panel.ranges) if _stands(self, name)]
         told: dict[str, Any] = {} if self.panel is self.first else {"law": self.panel.law}
@@ -383,12 +391,3 @@ def _plain(spec: Any) -> dict[str, Any]:
 def _without_place(error: EchelonError) -> str:
     """Return what was refused without the file's name, of which there is none here."""
     return str(error).removeprefix("mapping: ")
-
-
-def _lost(picture: Picture) -> str:
-    """Return who was lost, and when, in words."""
-    who, when = int(np.argmax(picture.beyond)), f"at {picture.time:.2f} s"
-    if np.isfinite(picture.states[who]).all():
-        far = np.abs(picture.states[who]).max()
-        return f"Agent {who} has flown apart, to {far:.1e}, {when}; reset."
-    return f"The state of agent {who} stopped being finite {when}; reset."

@@ -23,7 +23,8 @@ class Lemniscate(Reference):
     center + (ax cos th / (1 + sin^2 th), ay sin th cos th / (1 + sin^2 th)), th = rate t + phase.
 
     The defaults are the fit of the drawn curve; center and amplitude in m, rate in rad/s, phase and
-    yaw in rad, yaw_rate in rad/s.
+    yaw in rad, yaw_rate in rad/s. The center has three numbers for agents in a plane too, which
+    leave its height out.
     """
 
     center: _Vector = (0.25, 0.25, 1.0)
@@ -49,8 +50,8 @@ class Lemniscate(Reference):
 class FigureEight(Reference):
     """center + (ax sin th, ay sin 2 th), th = rate t + phase.
 
-    Center and amplitude are in m, rate in rad/s, phase and yaw in rad, yaw_rate
-    in rad/s.
+    Center and amplitude are in m, rate in rad/s, phase and yaw in rad, yaw_rate in rad/s. The
+    center has three numbers for agents in a plane too, which leave its height out.
     """
 
     center: _Vector = (0.0, 0.0, 1.0)
@@ -76,8 +77,8 @@ class FigureEight(Reference):
 class Circle(Reference):
     """center + radius (cos th, sin th), th = rate t + phase.
 
-    Center and radius are in m, rate in rad/s, phase and yaw in rad, yaw_rate
-    in rad/s.
+    Center and radius are in m, rate in rad/s, phase and yaw in rad, yaw_rate in rad/s. The center
+    has three numbers for agents in a plane too, which leave its height out.
     """
 
     center: _Vector = (0.0, 0.0, 1.0)

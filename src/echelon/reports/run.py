@@ -91,8 +91,8 @@ def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
     # One leader needs no number, and has its name from the paper's table.
     alone = ["leader"] if len(leaders) == 1 else None
-    rows = [_leader_row(label, each) for label, each in _labelled("leader", leaders, alone)]
-    rows += [_follower_row(label, each) for label, each in _labelled("follower", followers)]
+    rows = [_leader_row(label, each) for label, each in labelled("leader", leaders, alone)]
+    rows += [_follower_row(label, each) for label, each in labelled("follower", followers)]
     if printed:
         for k, row in enumerate(rows):
             row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
@@ -102,7 +102,7 @@ def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
 _Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)
 
 
-def _labelled(
+def labelled(
     role: str, each: Sequence[_Row], labels: list[str] | None = None
 ) -> Iterator[tuple[str, _Row]]:
     """Yield all of a role, or of many the best, the median and the worst, each with its label."""

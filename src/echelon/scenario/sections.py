@@ -156,7 +156,7 @@ class OwnClass(BaseModel):
 class ReferenceSpec(BaseModel):
     """What the leader tracks: a bundled reference by its name, or a class in a file of yours.
 
-    That reference's own keys stand beside it, such as `radius` beside `name: circle`.
+    Own keys stand beside it, as `radius` beside `name: circle`. Points are x, y, z in a plane too.
     """
 
     model_config = _either("name", "python") | ConfigDict(extra="allow")

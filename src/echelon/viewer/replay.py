@@ -113,7 +113,7 @@ def header(run: Recording, space: Space) -> dict[str, Any]:
         "title": run.name,
         "facts": facts(run),
         "notes": _notes(run, space),
-        "promise": promise_badge(run.promise),
+        "promise": _badge_of_run(run),
         "agents": run.agents,
         "leaders": list(run.leaders),
         "nearest": run.nearest.tolist(),
@@ -180,7 +180,30 @@ def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
     rate, kind = promise["rate"], promise["kind"]
     by = promise["theorem"] or kind
     short = f"promised: {rate:.3g} 1/s, {by}" if rate else f"promised: V does not rise, {by}"
-    return {"state": "holds", "short": short, "whole": promise["sentence"]}
+    whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
+    return {"state": "holds", "short": short, "whole": whole}
+
+
+def _rate_in_words(promise: Mapping[str, Any]) -> str:
+    """Return which rate stands in the badge; nothing where it stands in the promise's sentence."""
+    rate, slowest = promise["rate"], promise.get("slowest_mode")
+    if not rate or promise["theorem"]:
+        return ""
+    if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
+        return f"The rate {rate:.3g} 1/s is that of the slowest mode."
+    return (
+        f"The rate {rate:.3g} 1/s is kept whichever graph holds and turn is flown; the slowest "
+        f"mode by itself is {slowest:.3g} 1/s."
+    )
+
+
+def _badge_of_run(run: Recording) -> dict[str, str]:
+    """Return the badge of a run, in red where what was promised did not reach it."""
+    badge, ended = promise_badge(run.promise), run.attributes.get("outcome")
+    if badge["state"] != "holds" or ended not in ("left_chart", "diverged"):
+        return badge
+    short, whole = "what is promised does not reach this run", badge["whole"]
+    return {"state": "lost", "short": short, "whole": f"{run.attributes['message']} {whole}"}
 
 
 def _size(run: Recording, space: Space) -> tuple[float, str]:

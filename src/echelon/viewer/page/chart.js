@@ -8,11 +8,13 @@ const MARGIN = { left: 46, right: 14, top: 6, bottom: 20 };
 function brief(value) {
   if (!Number.isFinite(value)) return "\u2013";
   const size = Math.abs(value);
-  if (size && (size < 1e-3 || size >= 1e5)) {
+  if (!size) return "0";
+  if (size < 1e-3 || size >= 1e5) {
     const power = Math.floor(Math.log10(size));
     return `${(value / 10 ** power).toFixed(1)}\u00b7${raise(power)}`.replace("-", "\u2212");
   }
-  return value.toPrecision(3).replace("-", "\u2212");
+  // Three digits are too few before the point of a thousand.
+  return (size >= 1e3 ? value.toFixed(0) : value.toPrecision(3)).replace("-", "\u2212");
 }
 
 class Chart {
@@ -97,6 +99,7 @@ class Chart {
     pen.clip();
     this.drawMarks(pen, w);
     for (const line of this.lines) this.drawLine(pen, line);
+    this.nameMarks(pen, w);
     pen.restore();
     if (this.now !== undefined) this.point(this.now);
   }
@@ -115,20 +118,33 @@ class Chart {
     }
     Object.assign(pen, { textAlign: "center", textBaseline: "bottom" });
     const marks = ticks(first, last, across);
-    marks.forEach((t, k) => pen.fillText(shown(t, across) + (k === marks.length - 1 ? " s" : ""), this.x(t), h - 1));
+    marks.forEach((t, k) => {
+      const words = shown(t, across) + (k === marks.length - 1 ? " s" : "");
+      pen.fillText(words, Math.min(this.x(t), w - 1 - pen.measureText(words).width / 2), h - 1);
+    });
   }
 
   drawMarks(pen, w) {
     for (const mark of this.marks) {
       const y = this.y(this.log ? Math.log10(mark.value) : mark.value);
-      Object.assign(pen, { strokeStyle: themeColour("--cut"), fillStyle: themeColour("--cut"), lineWidth: 1, textAlign: "right", textBaseline: mark.below ? "top" : "bottom" });
+      Object.assign(pen, { strokeStyle: themeColour("--cut"), lineWidth: 1 });
       pen.setLineDash([4, 3]);
       pen.beginPath();
       pen.moveTo(MARGIN.left, y);
       pen.lineTo(w - MARGIN.right, y);
       pen.stroke();
       pen.setLineDash([]);
-      pen.fillText(mark.name, w - MARGIN.right - 2, y + (mark.below ? 2 : -2));
+    }
+  }
+
+  // Names over the curves, which would strike them through.
+  nameMarks(pen, w) {
+    for (const mark of this.marks) {
+      const y = this.y(this.log ? Math.log10(mark.value) : mark.value);
+      Object.assign(pen, { strokeStyle: themeColour("--panel"), fillStyle: themeColour("--cut"), lineWidth: 4, lineJoin: "round", textAlign: "right", textBaseline: mark.below ? "top" : "bottom" });
+      const at = [mark.name, w - MARGIN.right - 2, y + (mark.below ? 2 : -2)];
+      pen.strokeText(...at);
+      pen.fillText(...at);
     }
   }
 
@@ -155,10 +171,12 @@ class Chart {
     if (!this.x) return;
     this.cursor.style.transform = `translateX(${this.x(time).toFixed(1)}px)`;
     const k = Math.max(0, Math.min(this.times.length - 1, upper(this.times, time) - 1));
+    // What is nothing beside the axis is rounding.
+    const most = Math.max(...this.reach().map(Math.abs));
     this.lines.forEach((line, place) => {
       const value = line.values[k];
       if (this.readouts[place] && !line.mute)
-        this.readouts[place].textContent = Number.isFinite(value) ? brief(this.log ? 10 ** value : value) : this.log ? "0" : "";
+        this.readouts[place].textContent = Number.isFinite(value) ? brief(this.log ? 10 ** value : Math.abs(value) < 1e-9 * most ? 0 : value) : this.log ? "0" : "";
     });
   }
 }

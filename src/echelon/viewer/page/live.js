@@ -113,8 +113,7 @@ class Live {
   hear(told) {
     if (told.promise) this.tellPromise(told.promise);
     if (told.note !== undefined) this.note = told.note;
-    if (told.causes) this.causes = told.causes;
-    if (told.reset) (this.view.trail.forget(), (this.causes = []));
+    if (told.reset) this.view.trail.forget();
     if (told.panel) (this.makeKnobs(told.panel, told.choices), this.view.setHeard(told.heard));
     if (told.knobs) this.stand(told);
     this.tellNotes();
@@ -123,7 +122,7 @@ class Live {
   tellPromise(badge) {
     tellPromise(badge);
     this.promise = badge;
-    this.causes = badge.state === "lost" ? (badge.causes ?? []) : [];
+    this.causes = badge.causes ?? [];
     const knob = this.knobs.coupling;
     if (knob && badge.edge) knob.mark(badge.edge);
   }
@@ -275,6 +274,7 @@ class Knob {
   tell(value) {
     this.value = value;
     this.output.textContent = `${this.log ? value.toPrecision(3) : value.toFixed(this.high > 50 ? 0 : 2)} ${this.unit}`.replace("-", "\u2212");
+    this.input.setAttribute("aria-valuetext", this.output.textContent);
   }
 
   // What the server says, unless a hand is on the slider.

@@ -190,29 +190,45 @@ class View {
     this.home();
   }
 
+  // What is drawn, and whoever has left it meanwhile.
+  everything() {
+    const { low, high } = this.run.box, p = this.moment?.position ?? [];
+    const ends = [[...low], [...high]];
+    for (let at = 0; at < p.length; at++) {
+      if (!Number.isFinite(p[at])) continue;
+      ends[0][at % 3] = Math.min(ends[0][at % 3], p[at]);
+      ends[1][at % 3] = Math.max(ends[1][at % 3], p[at]);
+    }
+    return ends;
+  }
+
   // Look at everything.
   home() {
-    const { low, high } = this.run.box, [w, h] = [this.element.clientWidth || 16, this.element.clientHeight || 9];
-    this.orbit.target.copy(this.middle);
+    const [low, high] = this.everything(), [w, h] = [this.element.clientWidth || 16, this.element.clientHeight || 9];
+    const middle = new THREE.Vector3(...low.map((value, k) => (value + high[k]) / 2));
+    const reach = Math.max(...high.map((value, k) => value - low[k]));
+    if (!this.flat) Object.assign(this.camera, { near: reach / 500, far: reach * 60 });
+    this.camera.updateProjectionMatrix();
+    this.orbit.target.copy(middle);
     this.moved = null;
     if (this.flat) {
-      this.camera.position.set(this.middle.x, this.middle.y, 10);
+      this.camera.position.set(middle.x, middle.y, 10);
       this.camera.zoom = 0.86 * Math.min(w / (high[0] - low[0]), h / (high[1] - low[1]));
       this.camera.updateProjectionMatrix();
     } else {
-      this.stand(w / h);
+      this.stand(w / h, low, high, middle);
     }
     this.orbit.update();
     this.draw();
   }
 
   // Stand so near that the box just fits, its middle in the middle of the picture.
-  stand(aspect) {
+  stand(aspect, low, top, center) {
     const back = new THREE.Vector3(0.42, -0.78, 0.47).normalize(), up = new THREE.Vector3(0, 0, 1);
     const right = up.clone().cross(back).normalize(), high = back.clone().cross(right);
     const tall = Math.tan((this.camera.fov * Math.PI) / 360) * 0.87, wide = tall * aspect;
-    const { low, high: top } = this.run.box, corners = [];
-    for (let k = 0; k < 8; k++) corners.push(new THREE.Vector3(...[0, 1, 2].map((axis) => ((k >> axis) & 1 ? top : low)[axis])).sub(this.middle));
+    const corners = [];
+    for (let k = 0; k < 8; k++) corners.push(new THREE.Vector3(...[0, 1, 2].map((axis) => ((k >> axis) & 1 ? top : low)[axis])).sub(center));
     let [x, y, away] = [0, 0, 0];
     // Where the picture's middle is depends on how far off it is seen from.
     for (let round = 0; round < 8; round++) {

@@ -161,8 +161,10 @@ class Backdrop {
     const { view, w, h } = this, { space } = view.run, [sx, sy] = space.stretch;
     const half = [w, h].map((size) => size / 2 / view.camera.zoom), at = view.camera.position;
     const range = [[at.x - half[0], at.x + half[0], sx], [at.y - half[1], at.y + half[1], sy]];
+    const even = niceStep(2 * half[0] / sx, w / 90);
     const [xs, ys] = range.map(([low, high, s], k) => {
-      const step = niceStep((high - low) / s, [w / 90, h / 60][k]);
+      // One step for both, where both have one scale.
+      const step = sx === sy ? even : niceStep((high - low) / s, [w / 90, h / 60][k]);
       return ticks(low / s, high / s, step).map((value) => [value, s * value, step]);
     });
     for (const [value, x] of xs) this.line([view.project(x, 0, 0)[0], 0], [view.project(x, 0, 0)[0], h], !value);
@@ -235,7 +237,7 @@ class Labels {
     const { view } = this, p = view.moment?.position;
     if (!p) return;
     for (const [agent, label] of this.all) {
-      const up = view.flat ? [0, 0.75 * view.run.size, 0] : [0, 0, 0.4 * view.run.size];
+      const up = view.flat ? [0, 0.3 * view.run.size, 0] : [0, 0, 0.4 * view.run.size];
       const at = view.project(...up.map((value, k) => p[3 * agent + k] + value));
       label.hidden = !at || !this.shown;
       if (at) label.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px) translate(-50%, -110%)`;
