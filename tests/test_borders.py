@@ -16,6 +16,7 @@ from echelon.core.words import Kind, Theorem
 from echelon.engine.prepare import prepare
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.chains import chains_of
+from echelon.models.model import FlatBound, FlatChains
 from echelon.promises.everywhere import bounds_of
 from echelon.promises.promise import promise
 from echelon.verifier.verify import verify
@@ -209,3 +210,54 @@ def test_a_model_that_ends_somewhere_unknown_is_promised_nothing():
     found = promised(swings(Tilted()))
     assert not found.promised
     assert "does not say where its flat coordinates end" in found.sentence()
+
+
+# ---- bounds that models state --------------------------------------------------------------------
+
+
+def bounded(*bounds, degree=2):
+    """A pendulum that states these bounds."""
+
+    class Bounded(Swing):
+        flat_chains, flat_bounds = FlatChains((degree,), (0,)), bounds
+
+    return Bounded()
+
+
+@pytest.mark.parametrize(
+    ("bound", "text"),
+    [
+        (("angle",), "must be a tuple of `FlatBound`"),
+        (FlatBound("angle", 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound((), 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound(("q",), 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound(("angle", "angle"), 1, 0.0, "slow"), "must name different outputs"),
+        (FlatBound(("angle",), 0, -1.0, "slow"), "order 0 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 2, -1.0, "slow"), "order 2 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 1.0, -1.0, "slow"), "order 1.0 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 1, float("nan"), "slow"), "above nan, which must be a finite"),
+    ],
+)
+def test_a_bound_of_which_nothing_is_proved_is_refused(bound, text):
+    with pytest.raises(EchelonError, match=text):
+        StoppingPoint().prepared(bounded(bound), TREE)
+
+
+def test_bounds_of_chains_that_differ_are_refused():
+    class Mixed(ech.ControlAffine):
+        """An output that is pushed, and one that is commanded."""
+
+        state_names = ("x", "v", "y")
+        input_names = ("push", "speed")
+        flat_outputs = ("x", "y")
+        flat_chains = FlatChains((2, 1), (0, 0))
+        flat_bounds = (FlatBound(("x", "y"), 1, 0.0, "moving"),)
+
+        def drift(self, x):
+            return jnp.stack([x[1], 0.0 * x[0], 0.0 * x[0]])
+
+        def input_map(self, x):
+            return jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+
+    with pytest.raises(EchelonError, match="chains of 2 and 1 integrators, which must be alike"):
+        StoppingPoint().prepared(Mixed(), TREE)

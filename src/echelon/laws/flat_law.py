@@ -13,7 +13,7 @@ from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, State
 from echelon.laws.flat_loop import FlatLoop, Held
 from echelon.laws.law import Law, LocalView
-from echelon.models.chains import Chains, chains_of, flatten, switch_on
+from echelon.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
 from echelon.models.model import ControlAffine, FlatBound
 
 Speed: TypeAlias = float | tuple[float, ...]
@@ -125,11 +125,12 @@ class FlatLaw(Law):
         """Return the inner loop for a model.
 
         Raises:
-            LawError: the model has no flat coordinates, or roots or speeds are not as many as it
-                needs.
+            LawError: the model has no flat coordinates, or bounds of which nothing is proved, or
+                roots or speeds are not as many as it needs.
         """
         try:
             chains = chains_of(model)
+            check_bounds(model, chains)
         except ModelError as error:
             raise LawError(str(error)) from None
         needed, m = max(chains.degrees) - 1, len(chains.outputs)

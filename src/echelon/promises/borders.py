@@ -77,8 +77,6 @@ def border_of(run: Stopping, bound: FlatBound) -> Border:
     """
     chains, order = run.law.ready.chains, bound.derivative - 1
     places = [chains.outputs.index(name) for name in bound.outputs]
-    if len({chains.degrees[k] for k in places}) > 1:
-        raise GainError(f"the chains of {listing(bound.outputs)} are not alike.")
     chain = run.chain(places[0])
     least = least_on_path(run.leader, run.parts.model, run.settings.horizon, places, order + 1)
     allowed = Fraction(least.value) - Fraction(bound.above) - _ROUNDED
