@@ -261,3 +261,23 @@ def test_bounds_of_chains_that_differ_are_refused():
 
     with pytest.raises(EchelonError, match="chains of 2 and 1 integrators, which must be alike"):
         StoppingPoint().prepared(Mixed(), TREE)
+
+
+SLOW = FlatBound(("angle",), 1, -1.0, "a rate above -1")
+
+
+def test_starts_beyond_a_bound_that_no_integrator_decides_are_refused():
+    parts = swings(bounded(SLOW))
+    for rate, refused in ((-0.9, False), (-1.1, True)):
+        law = StoppingPoint().prepared(parts.model, TREE)
+        found = list(law.refusals(parts.model, np.array([[0.3, rate], [0.3, 2.0]])))
+        assert [k for k, _ in found] == [0] * refused
+    assert found[0][1] == "`angle'` is -1.1 there, allowed is a rate above -1"
+
+
+def test_a_bound_that_no_integrator_decides_is_promised_and_flown():
+    parts = swings(bounded(SLOW)).replace(initial={"angle": 1.0})
+    found = promised(parts)
+    assert found.promised and 0.0 < found.tube.left < 1.0
+    result = ech.simulate(parts, ech.Settings(horizon=4.0, dt=0.01))
+    assert result.states[:, :, 1].min() >= found.tube.left - 1.0
