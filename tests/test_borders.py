@@ -275,9 +275,62 @@ def test_starts_beyond_a_bound_that_no_integrator_decides_are_refused():
     assert found[0][1] == "`angle'` is -1.1 there, allowed is a rate above -1"
 
 
+@pytest.mark.slow
 def test_a_bound_that_no_integrator_decides_is_promised_and_flown():
     parts = swings(bounded(SLOW)).replace(initial={"angle": 1.0})
     found = promised(parts)
     assert found.promised and 0.0 < found.tube.left < 1.0
     result = ech.simulate(parts, ech.Settings(horizon=4.0, dt=0.01))
     assert result.states[:, :, 1].min() >= found.tube.left - 1.0
+
+
+class Lost(ech.models.Pendulum):
+    """A pendulum whose torque is lost where it hangs level, which inherits a word."""
+
+    def input_map(self, x):
+        return super().input_map(x) * jnp.cos(x[0])
+
+
+class Stated(Lost):
+    """The same with a word of its own."""
+
+    flat_bounds = ()
+
+
+class Quickened(ech.models.Unicycle):
+    """A unicycle that is quicker elsewhere, which inherits the bound of its speed."""
+
+    def input_map(self, x):
+        return super().input_map(x) * (1.0 + x[0] ** 2)
+
+
+class Damped(ech.models.Pendulum):
+    """A pendulum of another friction: what it inherits is proved of it again."""
+
+    def drift(self, x):
+        return super().drift(x) - jnp.stack([0.0 * x[0], x[1] ** 3])
+
+
+class Renamed(ech.models.Unicycle):
+    """A unicycle that moves as it does."""
+
+    input_names = ("v", "w")
+
+
+@pytest.mark.parametrize(
+    ("model", "known"),
+    [
+        (Lost(), False),
+        (Stated(), True),
+        (Quickened(), False),
+        (Damped(), True),
+        (Renamed(), True),
+        *((getattr(ech.models, name)(), True) for name in ("Unicycle", "Pendulum", "VanDerPol")),
+        *((getattr(ech.models, name)(), True) for name in ("Quadrotor", "PlanarQuadrotor")),
+        *((getattr(ech.models, name)(), True) for name in ("QuadrotorEuler", "QuadrotorThrust")),
+        *((getattr(ech.models, f"{name}Integrator")(), True) for name in ("Single", "Double")),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_word_on_borders_is_of_the_motion_that_it_was_given_with(model, known):
+    assert (bounds_of(model, chains_of(model)) is not None) == known
