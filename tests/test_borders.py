@@ -115,6 +115,32 @@ def test_a_unicycle_that_might_stop_is_told_what_would_help(change, text):
     assert not found.promised and text in found.sentence()
 
 
+def led(place=(0.0, 0.0), turned=0.0, **leader):
+    """Unicycles whose leader alone starts away from its place (m) and turned (rad)."""
+    parts = driven(leader=leader, speed=0.4)
+    states = np.array(parts.initial)
+    states[0] += (*place, turned)
+    return promised(parts.replace(initial=states))
+
+
+def test_of_a_leader_off_its_path_no_other_place_is_meant():
+    # At most c |zeta - path| of its speed is used here, which grows from another place.
+    found = led(place=(0.0, 0.02), speed=5.0)
+    assert found.promised
+    assert "from any position of the followers, with a speed above 0" in found.sentence()
+    assert "and the leader as at these starts" in found.sentence()
+    assert "any position," in led().sentence() and "keeps to its path" in led().sentence()
+
+
+def test_a_leader_that_is_turned_does_not_keep_to_its_path():
+    # Its stopping point is on the path: y' / root away from where it is.
+    turn, speed = 0.5, 1.4
+    ways = np.array([[np.cos(a), np.sin(a)] for a in (np.pi / 2, np.pi / 2 + turn)])
+    found = led(place=-speed * (ways[1] - ways[0]) / 4.0, turned=turn)
+    assert found.promised and "keeps to its path" not in found.sentence()
+    assert "and the leader as at these starts" in found.sentence()
+
+
 def test_a_path_that_stands_still_has_no_direction():
     with pytest.raises(EchelonError, match="`x'`, `y'` are 0 there, and allowed is a speed above"):
         prepare(driven(reference=ech.references.Hover()), ech.Settings(horizon=1.0, dt=0.01))
