@@ -255,6 +255,9 @@ PICKS = {
     "an entry that is not there": lambda v: TABLE.at[jnp.abs(whole(v)) + 4].get(
         mode="fill", fill_value=jnp.nan
     ),
+    "an entry in whose place another stands": lambda v: TABLE.at[jnp.abs(whole(v)) + 5].get(
+        mode="fill", fill_value=7.0
+    ),
     "rows of a state": lambda v: jax.lax.dynamic_slice(v, (jnp.argmax(v),), (2,)),
     "an entry that is set": lambda v: jnp.concatenate(
         [v.at[whole(v)].set(7.0), v.at[whole(v)].add(0.5), v.at[jnp.argmin(v)].set(v[0])]
@@ -291,6 +294,22 @@ def test_what_agents_pick_is_what_jax_picks(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.parametrize("bits", [64, 32])
+def test_quotients_of_whole_numbers_are_whole_by_any_number(bits):
+    x, by = np.arange(-600.0, 600.0)[None], (3, 41, 47, 49, 98, 103)
+
+    def function(v):
+        whole = v[0].astype(int)
+        cut = [jnp.stack([whole // k, whole % k, jax.lax.rem(whole, k)]) * 1.0 for k in by]
+        return jnp.concatenate([*cut, jnp.stack([jnp.fmod(v[0], 49.0), v[0] % 41.0])])
+
+    np.testing.assert_array_equal(run(function, x, bits=bits), by_jax(function, x))
+    # Where a product of floats stands for one of numbers, nothing says which side of it x is.
+    turns = 0.7 * np.arange(-300.0, 300.0)[None]
+    found = run(lambda v: jnp.fmod(v[0], 0.7)[None], turns)
+    np.testing.assert_array_equal(found, np.fmod(turns, 0.7))
+
+
 def test_what_is_no_number_is_picked_and_ordered_as_by_jax():
     columns = np.array(list(itertools.product([np.nan, 1.0, -np.inf, np.inf], repeat=3))).T
 
@@ -317,6 +336,7 @@ def test_what_is_no_number_is_picked_and_ordered_as_by_jax():
         (lambda v: jnp.sort(jnp.concatenate([v, v, v])), "`sort` of 9 entries"),
         (lambda v: v.at[jnp.stack([whole(v), 0])].set(1.0), "`scatter` of more than one entry"),
         (lambda v: (whole(v) & 1) * 1.0, "`and` of whole numbers"),
+        (lambda v: whole(v).astype(jnp.int8) * 1.0, "`convert_element_type` to int8"),
     ],
 )
 def test_what_is_too_much_to_pick_from_is_told(function, told):

@@ -92,12 +92,14 @@ class Crew:
         done = aligned((self.threads, 8), np.int64)
         rest = ctypes.cast(_rest(), ctypes.c_void_p).value or 0
 
+        # What needs memory before any thread begins: others would wait for one that failed.
+        turns = [self._turns(values["steps"], k) for k in range(self.threads)]
+        rooms = [common, *(np.empty_like(common) for _ in turns[1:])]
+
         def fly(k: int) -> None:
-            turns = self._turns(values["steps"], k)
             told = {"groups": 1, "threads": self.threads, "thread": k, "rest": rest}
-            room = common if k == 0 else np.empty_like(common)
-            parts = {"common": room, "done": done, "turns": turns}
-            _call(code, values | told | {"count": len(turns)}, firsts | parts)
+            parts = {"common": rooms[k], "done": done, "turns": turns[k]}
+            _call(code, values | told | {"count": len(turns[k])}, firsts | parts)
 
         # A thread each, since they wait for each other.
         share(self._own, fly, range(self.threads))

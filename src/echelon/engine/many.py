@@ -265,13 +265,19 @@ def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | Eche
 
 
 def _accepted(jobs: list[_Job]) -> list[_Job]:
-    """Return the runs whose starts the laws take."""
-    prepared = jobs[0].prepared
-    model, graph, drive = prepared.parts.model, prepared.parts.graph, prepared.parts.drive
-    assert isinstance(drive, Laws)
-    states = np.stack([job.prepared.problem.states for job in jobs])
-    refused = {k for k, _, _ in drive.refusals(model, graph, states)}
-    return [job for k, job in enumerate(jobs) if k not in refused]
+    """Return the runs whose starts the laws take; each case has numbers of its own."""
+    cases: dict[int, list[_Job]] = {}
+    for job in jobs:
+        cases.setdefault(id(job.case), []).append(job)
+    refused = set[int]()
+    for some in cases.values():
+        parts = some[0].prepared.parts
+        assert isinstance(parts.drive, Laws)
+        states = np.stack([job.prepared.problem.states for job in some])
+        with precision("float64"):
+            told = parts.drive.refusals(parts.model, parts.graph, states)
+        refused |= {some[k].place for k, _, _ in told}
+    return [job for job in jobs if job.place not in refused]
 
 
 def _fit(jobs: list[_Job]) -> bool:

@@ -316,9 +316,12 @@ def sign(x: Node) -> Node:
 
 def remainder(x: Node, y: Node) -> Node:
     """Return x - y trunc(x / y), exact while the quotient is small."""
-    quotient = x / y
-    whole = x.graph.make("floor", size(quotient))
-    return x - y * signed(whole, quotient)
+    g = x.graph
+    quotient = g.make("over", x, y)
+    rest = x - y * signed(g.make("floor", size(quotient)), quotient)
+    # A quotient just below a whole number may be rounded to it, which takes one y too many.
+    beyond = _less(rest * signed(g.constant(1.0), x), g.constant(0.0))
+    return choose(beyond, rest + signed(y, x), rest)
 
 
 def round_half_away(x: Node) -> Node:

@@ -94,9 +94,12 @@ def _drops(equation: Any) -> bool:
 
 def _elsewhere(equation: Any, operands: list[np.ndarray]) -> np.ndarray:
     """Return what is found where an index points outside: nothing read is no number."""
-    if equation.primitive.name == "gather":
-        return np.full(equation.outvars[0].aval.shape, np.nan)
-    return operands[0]
+    if equation.primitive.name != "gather":
+        return operands[0]
+    value, given = equation.params["fill_value"], equation.outvars[0].aval
+    if value is None and np.dtype(given.dtype).kind != "f":
+        raise Unsupported(f"`gather` from outside of a table of {given.dtype}{where(equation)}")
+    return np.full(given.shape, np.nan if value is None else value)
 
 
 def _ends(equation: Any, operands: list[np.ndarray]) -> list[int]:
@@ -242,12 +245,12 @@ def converted(
             return e if of.kind == "b" else graph.make("ne", entry(e), 0.0)
         if to.kind == "f" or of.kind == "b":
             return number(graph, e)
-        return _whole(graph, e, to, of)
+        return _whole(graph, e, to, of, where(equation))
 
     return [each(one, x)]
 
 
-def _whole(graph: Graph, e: Any, to: np.dtype, of: np.dtype) -> Any:
+def _whole(graph: Graph, e: Any, to: np.dtype, of: np.dtype, at: str) -> Any:
     """Return a number as a whole one, as XLA makes it: towards 0, nothing beyond, 0 of none."""
     if of.kind == "f":
         down, up = (graph.make(op, entry(e)) for op in ("floor", "ceil"))
@@ -255,6 +258,8 @@ def _whole(graph: Graph, e: Any, to: np.dtype, of: np.dtype) -> Any:
         towards = chosen(graph, graph.make("eq", entry(e), entry(e)), towards, 0.0)
         held = np.iinfo(to)
         return graph.make("min", graph.make("max", towards, float(held.min)), float(held.max))
+    if to.itemsize < of.itemsize and to.itemsize < 4:
+        raise Unsupported(f"`convert_element_type` to {to}{at}")
     if to.kind == "u" and of.kind == "i":
         return chosen(graph, graph.make("lt", entry(e), 0.0), e + 2.0 ** (8 * to.itemsize), e)
     return e
@@ -267,7 +272,7 @@ def divided(
     whole = np.dtype(equation.outvars[0].aval.dtype).kind in "iu"
 
     def one(a: Any, b: Any) -> Any:
-        made = graph.make("div", entry(a), entry(b))
+        made = graph.make("over" if whole else "div", entry(a), entry(b))
         if not whole:
             return made
         down, up = graph.make("floor", made), graph.make("ceil", made)

@@ -26,6 +26,8 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "apart": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
     "div": _divide,
+    # A quotient that is cut to a whole number: no inverse takes its place, so that 49 / 49 is 1.
+    "over": _divide,
     "neg": lambda a: -a,
     "abs": abs,
     "sqrt": lambda a: float(np.sqrt(a)),

@@ -16,6 +16,7 @@ from echelon.kernels.scalar import Node, needed
 _INSTRUCTIONS = {
     **{name: f"f{name} contract {{T}} {{0}}, {{1}}" for name in ("add", "sub", "mul", "div")},
     "apart": "fsub {T} {0}, {1}",
+    "over": "fdiv {T} {0}, {1}",
     "neg": "fneg {T} {0}",
     **{
         name: f"call {{T}} @llvm.{full}.{{S}}({{T}} {{0}})"

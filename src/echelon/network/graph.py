@@ -216,7 +216,7 @@ class Graph:
         """Return the directed graph in which agents hear those alone that are nearer to a leader.
 
         Raises:
-            GraphError: the graph switches.
+            GraphError: the graph switches, or falls apart between leaders.
         """
         edges, weights = outward_edges(self)
         return Graph(edges, self.leaders, self.agents, True, weights.tolist())

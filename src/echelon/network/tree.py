@@ -3,6 +3,8 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
@@ -35,13 +37,19 @@ def outward_edges(graph: "Graph") -> tuple[Array, Array]:
     Edges between agents equally far are none of them.
 
     Raises:
-        GraphError: the graph switches.
+        GraphError: the graph switches, or what each leader leads falls apart from the rest.
     """
     if graph.schedule is not None:
         raise GraphError("the graph switches, and no agent is nearer to a leader at all times.")
     depth = graph.depths()[graph.edges]
     apart = depth[:, 0] < depth[:, 1] if graph.directed else depth[:, 0] != depth[:, 1]
     edges = np.take_along_axis(graph.edges, np.argsort(depth, axis=1), axis=1)
+    links = coo_array((np.ones(apart.sum()), edges[apart].T), (graph.agents, graph.agents))
+    if connected_components(links, directed=False)[0] > 1:
+        raise GraphError(
+            "of the graph heard one way, what the leaders lead falls apart: no agent hears more "
+            "than one of them; leave `directed` out, or give the edges."
+        )
     return edges[apart], graph.weights[apart]
 
 
