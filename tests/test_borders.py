@@ -16,6 +16,7 @@ from echelon.core.words import Kind, Theorem
 from echelon.engine.prepare import prepare
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.models.chains import chains_of
+from echelon.models.model import FlatBound, FlatChains
 from echelon.promises.everywhere import bounds_of
 from echelon.promises.promise import promise
 from echelon.verifier.verify import verify
@@ -114,6 +115,32 @@ def test_a_unicycle_that_might_stop_is_told_what_would_help(change, text):
     assert not found.promised and text in found.sentence()
 
 
+def led(place=(0.0, 0.0), turned=0.0, **leader):
+    """Unicycles whose leader alone starts away from its place (m) and turned (rad)."""
+    parts = driven(leader=leader, speed=0.4)
+    states = np.array(parts.initial)
+    states[0] += (*place, turned)
+    return promised(parts.replace(initial=states))
+
+
+def test_of_a_leader_off_its_path_no_other_place_is_meant():
+    # At most c |zeta - path| of its speed is used here, which grows from another place.
+    found = led(place=(0.0, 0.02), speed=5.0)
+    assert found.promised
+    assert "from any position of the followers, with a speed above 0" in found.sentence()
+    assert "and the leader as at these starts" in found.sentence()
+    assert "any position," in led().sentence() and "keeps to its path" in led().sentence()
+
+
+def test_a_leader_that_is_turned_does_not_keep_to_its_path():
+    # Its stopping point is on the path: y' / root away from where it is.
+    turn, speed = 0.5, 1.4
+    ways = np.array([[np.cos(a), np.sin(a)] for a in (np.pi / 2, np.pi / 2 + turn)])
+    found = led(place=-speed * (ways[1] - ways[0]) / 4.0, turned=turn)
+    assert found.promised and "keeps to its path" not in found.sentence()
+    assert "and the leader as at these starts" in found.sentence()
+
+
 def test_a_path_that_stands_still_has_no_direction():
     with pytest.raises(EchelonError, match="`x'`, `y'` are 0 there, and allowed is a speed above"):
         prepare(driven(reference=ech.references.Hover()), ech.Settings(horizon=1.0, dt=0.01))
@@ -209,3 +236,127 @@ def test_a_model_that_ends_somewhere_unknown_is_promised_nothing():
     found = promised(swings(Tilted()))
     assert not found.promised
     assert "does not say where its flat coordinates end" in found.sentence()
+
+
+# ---- bounds that models state --------------------------------------------------------------------
+
+
+def bounded(*bounds, degree=2):
+    """A pendulum that states these bounds."""
+
+    class Bounded(Swing):
+        flat_chains, flat_bounds = FlatChains((degree,), (0,)), bounds
+
+    return Bounded()
+
+
+@pytest.mark.parametrize(
+    ("bound", "text"),
+    [
+        (("angle",), "must be a tuple of `FlatBound`"),
+        (FlatBound("angle", 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound((), 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound(("q",), 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound(("angle", "angle"), 1, 0.0, "slow"), "must name different outputs"),
+        (FlatBound(("angle",), 0, -1.0, "slow"), "order 0 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 2, -1.0, "slow"), "order 2 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 1.0, -1.0, "slow"), "order 1.0 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 1, float("nan"), "slow"), "above nan, which must be a finite"),
+    ],
+)
+def test_a_bound_of_which_nothing_is_proved_is_refused(bound, text):
+    with pytest.raises(EchelonError, match=text):
+        StoppingPoint().prepared(bounded(bound), TREE)
+
+
+def test_bounds_of_chains_that_differ_are_refused():
+    class Mixed(ech.ControlAffine):
+        """An output that is pushed, and one that is commanded."""
+
+        state_names = ("x", "v", "y")
+        input_names = ("push", "speed")
+        flat_outputs = ("x", "y")
+        flat_chains = FlatChains((2, 1), (0, 0))
+        flat_bounds = (FlatBound(("x", "y"), 1, 0.0, "moving"),)
+
+        def drift(self, x):
+            return jnp.stack([x[1], 0.0 * x[0], 0.0 * x[0]])
+
+        def input_map(self, x):
+            return jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+
+    with pytest.raises(EchelonError, match="chains of 2 and 1 integrators, which must be alike"):
+        StoppingPoint().prepared(Mixed(), TREE)
+
+
+SLOW = FlatBound(("angle",), 1, -1.0, "a rate above -1")
+
+
+def test_starts_beyond_a_bound_that_no_integrator_decides_are_refused():
+    parts = swings(bounded(SLOW))
+    for rate, refused in ((-0.9, False), (-1.1, True)):
+        law = StoppingPoint().prepared(parts.model, TREE)
+        found = list(law.refusals(parts.model, np.array([[0.3, rate], [0.3, 2.0]])))
+        assert [k for k, _ in found] == [0] * refused
+    assert found[0][1] == "`angle'` is -1.1 there, allowed is a rate above -1"
+
+
+@pytest.mark.slow
+def test_a_bound_that_no_integrator_decides_is_promised_and_flown():
+    parts = swings(bounded(SLOW)).replace(initial={"angle": 1.0})
+    found = promised(parts)
+    assert found.promised and 0.0 < found.tube.left < 1.0
+    result = ech.simulate(parts, ech.Settings(horizon=4.0, dt=0.01))
+    assert result.states[:, :, 1].min() >= found.tube.left - 1.0
+
+
+class Lost(ech.models.Pendulum):
+    """A pendulum whose torque is lost where it hangs level, which inherits a word."""
+
+    def input_map(self, x):
+        return super().input_map(x) * jnp.cos(x[0])
+
+
+class Stated(Lost):
+    """The same with a word of its own."""
+
+    flat_bounds = ()
+
+
+class Quickened(ech.models.Unicycle):
+    """A unicycle that is quicker elsewhere, which inherits the bound of its speed."""
+
+    def input_map(self, x):
+        return super().input_map(x) * (1.0 + x[0] ** 2)
+
+
+class Damped(ech.models.Pendulum):
+    """A pendulum of another friction: what it inherits is proved of it again."""
+
+    def drift(self, x):
+        return super().drift(x) - jnp.stack([0.0 * x[0], x[1] ** 3])
+
+
+class Renamed(ech.models.Unicycle):
+    """A unicycle that moves as it does."""
+
+    input_names = ("v", "w")
+
+
+@pytest.mark.parametrize(
+    ("model", "known"),
+    [
+        (Lost(), False),
+        (Stated(), True),
+        (Quickened(), False),
+        (Damped(), True),
+        (Renamed(), True),
+        *((getattr(ech.models, name)(), True) for name in ("Unicycle", "Pendulum", "VanDerPol")),
+        *((getattr(ech.models, name)(), True) for name in ("Quadrotor", "PlanarQuadrotor")),
+        *((getattr(ech.models, name)(), True) for name in ("QuadrotorEuler", "QuadrotorThrust")),
+        *((getattr(ech.models, f"{name}Integrator")(), True) for name in ("Single", "Double")),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_word_on_borders_is_of_the_motion_that_it_was_given_with(model, known):
+    assert (bounds_of(model, chains_of(model)) is not None) == known

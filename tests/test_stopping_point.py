@@ -464,6 +464,22 @@ def test_stopping_points_stay_within_what_turns_of_graphs_bound():
     assert found.bounds[:, -1].max() < 0.2 < 3.0 < found.bounds[:, 60].max()
 
 
+@pytest.mark.parametrize(("begin", "end"), [(0.051, 0.053), (0.051, 0.068), (0.05, 0.053)])
+def test_a_turn_that_begins_between_two_times_is_bounded_from_its_beginning(begin, end):
+    # For a moment follower 1 hears follower 2 alone, which is far off, and leaps toward it.
+    slow = (0, 2, 0.0003)
+    rows = [(0.0, [(0, 1, 1.0), slow]), (begin, [(2, 1, 1.0), slow]), (end, [(0, 1), (0, 2)])]
+    graph, c = ech.Graph.switching(rows, [0], 3, directed=True), 1000.0
+    stops, times = np.array([0.0, 0.0, 1.0]), 0.01 * np.arange(21)
+    found = _in_turns(stops, graph, StoppingPoint(), c, np.inf, times)
+    x, dt = stops[1:], 1e-4
+    flows = [scipy.linalg.expm(-c * dt * L.toarray()) for L in graph.stretches()]
+    for k in range(1500):
+        # All over each cell, by the bound at its beginning.
+        assert (np.abs(x) <= found.bounds[:, k // 100] * (1.0 + 1e-6)).all()
+        x = flows[graph.schedule.row((k + 0.5) * dt)] @ x
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("told", [True, False])
 def test_graphs_that_take_turns_are_there_in_time_or_are_told_none(told):
@@ -540,6 +556,19 @@ def test_a_push_that_carries_the_leader_away_is_told():
     found = promised(parts)
     assert not found.promised and "drift away for ever" in found.sentence()
     assert promised(flight(observer=True, world=wind)).promised
+
+
+@pytest.mark.parametrize("observer", [True, False])
+def test_a_current_that_carries_the_leader_away_is_told_with_an_observer_too(observer):
+    # It moves a position with no force: x' = v + d, which no rate of v shows.
+    for push, drifts in ((1.4, False), (1.6, True)):
+        current = ech.World(disturbance=ech.Disturbance(constant={"x": push}))
+        found = promised(flight(observer=observer, world=current))
+        assert ("drift away for ever" in found.sentence()) == drifts != found.promised
+    assert (
+        "observer" not in found.sentence()
+        and "raise the leader's `speed` above 1.6" in found.sentence()
+    )
 
 
 def test_parents_add_their_speeds():

@@ -13,7 +13,7 @@ from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, State
 from echelon.laws.flat_loop import FlatLoop, Held
 from echelon.laws.law import Law, LocalView
-from echelon.models.chains import Chains, chains_of, flatten, switch_on
+from echelon.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
 from echelon.models.model import ControlAffine, FlatBound
 
 Speed: TypeAlias = float | tuple[float, ...]
@@ -125,11 +125,12 @@ class FlatLaw(Law):
         """Return the inner loop for a model.
 
         Raises:
-            LawError: the model has no flat coordinates, or roots or speeds are not as many as it
-                needs.
+            LawError: the model has no flat coordinates, or bounds of which nothing is proved, or
+                roots or speeds are not as many as it needs.
         """
         try:
             chains = chains_of(model)
+            check_bounds(model, chains)
         except ModelError as error:
             raise LawError(str(error)) from None
         needed, m = max(chains.degrees) - 1, len(chains.outputs)
@@ -261,8 +262,14 @@ def _positive(root: object) -> bool:
 def _outside(
     chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
 ) -> Iterator[tuple[int, str]]:
-    """Yield the rows of states (K, n) from which the inputs push a bounded output the wrong way."""
+    """Yield the rows of states (K, n) beyond a bound of one output.
+
+    There the inputs push it the wrong way, or without integrators it is below.
+    """
     output = chains.outputs.index(bound.outputs[0])
+    if not chains.size:
+        yield from _below(chains, model, states, bound)
+        return
     both = np.concatenate([[np.asarray(model.trim[0], float)], states])
     upright, *ways = np.asarray(_pushes(chains, model, jnp.asarray(both), output)).tolist()
     for k, (x, way) in enumerate(zip(states.tolist(), ways, strict=True)):
@@ -273,6 +280,21 @@ def _outside(
             why = f"`{bound.outputs[0]}` is not pushed upward there"
             why = why if i is None else f"`{off[0]}` is {x[i]:.4g} {model.state_units[i]}".rstrip()
             yield k, f"{why}, allowed is {bound.within}"
+
+
+def _below(
+    chains: Chains, model: ControlAffine, states: Array, bound: FlatBound
+) -> Iterator[tuple[int, str]]:
+    """Yield the rows of states (K, n) at which the state alone is not above a bound."""
+    output, order = chains.outputs.index(bound.outputs[0]), bound.derivative
+
+    def one(x: State) -> jax.Array:
+        return flatten(model, chains, x, x[:0]).values[order, output]
+
+    name = bound.outputs[0] + "'" * order
+    for k, value in enumerate(np.asarray(jax.vmap(one)(jnp.asarray(states))).tolist()):
+        if not value > bound.above:
+            yield k, f"`{name}` is {value:.4g} there, allowed is {bound.within}"
 
 
 def _charted(model: ControlAffine, name: str, value: float) -> bool:

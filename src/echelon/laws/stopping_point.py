@@ -142,8 +142,9 @@ class StoppingPoint(FlatLaw):
             # Raises where the graph is no tree.
             graph.parents()
             links = int(graph.depths().max())
+        loop = self.found_loop(model)
         waits = self.speed is None and waits_for_path(model)
-        loop, reach = self.found_loop(model), Reach.of(graph, self.leaderward, links, waits)
+        reach = Reach.of(graph, self.leaderward, links, waits)
         speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
         return eqx.tree_at(
             lambda law: (law.loop, law.reach, law.ahead, law.speed),

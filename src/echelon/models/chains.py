@@ -7,6 +7,7 @@ of the quadrotor Mistler, Benallegue and M'Sirdi, 2001).
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from echelon.core.errors import ModelError, listing
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
-from echelon.models.model import ControlAffine, Flattened
+from echelon.models.model import ControlAffine, FlatBound, Flattened
 
 _SAMPLES = 16
 _RANK = 1e-8
@@ -142,6 +143,46 @@ def switch_on(model: ControlAffine, chains: Chains, x: State, ahead: jax.Array) 
             value, slope = jax.jvp(derivative, (e,), (one,))
             e = e + one * (ahead[order, k] - value) / slope
     return e
+
+
+def check_bounds(model: ControlAffine, chains: Chains) -> None:
+    """Check that each of the model's bounds is one of which something can be proved.
+
+    Raises:
+        ModelError: its outputs are no ends of chains that are alike, its derivative is the output
+            itself or one that the inputs reach, or it is no number.
+    """
+    name, bounds = f"`{type(model).__name__}`", model.flat_bounds
+    if bounds is None:
+        return
+    if not isinstance(bounds, tuple | list) or not all(isinstance(b, FlatBound) for b in bounds):
+        raise ModelError(
+            f"`flat_bounds` of {name} is {bounds!r}, and must be a tuple of `FlatBound`."
+        )
+    for bound in bounds:
+        fault = _fault_of(bound, chains)
+        if fault:
+            raise ModelError(f"`flat_bounds` of {name} has a bound {fault}.")
+
+
+def _fault_of(bound: FlatBound, chains: Chains) -> str:
+    """Return what is wrong with a bound, in words; empty where nothing is."""
+    outputs, order = bound.outputs, bound.derivative
+    known = isinstance(outputs, tuple | list) and all(n in chains.outputs for n in outputs)
+    if not known or len(set(outputs)) != max(1, len(outputs)):
+        told = f"of {outputs!r}, and must name different outputs of the chains, "
+        return told + listing(chains.outputs)
+    degrees = [chains.degrees[chains.outputs.index(name)] for name in outputs]
+    if len(set(degrees)) > 1:
+        told = " and ".join(map(str, degrees))
+        return f"of {listing(outputs)} with chains of {told} integrators, which must be alike"
+    # The law bounds speeds and what follows from them, of places and of inputs nothing.
+    if type(order) is not int or not 0 < order < degrees[0]:
+        allowed = "none, as an input moves it at once" if degrees[0] == 1 else "1"
+        allowed = f"1 to {degrees[0] - 1}" if degrees[0] > 2 else allowed
+        return f"on a derivative of order {order} of {listing(outputs)}, and allowed is {allowed}"
+    finite = isinstance(bound.above, int | float) and math.isfinite(bound.above)
+    return "" if finite else f"above {bound.above}, which must be a finite number"
 
 
 # ---- which models have them ----------------------------------------------------------------------

@@ -128,6 +128,9 @@ def _in_turns(
             m = _falling((off / w).max(), c, w.max(), speed, clock)
             each = np.minimum(w[:, None] * m, each)
         bounds[:, here], off = each[:, 1:-1], each[:, -1]
+        # A bound holds all over the cell after its time, in which the turn may begin and even end.
+        cell = max(int(np.searchsorted(times, begin, side="right")) - 1, 0)
+        bounds[:, cell] = np.maximum(bounds[:, cell], each[:, 0])
     # It may rise where neighbours are farther off; what is seen from then on does not.
     bounds = np.maximum.accumulate(bounds[:, ::-1], axis=1)[:, ::-1]
     return _Reach(bounds, np.arange(len(followers)), np.ones(len(followers)))

@@ -17,6 +17,8 @@ from echelon.promises.stopping import Stopping
 
 _ROUNDED = Fraction(1, 10**6)
 """Of a derivative of a flat output: a thousand times what floats leave of it at a start."""
+_LEVEL = 1e-9
+"""What floats leave of a level start, far below the slack of the room."""
 _STARTS = 64
 """Starts of agents that are looked at one by one; those that differ in one speed alone are two."""
 
@@ -31,7 +33,7 @@ class Border(NamedTuple):
         kind: of the argument.
         path: what the leader's path takes the bounded derivative to, at least.
         fastest: the `speed` of each output at which agreement alone may lead to it.
-        led: whether the leader keeps to the speed of its path in these outputs.
+        led: whether the leader starts on its path in these outputs, and so keeps to it.
         turn: by what angle (deg) a velocity as large as the leader's may be off it at the start;
             infinite where the bound is of no velocity.
         told: what is claimed, and of what it was computed; ready for JSON.
@@ -77,17 +79,15 @@ def border_of(run: Stopping, bound: FlatBound) -> Border:
     """
     chains, order = run.law.ready.chains, bound.derivative - 1
     places = [chains.outputs.index(name) for name in bound.outputs]
-    if len({chains.degrees[k] for k in places}) > 1:
-        raise GainError(f"the chains of {listing(bound.outputs)} are not alike.")
     chain = run.chain(places[0])
     least = least_on_path(run.leader, run.parts.model, run.settings.horizon, places, order + 1)
     allowed = Fraction(least.value) - Fraction(bound.above) - _ROUNDED
     fastest = float(allowed / chain.gain(order)) / math.sqrt(len(places))
     speeds = [run.own_speed(k) for k in places]
     own, s = _together(speeds), _together(map(run.speed, places))
-    known = Border(
-        bound, Fraction(-1), 0.0, least.kind, least.value, fastest, max(speeds) < 1e-9, math.inf, {}
-    )
+    led = max(speeds) < _LEVEL and _is_on_path(run, places)
+    none = Fraction(-1), 0.0
+    known = Border(bound, *none, least.kind, least.value, fastest, led, math.inf, {})
     if own is None or s is None:
         return known
     asked = _Asked(run, bound, places, chain, own, s, allowed)
@@ -98,6 +98,13 @@ def border_of(run: Stopping, bound: FlatBound) -> Border:
     told = {**_told(asked, least, left), **starts, "steepest": steepest}
     turn = _turn(run, places, steepest) if known.many and order == 0 else math.inf
     return known._replace(left=left, steepest=steepest, turn=turn, told=told)
+
+
+def _is_on_path(run: Stopping, places: list[int]) -> bool:
+    """Tell whether leaders start as their path moves, in all that the inner loop lets go by."""
+    leads, degree = list(run.parts.graph.leaders), run.law.ready.chains.degrees[places[0]]
+    off = (run.flat[leads] - run.ahead)[:, 1:degree, places]
+    return bool(np.abs(off).max(initial=0.0) < _LEVEL)
 
 
 def _turn(run: Stopping, places: list[int], chord: float) -> float:
@@ -193,8 +200,7 @@ def _few(starts: Array) -> Array:
     """
     starts = starts.copy()
     starts[:, 0] = 0.0
-    # What floats leave of a level start is far below the slack of the room.
-    starts[np.abs(starts) < 1e-9] = 0.0
+    starts[np.abs(starts) < _LEVEL] = 0.0
     if not starts[:, 2:].any() and starts.shape[1] > 1:
         low, high = starts[:, 1].argmin(), starts[:, 1].argmax()
         return starts[sorted({int(low), int(high)})]

@@ -271,34 +271,42 @@ def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
 
 
 def drift_reason(run: Stopping) -> Statement | None:
-    """Return why a lasting push carries the leader away for ever; None where it does not."""
-    world, model = run.parts.world, run.parts.model
-    if run.leader.observer or world.ideal:
+    """Return why what lasts carries the leader away for ever; None where it does not."""
+    world, model, loop = run.parts.world, run.parts.model, run.leader.ready
+    if world.ideal:
         return None
-    loop = run.leader.ready
     push = np.zeros(len(model.state_names))
     if world.disturbance is not None:
         push = model.per_state(world.disturbance.constant)
     found = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
-    for k, d in enumerate(np.abs(np.asarray(found)).tolist()):
-        s, degree = run.leader.speed_of(k), loop.chains.degrees[k]
-        asked = d * float(loop.weights[1, k]) if degree > 1 else d
-        if asked >= s:
-            name = loop.chains.outputs[k]
-            text = f"a push of {d:.3g} along `{name}` asks agreement for {asked:.3g} of speed, the "
-            text += f"leader's is {s:.3g}, and it can drift away for ever"
-            remedy = f"set `observer: true`, or `speed` above {asked:.3g}"
-            return Statement(
-                Hypothesis.EXACT, Verdict.FAILS, _PROOF, asked, f"{asked:.3g}", text, remedy, text
-            )
+    for k, (current, force) in enumerate(np.abs(np.stack(found)).T.tolist()):
+        s, inner = run.leader.speed_of(k), loop.chains.degrees[k] > 1
+        # The observer watches y' as the model has it, and of what is commanded at once y itself.
+        seen = run.leader.observer
+        current = 0.0 if seen and not inner else current
+        force = float(loop.weights[1, k]) * force if inner and not seen else 0.0
+        if current + force >= s:
+            return _drifts(loop.chains.outputs[k], current, force, s, inner)
     return None
+
+
+def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> Statement:
+    """Say what a current, and a force by what it asks of agreement, do to a leader of speed s."""
+    asked = current + force
+    what = " and ".join(word for word, d in (("current", current), ("push", force)) if d)
+    text = f"a lasting {what} along `{name}` asks agreement for {asked:.3g} of speed, the "
+    text += f"leader's is {s:.3g}, and it can drift away for ever"
+    helps = "" if inner and current >= s else "set `observer: true`, or "
+    remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
+    fails = Verdict.FAILS
+    return Statement(Hypothesis.EXACT, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text)
 
 
 @eqx.filter_jit
 def _pushed(
     model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
-) -> jax.Array:
-    """Return what outputs' accelerations differ by at the trim (m,), as an agent is pushed."""
+) -> tuple[jax.Array, jax.Array]:
+    """Return what outputs' speeds and accelerations differ by at the trim (m,), by the push."""
     chains = loop.chains
     x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
 
@@ -309,5 +317,4 @@ def _pushed(
         return jax.jvp(output, (x,), (model.velocity(x, u),))[1]
 
     more = plant.velocity(x, u) + push - model.velocity(x, u)
-    at_once = np.array(chains.degrees) == 1
-    return jnp.where(at_once, jax.jvp(output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1])
+    return jax.jvp(output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1]

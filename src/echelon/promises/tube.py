@@ -211,7 +211,9 @@ def _who(run: Stopping, borders: Sequence[Border]) -> str:
     free = "any position" if any(b.many for b in borders) else free
     if not all(b.led for b in borders):
         speeds = " and ".join(b.speeds for b in borders)
-        return f"{free}, with {within}, and {speeds} as at these starts"
+        # Of the leader's speed against its path no more is used than what these starts ask for.
+        free = f"{free} of the followers, with {within}, their {speeds} as at these starts"
+        return f"{free}, and the leader as at these starts"
     off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_turned(b)}" for b in borders)
     return f"{free}, with {within}, and {off} of the leader's, which keeps to its path there"
 
