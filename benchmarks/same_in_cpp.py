@@ -17,7 +17,8 @@ import numpy as np
 from echelon.engine.code import LANES
 from echelon.engine.native import NativeStepper
 from echelon.engine.scalars import body_of
-from echelon.kernels import SLOTS, Body, Code, Node, Plan, aligned, program
+from echelon.engine.turns import step_by_step
+from echelon.kernels import SLOTS, Body, Code, Node, Plan, aligned, program, shared
 from echelon.kernels.scalar import needed
 from echelon.kernels.usual import rewritten, whole
 
@@ -37,7 +38,7 @@ extern "C" void run({T} *rows, long blocks, long steps) {{
 for (long step = 0; step < steps; step++) for (long b = 0; b < blocks; b++) {{
 {T} *at = rows + b * {size};
 """
-_INFIX = {"add": "+", "sub": "-", "apart": "-", "mul": "*", "div": "/"}
+_INFIX = {"add": "+", "sub": "-", "apart": "-", "mul": "*", "div": "/", "over": "/"}
 _INFIX |= {"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
 _CALLS = {
     "sqrt": "(V)_mm512_sqrt_{s}((__m512{t}){0})",
@@ -127,10 +128,10 @@ class Follower:
         code = Code(program(plan))
 
         def run(rows: np.ndarray, steps: int) -> None:
-            ends = np.array([0, len(rows)], np.int64)
-            told = {"rows": rows.ctypes.data, "segments": ends.ctypes.data, "steps": steps}
-            told |= {"starts": ends.ctypes.data, "ends": ends[1:].ctypes.data}
-            told |= dict.fromkeys(("levels", "groups", "threads"), 1)
+            turns = step_by_step(np.array([0, len(rows)]), 0, steps, 0, 1)
+            common = aligned((steps, 1 + len(shared(plan))), rows.dtype)
+            told = {"rows": rows.ctypes.data, "turns": turns.ctypes.data, "steps": steps}
+            told |= {"common": common.ctypes.data, "count": len(turns), "groups": 1, "threads": 1}
             code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
 
         return run
