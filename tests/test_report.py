@@ -168,4 +168,4 @@ def test_wind_is_not_blamed_where_the_loop_grows_by_itself():
         for more in ([], ["simulation.dt=1.0", "simulation.horizon=20"])
     ]
     assert "the disturbance pushes it up" in told[0]
-    assert "the loop grows by itself" in told[1] and "pushes it up" not in told[1]
+    assert "the input is held over a `dt` too long" in told[1] and "pushes it up" not in told[1]
