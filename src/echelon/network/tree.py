@@ -41,16 +41,15 @@ def outward_edges(graph: "Graph") -> tuple[Array, Array]:
     """
     if graph.schedule is not None:
         raise GraphError("the graph switches, and no agent is nearer to a leader at all times.")
-    depth = graph.depths()[graph.edges]
-    apart = depth[:, 0] < depth[:, 1] if graph.directed else depth[:, 0] != depth[:, 1]
-    edges = np.take_along_axis(graph.edges, np.argsort(depth, axis=1), axis=1)
-    links = coo_array((np.ones(apart.sum()), edges[apart].T), (graph.agents, graph.agents))
+    heard = graph.exchange(leaderward=True)
+    edges = np.stack([heard.senders, heard.receivers], axis=1)
+    links = coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
     if connected_components(links, directed=False)[0] > 1:
         raise GraphError(
             "of the graph heard one way, what the leaders lead falls apart: no agent hears more "
             "than one of them; leave `directed` out, or give the edges."
         )
-    return edges[apart], graph.weights[apart]
+    return edges, np.asarray(heard.weights)
 
 
 def parents_of(graph: "Graph") -> tuple[int, ...]:
