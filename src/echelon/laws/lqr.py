@@ -14,6 +14,7 @@ import scipy.linalg
 
 from echelon.core.errors import LawError
 from echelon.core.linear import symmetric_part
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.model import ControlAffine
@@ -170,7 +171,7 @@ def _decay(P: Array, W: Array) -> Array:
     return np.asarray(-0.5 * np.linalg.eigvalsh(root @ W @ root.swapaxes(1, 2)).min())
 
 
-@eqx.filter_jit
+@program
 def _slopes(
     model: ControlAffine, reference: Guide, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State, States
 from echelon.models.model import ControlAffine
 from echelon.models.secants import Gap, Sides, sides, stencil
@@ -69,7 +69,7 @@ def at_trim(model: ControlAffine) -> AtTrim:
     return AtTrim(*there, bends=_bends(seen, u), gap=seen.gap(said))  # pyright: ignore
 
 
-@eqx.filter_jit
+@program
 def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[jax.Array]:
     functions = (model.drift, model.input_map, model.output)
     slopes = [jax.jacfwd(function)(x) for function in functions]

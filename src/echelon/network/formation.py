@@ -6,13 +6,13 @@ With it stands what the graph and the model make of the offsets: rigidity and sy
 from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, States
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -279,7 +279,7 @@ def _describe_change(
     return None
 
 
-@eqx.filter_jit
+@program
 def _local(model: ControlAffine, states: States) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Return f and g at states (S, n), each with its Jacobian."""
     parts = {"drift": model.drift, "input map": model.input_map}

@@ -6,7 +6,6 @@ left of one, or why.
 
 from collections.abc import Iterator, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from echelon.certificates.jacobians import offsets_are_symmetries
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Verdict
 from echelon.engine.drive import Drive
@@ -70,7 +70,7 @@ def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = 
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 
-@eqx.filter_jit
+@program
 def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)

@@ -7,13 +7,13 @@ for as long as it is the nearest sample, is a sign and no proof.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core import linear
 from echelon.core.linear import exponential, held_radius, held_step
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
@@ -256,7 +256,7 @@ def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
     return Slopes(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
 
 
-@eqx.filter_jit
+@program
 def _about(
     model: ControlAffine, law: Law, t: jax.Array, x: States, v: jax.Array, y: States
 ) -> tuple[jax.Array, ...]:

@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State, States
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
@@ -109,13 +109,13 @@ def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> Route:
     return path._replace(states=back, inputs=sent, headings=away, rates=rates)
 
 
-@eqx.filter_jit
+@program
 def _turned_back(model: ControlAffine, states: States, angles: jax.Array) -> States:
     """Return states (K, n) in axes that are turned by angles (K,)."""
     return jax.vmap(lambda x, angle: turned(model, x, -angle))(states, angles)
 
 
-@eqx.filter_jit
+@program
 def _in_heading(
     model: ControlAffine, states: States, inputs: jax.Array, angles: jax.Array
 ) -> tuple[States, jax.Array, jax.Array]:
@@ -128,7 +128,7 @@ def _in_heading(
     return _turned_back(model, states, angles), sent, jax.vmap(rate)(states, inputs)
 
 
-@eqx.filter_jit
+@program
 def _inputs(model: ControlAffine, now: States, soon: States) -> jax.Array:
     """Return the normalized inputs that take agents from states to others _SHORT later."""
 

@@ -5,13 +5,13 @@ And whether it is a motion of the model at all.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.references.flatness import follow_at
@@ -156,7 +156,7 @@ def demand(model: ControlAffine, inputs: Array) -> Array:
         return np.where(moved == 0.0, 0.0, np.abs(moved) / np.maximum(room, 0.0)).max(axis=1)
 
 
-@eqx.filter_jit
+@program
 def _rate(
     model: ControlAffine, before: jax.Array, now: jax.Array, after: jax.Array, near: float
 ) -> jax.Array:
@@ -166,7 +166,7 @@ def _rate(
     )
 
 
-@eqx.filter_jit
+@program
 def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> jax.Array:
     return jax.vmap(model.velocity)(states, inputs)
 

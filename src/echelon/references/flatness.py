@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import LawError, PlanError
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.references.guide import Guide
@@ -28,7 +28,7 @@ def follow_at(
     return x[:count], u[:count]
 
 
-@eqx.filter_jit
+@program
 def _follow_all(
     model: ControlAffine, reference: Guide, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -91,6 +91,6 @@ def _targets(model: ControlAffine, x: Array, v: Array) -> Targets:
     return Targets(x, outputs, v)
 
 
-@eqx.filter_jit
+@program
 def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
     return jax.vmap(model.output)(states)

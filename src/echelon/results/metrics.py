@@ -3,13 +3,13 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.result import Result, finite_or_none
 from echelon.engine.sums import SETTLED, output_error
@@ -132,7 +132,7 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
         )
 
 
-@eqx.filter_jit
+@program
 def _output_errors(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
     return jax.vmap(lambda x, wanted: output_error(model, x, wanted))(x, wanted)
 
