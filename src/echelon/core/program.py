@@ -2,20 +2,21 @@
 
 import contextlib
 import functools
+import os
 import pickle
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, final
+from typing import Any, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
 from echelon.core import store
 
-_P = ParamSpec("_P")
 _R = TypeVar("_R")
+_LEAST, _NEVER = "jax_persistent_cache_min_compile_time_secs", 1e9
+"""Of compiling, s, from which on JAX keeps what it compiles."""
 
 
 class _Place(NamedTuple):
@@ -34,15 +35,14 @@ class _Compiled(NamedTuple):
 class _Call(NamedTuple):
     """The arguments of a call: their arrays, and the tree in which these stand."""
 
-    arrays: Sequence[jax.Array]
+    arrays: Sequence[Any]
     leaves: tuple[Any, ...]
     tree: Any
 
     def key(self) -> Hashable:
         """Return what is equal for calls of one program."""
         kinds = tuple(map(type, self.leaves))
-        shapes = tuple((a.shape, a.dtype, a.weak_type) for a in self.arrays)
-        return self.tree, self.leaves, kinds, shapes, _precision()
+        return self.tree, self.leaves, kinds, tuple(map(_form, self.arrays))
 
     def arguments(self, arrays: Sequence[Any]) -> Any:
         """Return the arguments with other arrays in the places of theirs."""
@@ -50,20 +50,20 @@ class _Call(NamedTuple):
 
 
 @final
-class Program(Generic[_P, _R]):
+class Program(Generic[_R]):
     """A function that is compiled once for all arguments of the same shapes, as by `filter_jit`.
 
     Where compiled code is kept, neither is it traced again in the next process for arguments of
     echelon's own classes.
     """
 
-    def __init__(self, function: Callable[_P, _R]) -> None:
+    def __init__(self, function: Callable[..., _R]) -> None:
         """Wrap a function of a module."""
         functools.update_wrapper(self, function)
         self._function, self._plain = function, eqx.filter_jit(function)
         self._made: dict[Hashable, _Compiled | None] = {}
 
-    def __call__(self, *args: _P.args, **named: _P.kwargs) -> _R:
+    def __call__(self, *args: Any, **named: Any) -> _R:
         """Return what the function returns."""
         call = _call_of((args, named)) if store.is_open() else None
         if call is None:
@@ -80,7 +80,8 @@ class Program(Generic[_P, _R]):
         """Return what is kept for a call, or compile and keep it; None for a stranger's classes."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         given = call.arguments(call.arrays)
-        file = store.place_of(name, _precision(), given, arrays=_shape)
+        # Of no arrays too the precision matters.
+        file = store.place_of(name, _form(np.zeros(0)), given, arrays=_shape)
         if file is None:
             return None
         stored = store.read(file)
@@ -95,8 +96,8 @@ class Program(Generic[_P, _R]):
         return made
 
 
-def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Return a function that JAX compiles, a `Program`."""
+def program(function: Callable[..., _R]) -> Callable[..., _R]:
+    """Return a function that JAX compiles, of arrays of JAX's or of NumPy's."""
     return Program(function)
 
 
@@ -105,7 +106,7 @@ def _call_of(arguments: Any) -> _Call | None:
     leaves, tree = jax.tree.flatten(arguments)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return None
-    arrays = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+    arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
     places = map(_Place, range(len(arrays)))
     return _Call(arrays, tuple(next(places) if eqx.is_array(x) else x for x in leaves), tree)
 
@@ -119,9 +120,10 @@ def _filled(tree: Any, arrays: Sequence[Any]) -> Any:
     return jax.tree.map(at, tree, is_leaf=lambda leaf: isinstance(leaf, _Place))
 
 
-def _precision() -> str:
-    """Return in what precision JAX computes here."""
-    return str(jax.dtypes.canonicalize_dtype(np.float64))
+def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
+    """Return the shape and type of an array, as JAX takes it in the precision that is on."""
+    kind = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
+    return array.shape, str(kind), getattr(array, "weak_type", False)
 
 
 def _shape(array: Any) -> Iterator[bytes]:
@@ -129,7 +131,7 @@ def _shape(array: Any) -> Iterator[bytes]:
     if not eqx.is_array(array):
         yield from store.bits(array)
         return
-    yield f"{array.shape}{array.dtype}{array.weak_type}".encode()
+    yield repr(_form(array)).encode()
 
 
 # ---- compiled code -------------------------------------------------------------------------------
@@ -148,8 +150,15 @@ def _compile(function: Callable[..., Any], call: _Call) -> _Compiled:
         trees.append(jax.tree.unflatten(tree, leaves))
         return made
 
-    flat.__name__ = function.__name__
-    compiled = jax.jit(flat, keep_unused=True).lower(*call.arrays).compile()
+    # What JAX has read from its own disk cache cannot be written down again: it lacks its code.
+    # Under a name of its own it is not found there, nor is it kept there as well.
+    flat.__name__ = f"{function.__name__}_{os.urandom(8).hex()}"
+    lowered, least = jax.jit(flat, keep_unused=True).lower(*call.arrays), jax.config.values[_LEAST]
+    jax.config.update(_LEAST, _NEVER)
+    try:
+        compiled = lowered.compile()
+    finally:
+        jax.config.update(_LEAST, least)
     return _Compiled(compiled, trees[-1])
 
 

@@ -69,12 +69,12 @@ class JaxStepper(Stepper):
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
-        return begin(self.loop, jnp.asarray(self.states))
+        return begin(self.loop, self.states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
-        now, (states, inputs), sums = step(self.loop, now, jnp.asarray(counts), reference)
+        now, (states, inputs), sums = step(self.loop, now, counts, reference)
         return Chunk(now, *on_host((states, inputs, sums)))
 
 
@@ -113,7 +113,7 @@ class JaxFormations(Stepper):
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
-        made = _advance_all(self.loop, self.axes, now, jnp.asarray(counts), reference)
+        made = _advance_all(self.loop, self.axes, now, counts, reference)
         (x, u), sums = on_host(made[1:])
         # As if it were one swarm: the formations stand along the second axis, or the first.
         twice = {name: _merged(getattr(sums, name), 1) for name in ("errors", "tracking")}

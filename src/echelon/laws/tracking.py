@@ -5,7 +5,6 @@ It serves the paper's Assumption 4.
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import LawError, ReferenceError
@@ -57,7 +56,7 @@ class Tracking(Law):
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
         gain = tracking_gain(self, model, graph, self.gain)
         # Refused here, since a run would only say that the leader diverged at once.
-        begin = follow_at(model, self.reference, jnp.zeros(1))
+        begin = follow_at(model, self.reference, np.zeros(1))
         if not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
@@ -75,7 +74,7 @@ class Tracking(Law):
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""
-        return follow_at(model, self.reference, jnp.zeros(1))[0][0]
+        return follow_at(model, self.reference, np.zeros(1))[0][0]
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return x_r at each of `times`, (T, n)."""

@@ -146,7 +146,7 @@ def heading_gap(model: "ControlAffine") -> float:
     x = trim + draw.uniform(-0.5, 0.5, (_SAMPLES, len(trim)))
     angles = draw.uniform(-np.pi, np.pi, _SAMPLES)
     with precision("float64"):
-        found = _gaps(model, jnp.asarray(x), jnp.asarray(angles))
+        found = _gaps(model, x, angles)
     gaps, sizes = map(np.asarray, found)
     return float((gaps / np.maximum(1.0, sizes)).max())
 

@@ -63,7 +63,7 @@ def at_trim(model: ControlAffine) -> AtTrim:
     x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are kept in files, so they must not depend on the precision of the run that needs them.
     with precision("float64"):
-        found = _evaluate(model, jnp.asarray(x), jnp.asarray(u), jnp.asarray(stencil(x)))
+        found = _evaluate(model, x, u, stencil(x))
     *there, around = map(_freeze, found)
     said, seen = np.concatenate([there[3], there[4].reshape(-1, len(x))]), sides(x, around)
     return AtTrim(*there, bends=_bends(seen, u), gap=seen.gap(said))  # pyright: ignore

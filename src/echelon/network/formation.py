@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import FormationError
@@ -264,7 +263,7 @@ def _describe_change(
     base = np.asarray(model.trim[0], float)
     # Near the trim where nothing else is asked, so that no angle leaves its chart.
     states = base + np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, len(base)))
-    both = jnp.asarray(np.concatenate([states, states + offset]))
+    both = np.concatenate([states, states + offset])
     for name, (values, slopes) in _local(model, both).items():
         here, there = np.split(np.asarray(values), 2)
         # A change that happens to vanish at a state rarely vanishes with its slope.

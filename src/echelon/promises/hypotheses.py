@@ -7,7 +7,6 @@ left of one, or why.
 from collections.abc import Iterator, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.jacobians import offsets_are_symmetries
@@ -66,7 +65,7 @@ def _trim_applied(case: Case) -> Statement:
 def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:
     """Return the drift at the goals about the trim, (N, n), with the law's inner loop if any."""
     with precision("float64"):
-        goals = jnp.asarray(np.asarray(model.trim[0], float) + offsets)
+        goals = np.asarray(model.trim[0], float) + offsets
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 

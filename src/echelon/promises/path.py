@@ -246,7 +246,7 @@ def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
     # Rows of one number, so that every path and every swarm is compiled once.
     full = (np.concatenate([part, np.repeat(part[-1:], more, axis=0)]) for part in rows)
     law = without_certificates(parts.drive.follower)
-    found = _about(parts.model, law, *map(jnp.asarray, [*full][:4]))
+    found = _about(parts.model, law, *[*full][:4])
     A, B, alone, felt = (np.asarray(part)[:count] for part in found)
     if rows.rates.any():
         # In axes that turn, delta turns the other way by itself.

@@ -75,8 +75,8 @@ def lyapunov(result: Result) -> Lyapunov | None:
     if P is None or not len(result.times) or not goes_both_ways(graph):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
-        x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
-        steps = jnp.asarray(np.rint(result.times / result.settings.dt).astype(np.int32))
+        x, u = result.states, result.inputs
+        steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
         now, after = (
             _seen(result.model, each, np.asarray(each.states) - offsets) for each in fields
@@ -108,7 +108,7 @@ _Difference: TypeAlias = Callable[[Array, Array], Array]
 
 def _difference(model: ControlAffine) -> _Difference:
     """Return the difference of states (T, E, n) that the laws take: angles may wind."""
-    return lambda x, y: np.asarray(_differences(model, jnp.asarray(x), jnp.asarray(y)))
+    return lambda x, y: np.asarray(_differences(model, x, y))
 
 
 @program

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import Outcome
@@ -127,9 +126,7 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
     leader = result.graph.leaders[0] if leader is None else leader
     wanted = result.reference + result.formation.offsets[leader]
     with precision("float64"):
-        return np.asarray(
-            _output_errors(result.model, jnp.asarray(result.states[:, leader]), jnp.asarray(wanted))
-        )
+        return np.asarray(_output_errors(result.model, result.states[:, leader], wanted))
 
 
 @program
