@@ -1,7 +1,7 @@
 """Labelled arrays as netCDF, without what labels can do beyond that and takes long to load."""
 
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -37,32 +37,26 @@ class Labelled(NamedTuple):
         # Here, since it takes long to load; `xarray` takes five times as long.
         import h5netcdf
 
-        file = io.BytesIO()
+        file, labels = io.BytesIO(), set(self._labels())
         with h5netcdf.File(file, "w") as written:
-            for name, dimensions, values, attributes in self._parts():
-                _write(written, name, dimensions, values, attributes)
-            for name, value in self.attributes.items():
+            for name, part in {**self.variables, **self.coordinates}.items():
+                dimensions, values, told = _whole(name, part)
+                if name in self.variables and (mine := self._labels(dimensions)):
+                    told["coordinates"], labels = " ".join(mine), labels - {*mine}
+                _write(written, name, dimensions, values, told)
+            # Labels that no variable names are named by the whole.
+            rest = {"coordinates": " ".join(sorted(labels))} if labels else {}
+            for name, value in {**self.attributes, **rest}.items():
                 written.attrs[name] = value if isinstance(value, str) else np.atleast_1d(value)
         return file.getvalue()
 
-    def _parts(self) -> Iterator[tuple[str, tuple[str, ...], Array, dict[str, Any]]]:
-        """Yield name, dimensions, values and attributes of all, the variables first."""
-        for name, part in {**self.variables, **self.coordinates}.items():
-            dimensions, values, told = _whole(name, part)
-            beside = [] if name in self.coordinates else self._beside(dimensions)
-            yield (
-                name,
-                dimensions,
-                values,
-                told | {"coordinates": " ".join(beside)} if beside else told,
-            )
-
-    def _beside(self, dimensions: tuple[str, ...]) -> list[str]:
-        """Return which coordinates label dimensions under another name."""
+    def _labels(self, dimensions: tuple[str, ...] | None = None) -> list[str]:
+        """Return which coordinates label dimensions, or any, under another name."""
+        owns = {name: _whole(name, part)[0] for name, part in self.coordinates.items()}
         return [
             name
-            for name, part in self.coordinates.items()
-            if name not in (own := _whole(name, part)[0]) and set(own) <= set(dimensions)
+            for name, own in owns.items()
+            if name not in own and (dimensions is None or set(own) <= set(dimensions))
         ]
 
 
