@@ -19,12 +19,13 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FunctionType
 from typing import Any, Final, TypeAlias
 
 FOLDER: Final = "ECHELON_KEPT"
 """Of the environment: where all is kept. The command line sets it; the library keeps nothing."""
-_SETTINGS: Final = ("XLA_FLAGS", "JAX_")
-"""What the names in the environment begin with that change what JAX makes."""
+_SETTINGS, _IDLE = ("xla_", "jax_"), ("cache", "log")
+"""What the names of settings begin with that may change what JAX makes, and hold if they do not."""
 _BEGAN = time.time()
 _closed = threading.Event()
 
@@ -109,13 +110,13 @@ def _ground() -> bytes | None:
         return None
     below = (np, scipy, jax, jaxlib, equinox)
     told = [*(module.__version__ for module in below), sys.version, _processor()]
-    told += [f"{key}={value}" for key, value in sorted(os.environ.items()) if _sets(key)]
-    told += [f"{key}={value}" for key, value in sorted(jax.config.values.items())]
+    settings = [*os.environ.items(), *jax.config.values.items()]
+    told += sorted(f"{key}={value}" for key, value in settings if _sets(key.lower()))
     return hashlib.sha256(sources + "\0".join(told).encode()).digest()
 
 
 def _sets(name: str) -> bool:
-    return name.startswith(_SETTINGS) and "CACHE" not in name
+    return name.startswith(_SETTINGS) and not any(word in name for word in _IDLE)
 
 
 def _sources() -> bytes | None:
@@ -141,17 +142,18 @@ def _processor() -> str:
 
 def _told(value: Any, arrays: Tell) -> Iterator[bytes]:
     """Yield what a tree of values is known by, each part with its class."""
-    kind = type(value)
-    yield _name_of(kind).encode()
-    if hasattr(value, "dtype") and hasattr(value, "shape") and kind is not type:
+    if isinstance(value, type | FunctionType):
+        yield b"named " + _name_of(value).encode()
+        return
+    if hasattr(value, "dtype") and hasattr(value, "shape"):
         yield from arrays(value)
-    elif isinstance(value, enum.Enum):
+        return
+    yield _name_of(type(value)).encode()
+    if isinstance(value, enum.Enum):
         yield value.name.encode()
     elif value is None or isinstance(value, bool | int | str | bytes | float | complex):
         # `repr` of a float has all its digits, and the sign of 0.
         yield repr(value).encode()
-    elif isinstance(value, type) or kind is type(_told):
-        yield _name_of(value).encode()
     else:
         for part in _parts(value):
             yield from _told(part, arrays)
@@ -179,11 +181,11 @@ def bits(array: Any) -> Iterator[bytes]:
     values = np.asarray(array)
     if values.dtype.hasobject:
         raise _Foreign
-    yield f"{values.dtype.str}{values.shape}".encode()
+    yield f"{type(array).__name__} {values.dtype.str}{values.shape}".encode()
     yield values.tobytes()
 
 
-_OURS: Final = {"echelon", "builtins", "numpy", "jax", "jaxlib"}
+_OURS: Final = {"echelon", "builtins", "numpy", "jax"}
 
 
 def _name_of(named: Any) -> str:
@@ -192,8 +194,8 @@ def _name_of(named: Any) -> str:
     found: Any = sys.modules.get(home)
     for part in name.split("."):
         found = getattr(found, part, None)
-    # What goes by another's name, as a class that is made in a function does, is nobody's.
-    plain = named is type(None) or found is named
-    if home.partition(".")[0] not in _OURS or not plain and home != "jaxlib._jax":
+    # What cannot be found by its name, as a class that is made in a function, is nobody's.
+    known = named is type(None) or found is named
+    if home.partition(".")[0] not in _OURS or not known:
         raise _Foreign
     return f"{home}.{name}"
