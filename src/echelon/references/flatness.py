@@ -10,7 +10,7 @@ from jax.core import Tracer
 from echelon.core.errors import LawError, PlanError
 from echelon.core.numerics import precision
 from echelon.core.program import program
-from echelon.core.types import Array
+from echelon.core.types import Array, State
 from echelon.models.model import ControlAffine
 from echelon.references.guide import Guide
 from echelon.references.reference import check_reference
@@ -28,6 +28,17 @@ def follow_at(model: ControlAffine, reference: Guide, times: Array | jax.Array) 
     found = [_follow_all(model, reference, few) for few in np.split(padded, len(padded) // _FEW)]
     x, u = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
     return x, u
+
+
+def followed_states(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> jax.Array:
+    """Return the states (T, n) that follow a reference exactly at times (T,)."""
+    # As laws return them, and without a program of its own as `asarray` has.
+    return jax.device_put(follow_at(model, reference, times)[0])
+
+
+def first_state(model: ControlAffine, reference: Guide) -> State:
+    """Return the state (n,) that follows a reference at time zero."""
+    return jax.device_put(follow_at(model, reference, np.zeros(1))[0][0])
 
 
 @program
