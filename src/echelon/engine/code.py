@@ -6,9 +6,9 @@ from typing import NamedTuple, TypeAlias, final
 from weakref import WeakValueDictionary
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.numerics import precision
 from echelon.engine.loop import Loop
 from echelon.engine.own import Own
 from echelon.engine.scalars import Rows, body_of, signals_of
@@ -22,7 +22,9 @@ _KEPT = 8
 
 def follows(loop: Loop) -> bool:
     """Tell whether the leaders of a loop follow a reference."""
-    return loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
+    # As references are sampled, so that nothing is compiled for this alone.
+    with precision("float64"):
+        return loop.leader.reference_states(loop.model, jax.device_put(np.zeros(1))) is not None
 
 
 class Kernel(NamedTuple):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.loop import Loop, act_alone, what_limits_did
+from echelon.engine.loop import Loop, act_alone, tell, what_limits_did
 from echelon.engine.own import Own
 from echelon.kernels import Body, Graph, Node, Unsupported, inverses_shared, lower, nodes
 from echelon.laws.law import Law, LocalView, Memory
@@ -98,13 +98,14 @@ def memories_of(law: Law, flat: Array) -> Memory:
 def told_by(loop: Loop) -> int:
     """Return how many numbers an agent sends besides its state."""
     n, m = len(loop.model.state_names), len(loop.model.input_names)
-    known = jnp.zeros(n), jnp.zeros(signals_of(loop) or n), jnp.zeros(m)
+    turning = loop.follower.turning
 
-    def told(x: Any, z: Any, sent: Any) -> Any:
-        view = LocalView(x[0], x, x, z, sent, loop.motion.dt)
-        return act_alone(loop, loop.leader, view, loop.leader.init(), leads=True)[3]
+    # Of what is told alone: a trace of all that a leader does takes as long as the code of it.
+    def told(x: Any, v: Any) -> Any:
+        follower = loop.follower.facing(x[0]) if turning else loop.follower
+        return tell(follower, loop.model, x, v, loop.leader.init())
 
-    return jax.eval_shape(told, *known).shape[0]
+    return jax.eval_shape(told, np.zeros(n), np.zeros(m)).shape[0] + turning
 
 
 def signals_of(loop: Loop) -> int:

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, Output, State
@@ -276,8 +277,11 @@ class ControlAffine(eqx.Module):
         """Return v = S^-1 (u - u*) of physical inputs (..., m), NumPy's or JAX's."""
         xp = u.__array_namespace__()
         # A constant wherever S is one, so that neither a step nor a solver's expression inverts it.
-        with jax.ensure_compile_time_eval():
+        # By NumPy, since a program for it takes longer than the rest of a trace.
+        if any(isinstance(entry, Tracer) for entry in jax.tree.leaves(self.input_scale)):
             inverse = xp.linalg.inv(xp.asarray(self.input_scale, u.dtype))
+        else:
+            inverse = xp.asarray(np.linalg.inv(np.asarray(self.input_scale, u.dtype)))
         return (u - _rest(self, u)) @ inverse.T
 
     def position_indices(self) -> tuple[int, ...]:
