@@ -12,7 +12,7 @@ from echelon.core.types import Array
 from echelon.engine.code import LANES, Kernels, Make, follows
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin, signals
+from echelon.engine.loop import Loop, Moment, begin, begin_forgetful, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.scalars import memories_of, signals_of
@@ -159,14 +159,13 @@ class NativeStepper(Stepper):
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
-        parts = np.split(np.asarray(self.states), len(self.loops))
-        # Where nothing is remembered all begin alike.
-        loops = self.loops if len(self.rows.memory) else self.loops[:1]
-        found = [begin(loop, jnp.asarray(x)) for loop, x in zip(loops, parts)]
-        found = [jax.tree.map(np.asarray, moment) for moment in found]
-        found *= len(self.loops) // len(found)
+        states = np.asarray(self.states, self.dtype)
+        if not len(self.rows.memory):
+            return begin_forgetful(self.loop, states)
+        each = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
+        found = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in each]
         many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(each[1:] for each in found))
-        return Moment(found[0].step, *many)._replace(states=np.asarray(self.states, self.dtype))
+        return Moment(found[0].step, *many)._replace(states=states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
@@ -182,7 +181,7 @@ class NativeStepper(Stepper):
     def turn(self, loop: Loop) -> None:
         """Go on in a loop of one formation that is like the one before, but for its numbers."""
         self.loop, self.loops = loop, [loop]
-        self.own.values = self.own.of(loop)[None]
+        self.own.turn(loop)
         self.heavy[:] = heard(loop, self.places)[2]
         # Offsets, numbers and the wind are written with a moment.
         self._held = None
