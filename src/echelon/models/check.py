@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.kept import kept
 from echelon.core.numerics import precision
 from echelon.core.trace import check_function, in_short
 from echelon.models.heading import check_heading
@@ -29,11 +28,8 @@ class Shortfall(NamedTuple):
     asked: float
 
 
-@kept
 def check_model(model: ControlAffine) -> tuple[str, ...]:
     """Check shapes, finite values and Jacobians at the trim, and that the trim is an equilibrium.
-
-    A model that passes is checked once.
 
     Returns:
         Warnings, one sentence each, about what is allowed but probably not meant.

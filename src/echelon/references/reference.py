@@ -103,7 +103,6 @@ def _turns(reference: Reference, place: int, rest: float) -> bool:
     return bool((hull.vertices != rest).any() or hull.error.any())
 
 
-@kept
 def _check_map(model: ControlAffine) -> None:
     """Trace the flatness map, and check the state and the input that it returns."""
     name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
