@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.code import LANES, Kernels, Make, follows
+from echelon.engine.code import KERNELS, LANES, Make
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.loop import Loop, Moment, begin, begin_forgetful, signals
@@ -50,7 +50,7 @@ class NativeStepper(Stepper):
         far: what goes on where a state is beyond the range of the kernels' sines; None where the
             caller looks.
         pool: threads that step formations; None for the caller's alone.
-        make: makes the kernel, or has made it before.
+        make: makes the kernel, or has made it before; those of all runs when left out.
         unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
             weights of edges anyway; None where nothing is turned.
         threads: that share the steps of one formation; by its size when left out.
@@ -75,7 +75,6 @@ class NativeStepper(Stepper):
         """Write and compile the step."""
         self.own = Own(loops, unlike)
         self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
-        self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
         known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
@@ -86,7 +85,7 @@ class NativeStepper(Stepper):
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
         lines, turned = self.places.lines, unlike is not None
-        made = (make or Kernels().of)(self.own, bits, together, lines, turned)
+        made = (make or KERNELS.of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
         self._signaled = signals_of(self.loop)
         self._work = 1 + len(needed(self.plan.others.results()))

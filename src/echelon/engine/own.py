@@ -4,6 +4,7 @@ Or between one formation now and later, where somebody turns its knobs.
 """
 
 import dataclasses
+import hashlib
 import operator
 from collections.abc import Hashable, Sequence
 from typing import Any, final
@@ -14,6 +15,9 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
+
+_LARGE = 4096
+"""Bytes of an array of which a digest is remembered."""
 
 
 def _apart(loop: Loop) -> list[Any]:
@@ -101,9 +105,9 @@ class Own:
         return key
 
     def _fixed(self, leaves: Sequence[Any]) -> list[bytes]:
-        """Return the leaves without the numbers that differ."""
+        """Return what says the leaves without the numbers that differ."""
         return [
-            (np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf)).tobytes()
+            _said(np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf))
             for leaf, mask in zip(leaves, self._masks, strict=True)
         ]
 
@@ -126,6 +130,11 @@ class Own:
         given, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
         new = self._tree.unflatten([next(given) if m.any() else leaf for leaf, m in pairs])
         return eqx.tree_at(_apart, new, _apart(self.loop), is_leaf=lambda x: x is None)
+
+
+def _said(array: Array) -> bytes:
+    """Return the bits of an array; of a large one, such as a graph's, a digest that is kept."""
+    return array.tobytes() if array.nbytes < _LARGE else hashlib.sha256(array.tobytes()).digest()
 
 
 def alike(loop: Loop, other: Loop) -> bool:
