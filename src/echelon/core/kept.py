@@ -34,7 +34,7 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @functools.wraps(function)
     def once(*args: _P.args, **named: _P.kwargs) -> _R:
-        call = _Call(_identify((args, tuple(named.items()))), args, named)
+        call = _Call(identify((args, named)), args, named)
         try:
             hash(call)
         except TypeError:
@@ -73,13 +73,18 @@ class _Call:
     named: dict[str, Any] = dataclasses.field(compare=False)
 
 
-def _identify(value: Any) -> Any:
-    """Return what is equal, and hashable, for values of the same types and bits alone."""
+def identify(value: Any) -> Any:
+    """Return what is equal, and hashable, for values of the same types and bits alone.
+
+    What is no value of a known kind stands for itself. Where that cannot be hashed, nor can this.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = dataclasses.fields(value)
-        return type(value), tuple(_identify(getattr(value, field.name)) for field in fields)
+        return type(value), tuple(identify(getattr(value, field.name)) for field in fields)
     if isinstance(value, tuple | list):
-        return type(value), tuple(map(_identify, value))
+        return type(value), tuple(map(identify, value))
+    if isinstance(value, dict):
+        return dict, tuple((identify(key), identify(each)) for key, each in value.items())
     # Numbers by their bytes too, since 0.0 equals -0.0, and NaN not itself.
     if isinstance(value, float | complex | np.ndarray | jax.Array):
         array = np.asarray(value)

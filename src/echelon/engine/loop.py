@@ -145,6 +145,13 @@ def begin(loop: Loop, states: States) -> Moment:
     )
 
 
+def begin_forgetful(loop: Loop, states: Any) -> Moment:
+    """Return that moment for laws that remember nothing, without JAX: its calls cost many steps."""
+    cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
+    step: Any = np.zeros((), np.int32)
+    return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)
+
+
 # ---- one step ------------------------------------------------------------------------------------
 
 

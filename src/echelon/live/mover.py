@@ -95,7 +95,7 @@ class _Native(Mover):
 
     def _reference(self, now: Moment, count: int) -> Array | None:
         """Return what the meter measures leaders against, which nobody asks for here."""
-        if not self.stepper.follows:
+        if not self.stepper.plan.table:
             return None
         times = self.loop.motion.dt * (int(now.step) + jnp.arange(count + 1))
         return np.asarray(_followed(self.loop.leader, self.loop.model, times), np.float64)

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 
 from echelon.certificates.responses import Chain
+from echelon.core.kept import kept
 from echelon.core.linear import held_radius
 from echelon.core.program import program
 from echelon.core.types import Array
@@ -128,7 +129,15 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | N
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
-    return Stopping(parts, settings, states, flat, np.asarray(drive.leader.begins(parts.model)))
+    return Stopping(parts, settings, states, flat, _begun(drive.leader, parts.model))
+
+
+@kept
+def _begun(leader: StoppingLeader, model: ControlAffine) -> Array:
+    """Return where the leader's path begins, as `begins` does, read-only."""
+    found = np.array(leader.begins(model))
+    found.setflags(write=False)
+    return found
 
 
 @program
