@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import sys
 from fractions import Fraction
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -148,9 +149,40 @@ def test_sources_are_told_by_all_that_stands_in_them(tmp_path, monkeypatch):
     assert None not in told and len(set(told)) == 4
 
 
-def test_nothing_is_kept_where_a_source_changed_since_the_process_began(monkeypatch):
+def test_nothing_is_kept_where_a_source_changed_since_the_process_began(folder, monkeypatch):
+    before = place(1)
     monkeypatch.setattr(store, "_BEGAN", 0.0)
+    # What was loaded after the change is no part of what was told before it.
+    assert stored(lambda: 3, "what", 1) == 3 and place(1) == before
+    assert list(folder.iterdir()) == []
+    store._ground.cache_clear()
     assert place(1) is None
+
+
+class Still(eqx.Module):
+    """An array that is no part of what is traced, and known by who it is alone."""
+
+    kept: Any = eqx.field(static=True)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Box:
+    values: Any
+
+
+def scaled(still, x):
+    return x * still.kept.values
+
+
+def test_arrays_that_are_not_traced_are_known_by_their_numbers(monkeypatch):
+    for thing in (Still, Box, scaled):
+        monkeypatch.setattr(thing, "__module__", "echelon.models")
+        monkeypatch.setattr("echelon.models." + thing.__name__, thing, raising=False)
+    x = np.ones(2)
+    for numbers in (np.array([1.0, 2.0]), np.array([3.0, 4.0])):
+        with precision("float64"):
+            got = Program(scaled)(Still(Box(numbers)), x)
+        np.testing.assert_array_equal(got, numbers)
 
 
 def test_nothing_is_kept_once_a_users_file_is_loaded(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import os
 import pickle
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
@@ -79,9 +79,10 @@ class Program(Generic[_R]):
     def _make(self, call: _Call) -> _Compiled | None:
         """Return what is kept for a call, or compile and keep it; None for a stranger's classes."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
-        given = call.arguments(call.arrays)
-        # Of no arrays too the precision matters.
-        file = store.place_of(name, _form(np.zeros(0)), given, arrays=_shape)
+        # Places stand for what is traced; other arrays are known by their numbers. Of no arrays too
+        # the precision matters.
+        forms, whole = tuple(map(_form, call.arrays)), jax.tree.unflatten(call.tree, call.leaves)
+        file = store.place_of(name, _form(np.zeros(0)), forms, whole)
         if file is None:
             return None
         stored = store.read(file)
@@ -124,14 +125,6 @@ def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
     """Return the shape and type of an array, as JAX takes it in the precision that is on."""
     kind = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
     return array.shape, str(kind), getattr(array, "weak_type", False)
-
-
-def _shape(array: Any) -> Iterator[bytes]:
-    """Yield what is known of an array before it has numbers; all of a number that is none."""
-    if not eqx.is_array(array):
-        yield from store.bits(array)
-        return
-    yield repr(_form(array)).encode()
 
 
 # ---- compiled code -------------------------------------------------------------------------------

@@ -17,10 +17,10 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import FunctionType
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 FOLDER: Final = "ECHELON_KEPT"
 """Of the environment: where all is kept. The command line sets it; the library keeps nothing."""
@@ -34,10 +34,6 @@ class _Foreign(Exception):
     """A value of a class that is not echelon's."""
 
 
-Tell: TypeAlias = Callable[[Any], Iterator[bytes]]
-"""value -> the bytes that it is known by."""
-
-
 def is_open() -> bool:
     """Tell whether anything is kept in this process."""
     return not _closed.is_set() and FOLDER in os.environ
@@ -48,20 +44,19 @@ def close() -> None:
     _closed.set()
 
 
-def place_of(what: str, *values: Any, arrays: Tell | None = None) -> Path | None:
+def place_of(what: str, *values: Any) -> Path | None:
     """Return the file for what is made of some values; None where nothing may be kept.
 
     Args:
         what: is made, by whom.
         values: trees of numbers, arrays, words and echelon's own classes.
-        arrays: what an array is known by, if not by all its numbers.
     """
     ground = _ground() if is_open() else None
     if ground is None:
         return None
     made = hashlib.sha256(ground)
     try:
-        for part in _told((what, values), arrays or bits):
+        for part in _told((what, values)):
             made.update(b"%d:" % len(part) + part)
     except _Foreign:
         return None
@@ -82,6 +77,9 @@ def read(file: Path) -> bytes | None:
 
 def keep(file: Path, made: bytes) -> None:
     """Write what was made to a file, beside it first; a folder without room keeps nothing."""
+    # A file that is loaded late may have changed since the others were told.
+    if _changed():
+        return
     beside, packed = file.with_name(f"{file.name}.{os.getpid()}"), zlib.compress(made, 1)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -122,13 +120,18 @@ def _sets(name: str) -> bool:
 def _sources() -> bytes | None:
     """Return what echelon's own files hold, in short; None where they are not what was loaded."""
     home, told = Path(__file__).parents[1], hashlib.sha256()
+    if _changed():
+        return None
     for file in sorted(home.rglob("*.py")):
-        # It was changed while this process ran, which may have loaded what stood there before.
-        if file.stat().st_mtime >= _BEGAN:
-            return None
         content = file.read_bytes()
         told.update(f"{file.relative_to(home)}\0{len(content)}\0".encode() + content)
     return told.digest()
+
+
+def _changed() -> bool:
+    """Tell whether a source changed while this process ran, which may have loaded it before."""
+    files = Path(__file__).parents[1].rglob("*.py")
+    return any(file.stat().st_mtime >= _BEGAN for file in files)
 
 
 def _processor() -> str:
@@ -140,13 +143,13 @@ def _processor() -> str:
     return " ".join((platform.machine(), platform.processor(), platform.platform()))
 
 
-def _told(value: Any, arrays: Tell) -> Iterator[bytes]:
+def _told(value: Any) -> Iterator[bytes]:
     """Yield what a tree of values is known by, each part with its class."""
     if isinstance(value, type | FunctionType):
         yield b"named " + _name_of(value).encode()
         return
     if hasattr(value, "dtype") and hasattr(value, "shape"):
-        yield from arrays(value)
+        yield from _bits(value)
         return
     yield _name_of(type(value)).encode()
     if isinstance(value, enum.Enum):
@@ -156,7 +159,7 @@ def _told(value: Any, arrays: Tell) -> Iterator[bytes]:
         yield repr(value).encode()
     else:
         for part in _parts(value):
-            yield from _told(part, arrays)
+            yield from _told(part)
         yield b"."
 
 
@@ -174,8 +177,7 @@ def _parts(value: Any) -> Iterator[Any]:
         raise _Foreign
 
 
-def bits(array: Any) -> Iterator[bytes]:
-    """Yield all that an array is."""
+def _bits(array: Any) -> Iterator[bytes]:
     import numpy as np
 
     values = np.asarray(array)
