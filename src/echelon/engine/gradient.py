@@ -13,6 +13,7 @@ from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.jaxpr import read_by
 from echelon.core.kept import identify, kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.backward import Backward, Wants
 from echelon.engine.drive import Drive, Problem
@@ -274,7 +275,7 @@ def _own(loop: Loop, names: Sequence[str]) -> tuple[Own, list[str]]:
     return Own([loop], unlike), [leaf for leaf in marked if isinstance(leaf, str)]
 
 
-@eqx.filter_jit
+@program
 def _slopes_of(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
     """Return a cost of sums, and its slopes along those that have some."""
     names = ("errors", "tracking", "outputs", "effort", "spacing")
@@ -320,7 +321,7 @@ def _symmetric(name: str, slope: Array) -> Array:
     return 0.5 * (slope + slope.T) if name in ("P", "R") else slope
 
 
-@eqx.filter_jit
+@program
 def _differentiate(
     loop: Loop,
     values: dict[str, Array],

@@ -156,7 +156,7 @@ class _Flock:
         self.count, self.grid, self.first, self.bits = count, grid, first, bits
         self.times, self._states = list[Array](), list[Array]()
         self._inputs, self._references = list[Array](), list[Array]()
-        nothing = on_host(first.problem.meter.nothing())
+        nothing = on_host(first.problem.meter.nothing(np))
         self.sums = Sums(*(np.stack([part] * count) for part in nothing))
         self.finite, self.far = np.ones(count, bool), np.zeros(count, bool)
 

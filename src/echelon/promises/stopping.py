@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import scipy.linalg
 
 from echelon.certificates.responses import Chain
 from echelon.core.linear import held_radius
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Verdict
 from echelon.engine.laws import Laws
@@ -131,7 +131,7 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | N
     return Stopping(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
 
 
-@eqx.filter_jit
+@program
 def _flat(
     model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
 ) -> jax.Array:
@@ -302,7 +302,7 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     return Statement(Hypothesis.EXACT, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text)
 
 
-@eqx.filter_jit
+@program
 def _pushed(
     model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
