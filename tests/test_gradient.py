@@ -189,6 +189,11 @@ def test_what_is_changed_in_place_or_refused_is_seen_by_the_next_gradient():
     first = ech.gradient(parts, settings, squares, ("initial",)).value
     starts[1] *= 2.0
     assert ech.gradient(parts, settings, squares, ("initial",)).value == pytest.approx(4.0 * first)
+    # A number of the gain along which there is no slope, a constant of the code.
+    parts.drive.gain.R_inverse[:] *= 0.5
+    weaker = ech.gradient(parts, settings, squares, ("initial",)).value
+    found = ech.gradient(regained(parts, 1.0, 0.8, 2.0), settings, squares, ("initial",))
+    assert weaker == found.value != first
     starts[1] = np.nan
     with pytest.raises(ech.EchelonError, match="must be finite"):
         ech.gradient(parts, settings, squares, ("initial",))

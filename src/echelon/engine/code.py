@@ -119,4 +119,4 @@ class Kernels:
 
 
 KERNELS = Kernels()
-"""Those of runs one by one."""
+"""Those of all runs."""

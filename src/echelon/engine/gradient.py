@@ -98,8 +98,8 @@ class Run(NamedTuple):
 # ---- what is ready to be run again ---------------------------------------------------------------
 
 
-_READY = 4
-"""Runs that are kept for other calls."""
+_READY, _LARGE = 4, 100_000
+"""Runs that are kept for other calls, and the states of one beside which that saves nothing."""
 _ready: dict[Hashable, "_Ready"] = {}
 
 
@@ -114,7 +114,7 @@ def _taken(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> "_Ready":
 
 def _give(ready: "_Ready") -> None:
     """Keep a run for the next caller."""
-    if ready.key is not None:
+    if ready.key is not None and ready.run.states.size < _LARGE:
         _ready[ready.key] = ready
         for key in list(_ready)[:-_READY]:
             _ready.pop(key, None)

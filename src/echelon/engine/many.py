@@ -18,7 +18,7 @@ from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.engine.by_jax import JaxFormations
-from echelon.engine.code import Kernels
+from echelon.engine.code import KERNELS
 from echelon.engine.crew import processors
 from echelon.engine.drive import Chunk, Stepper
 from echelon.engine.family import Families
@@ -73,7 +73,7 @@ class Fleet:
         """Begin with nothing prepared."""
         self.threads = threads or processors()
         self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
-        self.kernels, self.kinds = Kernels(), Families()
+        self.kinds = Families()
         self._cases: WeakKeyDictionary[Parts, dict[Settings, _Case]] = WeakKeyDictionary()
 
     def fly(self, runs: Sequence[Run], told: Told | None = None) -> Iterator[Result | EchelonError]:
@@ -127,7 +127,7 @@ class Fleet:
         """Return what a family comes to; nothing where its runs cannot go together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
-        bits, pool = int(settings.precision[5:]), (self.pool, self.kernels.of)
+        bits, pool = int(settings.precision[5:]), (self.pool, KERNELS.of)
         loops, began = [job.loop for job in jobs], time.perf_counter()
         with precision(settings.precision):
             try:

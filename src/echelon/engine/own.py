@@ -62,6 +62,8 @@ class Own:
         others = [] if unlike is None else [unlike]
         flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in [*distinct[1:], *others])]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
+        # At once: somebody may write to an array later, and code is made of what stands there now.
+        self._constant = self._fixed(self._flat)
         values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
 
@@ -87,7 +89,7 @@ class Own:
         """Tell whether a loop is like the first but for these numbers."""
         leaves, tree = jax.tree.flatten(bare(loop))
         same = _forms(leaves, tree) == _forms(self._flat, self._tree)
-        return same and self._fixed(leaves) == self._fixed(self._flat)
+        return same and self._fixed(leaves) == self._constant
 
     def turn(self, loop: Loop) -> None:
         """Take another loop that is like the first but for these numbers in its place."""
@@ -97,7 +99,7 @@ class Own:
     @property
     def signature(self) -> Hashable:
         """What decides the program, the same for other values; None where it cannot be told."""
-        key = (self._tree, *self._fixed(self._flat), *(mask.tobytes() for mask in self._masks))
+        key = (self._tree, *self._constant, *(mask.tobytes() for mask in self._masks))
         try:
             hash(key)
         except TypeError:

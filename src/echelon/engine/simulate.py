@@ -63,6 +63,8 @@ Keep: TypeAlias = Callable[[Stretch], None]
 Where it raises `Stopped`, with the reason in words, the run ends there.
 """
 
+_ROWS = 512
+"""Steps of a reference that cost as much as one."""
 _SECONDS = 2.0
 """Of wall time that a stretch takes: what is lost at most where a run is killed."""
 
@@ -167,6 +169,7 @@ class _Flight:
         self, stepper: Stepper, prepared: Prepared, recorder: Recorder, began: float
     ) -> None:
         self.stepper, self.prepared, self.recorder = stepper, prepared, recorder
+        self.followed = _Followed(prepared)
         last = recorder.stretches[-1] if recorder.stretches else None
         self.now = stepper.start() if last is None else stepper.recall(last.moment)
         # As if it had begun so much earlier: what was computed before counts too.
@@ -192,7 +195,7 @@ class _Flight:
         first, grid = self.recorder.done, self.recorder.grid
         # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
         # last chunks, which have fewer steps, keep them from compiling anew.
-        reference = sample_reference(self.prepared, first, grid.longest + 1)
+        reference = self.followed.rows(first, grid.longest + 1)
         made = self.stepper.advance(self.now, grid.counts(first), reference)
         self.recorder.keep(made, reference, time.perf_counter() - self.began)
         self.now = made.now
@@ -203,6 +206,23 @@ class _Flight:
         if keep is not None and new is not None:
             keep(new)
         self.given, self.gave = len(self.recorder.stretches), time.perf_counter()
+
+
+@final
+class _Followed:
+    """What the leaders follow, of more steps at once than a short chunk has."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self.prepared, self.first = prepared, 0
+        self.kept: Array | None = None
+
+    def rows(self, first: int, count: int) -> Array | None:
+        """Return what they follow at so many steps from one on; None where they follow nothing."""
+        if self.kept is None or first + count > self.first + len(self.kept):
+            self.first = first
+            self.kept = sample_reference(self.prepared, first, max(count, _ROWS))
+        at = first - self.first
+        return None if self.kept is None else self.kept[at : at + count]
 
 
 def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import LawError, listing
+from echelon.core.kept import kept
+from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, Hears
 from echelon.laws.flat_law import (
@@ -166,7 +168,7 @@ class StoppingPoint(FlatLaw):
                 "the leader and the followers have different `roots`, and would come to rest "
                 "differently; give both the same."
             )
-        ahead = np.asarray(leader.begins(model))
+        ahead = beginning_of(leader, model)
         assert self.reach is not None
         same = np.array_equal(np.asarray(self.ahead), ahead)
         law = self if same else eqx.tree_at(lambda law: law.ahead, self, ahead)
@@ -294,3 +296,12 @@ class StoppingLeader(FlatLaw):
         away = loop.place(model, view.x, view.offset, memory) - loop.stop(path[:-1])
         rate = loop.stop(path[1:]) - self.bounded(self.strength(view.period) * away)
         return loop.obey(model, view.x, rate, memory, view.period)
+
+
+@kept
+def beginning_of(leader: StoppingLeader, model: ControlAffine) -> Array:
+    """Return where a leader's path begins, as `begins` does, read-only; once for both."""
+    with precision("float64"):
+        found = np.array(leader.begins(model))
+    found.setflags(write=False)
+    return found

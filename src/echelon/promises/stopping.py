@@ -9,7 +9,6 @@ import numpy as np
 import scipy.linalg
 
 from echelon.certificates.responses import Chain
-from echelon.core.kept import kept
 from echelon.core.linear import held_radius
 from echelon.core.program import program
 from echelon.core.types import Array
@@ -18,7 +17,7 @@ from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
 from echelon.laws.flat_loop import FlatLoop
-from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
 from echelon.models.chains import flat_output, flatten
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -129,15 +128,7 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | N
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
-    return Stopping(parts, settings, states, flat, _begun(drive.leader, parts.model))
-
-
-@kept
-def _begun(leader: StoppingLeader, model: ControlAffine) -> Array:
-    """Return where the leader's path begins, as `begins` does, read-only."""
-    found = np.array(leader.begins(model))
-    found.setflags(write=False)
-    return found
+    return Stopping(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
 
 
 @program
