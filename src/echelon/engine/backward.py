@@ -15,7 +15,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.code import LANES, Kernel, compiled, follows, plan_of
-from echelon.engine.loop import Loop, Moment, begin, signals
+from echelon.engine.loop import Loop, Moment, begin, signals, stretch_at
 from echelon.engine.native import STEPS, NativeStepper, beyond
 from echelon.engine.own import Own
 from echelon.engine.places import Swarm, heard, senders_of, smooth_blocks
@@ -391,7 +391,7 @@ def _reach(loop: Loop, places: Swarm, turned: _Turned, pair: _Pair) -> _Reach:
 def _heard_back(loop: Loop, felt: Array) -> Array:
     """Return the slopes along what agents show (N, s), of those along what they hear at a start."""
     exchange, made = loop.exchange, np.zeros_like(felt)
-    weights = np.atleast_2d(np.asarray(exchange.weights))[loop.stretch(0)[0]]
+    weights = np.atleast_2d(np.asarray(exchange.weights))[stretch_at(loop, 0)[0]]
     along = weights[:, None] * felt[exchange.receivers]
     np.add.at(made, np.asarray(exchange.receivers), along)
     np.subtract.at(made, np.asarray(exchange.senders), along)

@@ -14,7 +14,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.places import Places
 from echelon.engine.turns import pays, step_by_step, tile_by_tile
-from echelon.kernels import SLOTS, Code, aligned
+from echelon.kernels import SLOTS, Code, aligned, mover
 
 _SHARED = 20_000
 """Agents of a swarm from which on threads share its steps; they wait twice in each."""
@@ -82,6 +82,29 @@ class Crew:
             return
         # More parts than threads, since another process may take a processor from one of them.
         share(self.pool, fly, np.array_split(groups, min(len(groups), 8)))
+
+    def move(self, blocks: Array, rows: range, values: Array, inward: bool = False) -> None:
+        """Read rows of blocks into values of the agents (N, rows), or write them there (`inward`).
+
+        Both arrays are contiguous, and the values float64, of the precision of the blocks, or int8.
+        """
+        count, lanes = len(blocks), self.places.lanes
+        code = mover(8 * blocks.itemsize, lanes, values.dtype.str[1:], inward)
+        agents, whole = self.places.agents, blocks[:, rows.start :]
+        arrays = [array.ctypes.data for array in (whole, agents, values)]
+        sizes = [blocks[0].size, len(rows)]
+
+        def some(ends: tuple[int, int]) -> None:
+            code.call(np.array([*arrays, *sizes, *ends], np.int64))
+
+        pool = self._own or self.pool
+        if not len(rows):
+            return
+        if pool is None or count * lanes < _SHARED:
+            some((0, count))
+            return
+        ends = np.linspace(0, count, 9, dtype=int).tolist()
+        share(pool, some, zip(ends[:-1], ends[1:], strict=True))
 
     def _swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array

@@ -12,9 +12,10 @@ from echelon.core.types import Array
 from echelon.engine.code import LANES, Kernels, Make, follows
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin, signals
+from echelon.engine.loop import Loop, Moment, begin, signals, stretch_at
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
+from echelon.engine.room import Room
 from echelon.engine.scalars import memories_of, signals_of
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.engine.winds import draw_holds, holds_at_once
@@ -22,7 +23,7 @@ from echelon.kernels import aligned, needed, stride
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some hundredths of a second."""
-_OPERATIONS, _ENOUGH = {64: 2e10, 32: 4e10}, 1_000
+_OPERATIONS, _ENOUGH = {64: 4e10, 32: 8e10}, 1_000
 """Of a chunk with no more steps than enough: about a second of one thread."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
@@ -80,7 +81,7 @@ class NativeStepper(Stepper):
         together, lanes = len(loops) > 1, LANES[bits]
         known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
         self.places: Places = known
-        self.crew = Crew(self.places, pool, threads)
+        self.crew, self.room = Crew(self.places, pool, threads), Room()
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
@@ -115,23 +116,16 @@ class NativeStepper(Stepper):
             places.measure(self.found, far, bytes_)
         self.edges, self.heavy = self.found.edges, self.found.weights
 
-    def _read(self, *parts: range, out: Array | None = None) -> Array:
-        """Return parts of the rows of all agents, (N, rows), in an array that is given or new."""
-        ends = np.cumsum([len(rows) for rows in parts]).tolist()
-        dtype = self.dtype if out is None else out.dtype
-        turned = np.empty((len(self.blocks), self.plan.lanes, ends[-1]), dtype)
-        for rows, end in zip(parts, ends, strict=True):
-            part = self.blocks[:, rows.start : rows.stop]
-            turned[..., end - len(rows) : end] = part.transpose(0, 2, 1)
-        flat = turned.reshape(len(self.places.agents), -1)
-        # Places are right, and to look at each would take a copy.
-        return np.take(flat, self.places.of, axis=0, out=out, mode="clip")
+    def _read(self, rows: range, out: Array) -> Array:
+        """Read rows of all agents into an array (N, rows), and return it."""
+        self.crew.move(self.blocks, rows, out)
+        return out
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
-        lanes = self.places.lanes
-        shaped = values[self.places.agents].reshape(self.places.blocks, lanes, len(rows))
-        self.blocks[:, rows.start : rows.stop] = shaped.transpose(0, 2, 1)
+        values = np.ascontiguousarray(values)
+        kind = np.float64 if values.dtype == np.float64 else self.dtype
+        self.crew.move(self.blocks, rows, values.astype(kind, copy=False), inward=True)
 
     # ---- steps ----
 
@@ -196,15 +190,19 @@ class NativeStepper(Stepper):
         first = int(now.step)
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
         step, agents = first, len(self.places.of)
-        x, u = (np.empty((len(counts), agents, len(r))) for r in (self.rows.state, self.rows.input))
+        begun, sizes = np.asarray(now.states), [len(self.rows.state), len(self.rows.input)]
+        x, u = (self.room.empty((len(counts), agents, size), float) for size in sizes)
+        # Nobody writes to either, and to copy many takes as long as a step.
+        same = len(counts) == 1 and begun.dtype == x.dtype
+        x = begun[None] if same else x
         for k, count in enumerate(counts.tolist()):
-            if step == first:
-                x[k] = now.states
-            else:
-                self._read(self.rows.state, out=x[k])
+            if step > first:
+                self._read(self.rows.state, x[k])
+            elif not same:
+                x[k] = begun
             if count:
                 self._run(step, count, first, table)
-                self._read(self.rows.input, out=u[k])
+                self._read(self.rows.input, u[k])
                 step += count
             elif step == first or counts[k - 1]:
                 self._look(step, first, table, u[k])
@@ -218,7 +216,7 @@ class NativeStepper(Stepper):
         changed = (self.blocks, self.edges, *self.mirrors)
         kept, drawn = [array.copy() for array in changed], self._drawn
         self._run(step, 1, first, table)
-        self._read(self.rows.input, out=out)
+        self._read(self.rows.input, out)
         self.mirrors.reverse()
         for array, before in zip(changed, kept, strict=True):
             array[:] = before
@@ -246,7 +244,7 @@ class NativeStepper(Stepper):
 
     def _switch(self, step: int) -> int:
         """Take the weights that hold at a step, and return for how many steps they do."""
-        row, count = self.loop.stretch(step)
+        row, count = stretch_at(self.loop, step)
         self.found = self.found._replace(weights=self.heavy[row])
         return count
 
@@ -346,24 +344,25 @@ class NativeStepper(Stepper):
         """Return what is in the blocks as a moment, and the sums from one step to another."""
         loop, rows = self.loop, self.rows
         sums = range(rows.errors.start, rows.tracking.start)
-        parts = (rows.state, rows.memory, rows.cut, sums)
-        # All at once, since each reads the memory of all agents in another order.
-        found = np.split(self._read(*parts), np.cumsum([len(r) for r in parts[:-1]]), axis=1)
-        x, memory, cut, kept = found
+        parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, np.int8)
+        x, memory, cut, kept = (
+            self._read(part, self.room.empty((len(self.places.of), len(part)), kind))
+            for part, kind in (*parts, (sums, np.float64))
+        )
         now: Any = [
             np.asarray(step, np.int32),
-            np.ascontiguousarray(x),
+            x,
             memories_of(loop.leader, memory[self.leaders]),
             memories_of(loop.follower, memory[self.followers]),
-            cut.astype(np.int8),
+            cut,
         ]
         return Moment._make(now), self._sums(first, step, kept)
 
     def _clear_sums(self) -> None:
-        first = self.rows.errors.start
-        self.blocks[:, first:] = 0.0
-        self.blocks[:, self.rows.unsettled.start] = -1.0
-        self.blocks[:, self.rows.inside.start : self.rows.inside.stop] = ALWAYS
+        rows = self.rows
+        nothing = np.zeros((rows.total, 1), self.dtype)
+        nothing[rows.unsettled.start], nothing[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
+        self.blocks[:, rows.errors.start :] = nothing[rows.errors.start :]
         self.edges[..., -1, :] = 0.0
 
     def _sums(self, first: int, end: int, kept: Array) -> Sums:
@@ -396,4 +395,4 @@ class NativeStepper(Stepper):
 
 def _whole(parted: Array) -> Array:
     """Return sums of all steps and of the steady window (2, N) from those before it and in it."""
-    return np.stack([parted.sum(axis=1), parted[:, 1]])
+    return np.stack([parted[:, 0] + parted[:, 1], parted[:, 1]])
