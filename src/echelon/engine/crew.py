@@ -14,7 +14,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.places import Places
 from echelon.engine.turns import pays, step_by_step, tile_by_tile
-from echelon.kernels import SLOTS, Code, aligned, mover
+from echelon.kernels import SLOTS, Code, aligned, move
 
 _SHARED = 20_000
 """Agents of a swarm from which on threads share its steps; they wait twice in each."""
@@ -86,22 +86,17 @@ class Crew:
     def move(self, blocks: Array, rows: range, values: Array, inward: bool = False) -> None:
         """Read rows of blocks into values of the agents (N, rows), or write them there (`inward`).
 
-        Both arrays are contiguous, and the values float64, of the precision of the blocks, or int8.
+        The values are contiguous and of the precision of the blocks, or float64 to read into.
         """
-        count, lanes = len(blocks), self.places.lanes
-        code = mover(8 * blocks.itemsize, lanes, values.dtype.str[1:], inward)
-        agents, whole = self.places.agents, blocks[:, rows.start :]
-        arrays = [array.ctypes.data for array in (whole, agents, values)]
-        sizes = [blocks[0].size, len(rows)]
+        count, part = len(blocks), blocks[:, rows.start : rows.stop]
+        pool = self._own or self.pool
 
         def some(ends: tuple[int, int]) -> None:
-            code.call(np.array([*arrays, *sizes, *ends], np.int64))
+            move(part, self.places.agents, values, inward, *ends)
 
-        pool = self._own or self.pool
-        if not len(rows):
-            return
-        if pool is None or count * lanes < _SHARED:
-            some((0, count))
+        if pool is None or part.size < _SHARED * len(rows):
+            if part.size:
+                some((0, count))
             return
         ends = np.linspace(0, count, 9, dtype=int).tolist()
         share(pool, some, zip(ends[:-1], ends[1:], strict=True))

@@ -123,9 +123,7 @@ class NativeStepper(Stepper):
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
-        values = np.ascontiguousarray(values)
-        kind = np.float64 if values.dtype == np.float64 else self.dtype
-        self.crew.move(self.blocks, rows, values.astype(kind, copy=False), inward=True)
+        self.crew.move(self.blocks, rows, np.ascontiguousarray(values, self.dtype), inward=True)
 
     # ---- steps ----
 
@@ -344,7 +342,7 @@ class NativeStepper(Stepper):
         """Return what is in the blocks as a moment, and the sums from one step to another."""
         loop, rows = self.loop, self.rows
         sums = range(rows.errors.start, rows.tracking.start)
-        parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, np.int8)
+        parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, self.dtype)
         x, memory, cut, kept = (
             self._read(part, self.room.empty((len(self.places.of), len(part)), kind))
             for part, kind in (*parts, (sums, np.float64))
@@ -354,7 +352,7 @@ class NativeStepper(Stepper):
             x,
             memories_of(loop.leader, memory[self.leaders]),
             memories_of(loop.follower, memory[self.followers]),
-            cut,
+            cut.astype(np.int8),
         ]
         return Moment._make(now), self._sums(first, step, kept)
 
