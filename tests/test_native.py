@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.engine import crew, native, places, turns
+from echelon.engine import crew, native, order, turns
 from echelon.engine.drive import numbers
 from echelon.engine.prepare import prepare
 
@@ -350,15 +350,15 @@ def test_an_agent_that_is_lost_is_told_as_by_jax():
 
 
 def test_where_agents_stand_changes_no_bit(monkeypatch):
-    order = np.random.default_rng(0).permutation(60)
-    graph = ech.Graph.from_edges([(order[k], order[k + 1]) for k in range(59)])
+    line = np.random.default_rng(0).permutation(60)
+    graph = ech.Graph.from_edges([(line[k], line[k + 1]) for k in range(59)])
     model = ech.models.DoubleIntegrator(1)
     gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
     offsets = np.arange(60.0)[:, None] * [[1.0, 0.0]]
     parts = ech.Parts(model, graph, ech.Formation(offsets), drive, initial={"position": 1.0})
     (as_numbered, plain) = stepped(parts, run_settings(), (3, 20, 0), "native")
-    monkeypatch.setattr(places, "_LARGE", 2)
+    monkeypatch.setattr(order, "_LARGE", 2)
     (nearby, moved) = stepped(parts, run_settings(), (3, 20, 0), "native")
     assert as_numbered.states.tobytes() == nearby.states.tobytes()
     for name, a, b in zip(nearby.sums._fields, as_numbered.sums, nearby.sums, strict=True):

@@ -16,8 +16,10 @@ from echelon.engine.places import Places
 from echelon.engine.turns import pays, step_by_step, tile_by_tile
 from echelon.kernels import SLOTS, Code, aligned, move
 
-_SHARED = 20_000
-"""Agents of a swarm from which on threads share its steps; they wait twice in each."""
+_SHARED, _WORTH = 20_000, 100_000
+"""Agents of a swarm from which on threads share its steps, where they wait for each other, and
+steps of one agent of formations: what wakes threads takes as long as fewer.
+"""
 
 
 @cache
@@ -77,7 +79,8 @@ class Crew:
             told = {"groups": len(some), "threads": 1, "count": len(turns)}
             _call(code, values | told, own | {"common": room, "turns": turns})
 
-        if self.pool is None or len(groups) < 2:
+        steps = values["steps"] * len(self.places.agents)
+        if self.pool is None or len(groups) < 2 or steps < _WORTH:
             fly(groups)
             return
         # More parts than threads, since another process may take a processor from one of them.

@@ -12,11 +12,12 @@ from echelon.core.types import Array
 from echelon.engine.code import LANES, Kernels, Make, follows
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin, signals, stretch_at
+from echelon.engine.loop import Loop, Moment, begin, stretch_at
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.room import Room
 from echelon.engine.scalars import memories_of, signals_of
+from echelon.engine.shown import offsets_of, shown_by
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.engine.winds import draw_holds, holds_at_once
 from echelon.kernels import aligned, needed, stride
@@ -294,12 +295,12 @@ class NativeStepper(Stepper):
     def _load(self, now: Moment) -> None:
         """Write a moment into the blocks."""
         rows, x = self.rows, np.asarray(now.states, self.dtype)
-        offsets = np.concatenate([np.asarray(loop.offsets, self.dtype) for loop in self.loops])
+        offsets = offsets_of(self.loops, self.dtype)
         self._write(rows.state, x)
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
         self._write(rows.own, np.repeat(self.own.values, len(self.loop.offsets), axis=0))
-        self._show(np.concatenate([x - offsets, *self._signals(now, offsets)], axis=1))
+        self._show(shown_by(self.loops, now, x, offsets, bool(self._signaled)))
         memory = np.zeros((len(x), len(rows.memory)))
         for who, tree in ((self.leaders, now.leader_memory), (self.followers, now.follower_memory)):
             leaves = [np.asarray(leaf).reshape(len(who), -1) for leaf in jax.tree.leaves(tree)]
@@ -308,31 +309,16 @@ class NativeStepper(Stepper):
         self._write(rows.memory, memory)
         self._drawn = -1
 
-    def _signals(self, now: Moment, offsets: Array) -> list[Array]:
-        """Return what neighbours hear of all agents beside their states, (N, s), if anything."""
-        if not self._signaled:
-            return []
-        counts = [len(self.loop.offsets), len(self.loop.leaders), len(self.loop.followers)]
-        found = list[Array]()
-        for k, loop in enumerate(self.loops):
-            all_, led, others = (slice(k * count, (k + 1) * count) for count in counts)
-            mine = now._replace(
-                states=now.states[all_],
-                leader_memory=jax.tree.map(lambda leaf, led=led: leaf[led], now.leader_memory),
-                follower_memory=jax.tree.map(lambda leaf, o=others: leaf[o], now.follower_memory),
-            )
-            found.append(np.asarray(signals(loop, mine, jnp.asarray(offsets[all_]))))
-        return [np.concatenate(found)]
-
     def _show(self, values: Array) -> None:
         """Write what neighbours read of all agents, (N, n), or more beside their states."""
         if self.plan.lines:
             self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
             return
-        shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         if self.plan.together:
-            self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)
+            rows = self.mirrors[0].reshape(self.places.blocks, -1, self.plan.lanes)
+            self.crew.move(rows, range(self.plan.width), values, inward=True)
             return
+        shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         wide = self.mirrors[0].reshape(*shown.shape[:2], -1)
         # Whether an angle is large is left open, and seen by the kernel.
         wide[:, :, : self.plan.width] = np.nan

@@ -88,7 +88,9 @@ class Graph:
     ) -> None:
         self.edges, self.weights, self.agents, self.schedule = edges, weights, agents, schedule
         self.leaders = check_leaders(leaders, self.agents)
-        self.followers = tuple(np.setdiff1d(np.arange(self.agents), self.leaders).tolist())
+        leads = np.zeros(self.agents, bool)
+        leads[list(self.leaders)] = True
+        self.followers = tuple(np.flatnonzero(~leads).tolist())
         if not self.followers:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         check_reached(self)
@@ -167,19 +169,22 @@ class Graph:
     def path(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the line 0 - 1 - ... - (agents - 1); a directed one leads away from 0."""
         check_size(agents, 2, "path")
-        return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents, directed)
+        first = np.arange(agents - 1)
+        return cls(np.stack([first, first + 1], axis=1), leaders, agents, directed)
 
     @classmethod
     def ring(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the closed line."""
         check_size(agents, 3, "ring")
-        return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents, directed)
+        first = np.arange(agents)
+        return cls(np.stack([first, (first + 1) % agents], axis=1), leaders, agents, directed)
 
     @classmethod
     def star(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the star with agent 0 in the middle."""
         check_size(agents, 2, "star")
-        return cls([(0, i) for i in range(1, agents)], leaders, agents, directed)
+        others = np.arange(1, agents)
+        return cls(np.stack([0 * others, others], axis=1), leaders, agents, directed)
 
     @classmethod
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
