@@ -24,7 +24,7 @@ from echelon.kernels import aligned, needed, stride
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some hundredths of a second."""
-_OPERATIONS, _ENOUGH = {64: 4e10, 32: 8e10}, 1_000
+_OPERATIONS, _ENOUGH = {64: 3e10, 32: 6e10}, 1_000
 """Of a chunk with no more steps than enough: about a second of one thread."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
