@@ -82,6 +82,11 @@ def check_edges(
     return edges, weights
 
 
+def links(i: Array | int, j: Array) -> Array:
+    """Return edges (E, 2) from agents, or from one, to others."""
+    return np.stack(np.broadcast_arrays(i, j), axis=1)
+
+
 def _ascending(pairs: Array) -> Array:
     """Return pairs with the smaller number first."""
     # Three times as fast as a sort of each.

@@ -72,6 +72,15 @@ def lost_along(graph: "Graph", weights: Array) -> Array:
     return np.flatnonzero(np.isinf(csgraph.dijkstra(graph.told(weights), **among)))
 
 
+def nearest_leaders(graph: "Graph") -> tuple[int, ...]:
+    """Return what `Graph.nearest_leader` says."""
+    if len(graph.leaders) == 1:
+        return graph.leaders * graph.agents
+    hops = csgraph.dijkstra(graph.told(), indices=graph.leaders, unweighted=True)
+    # `argmin` takes the first of equals, and leaders are sorted.
+    return tuple(np.array(graph.leaders)[np.argmin(hops, axis=0)].tolist())
+
+
 def lost_at_times(graph: "Graph") -> str:
     """Return whom leaders do not reach at some time, and when; empty where they always do."""
     if graph.schedule is None:
