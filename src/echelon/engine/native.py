@@ -91,6 +91,8 @@ class NativeStepper(Stepper):
         made = (make or Kernels().of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
         self._signaled = signals_of(self.loop)
+        # Once, since to ask a law takes as long as many small steps.
+        self.memories = self.loop.leader.init(), self.loop.follower.init()
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
@@ -326,7 +328,7 @@ class NativeStepper(Stepper):
 
     def _leave(self, first: int, step: int) -> tuple[Moment, Sums]:
         """Return what is in the blocks as a moment, and the sums from one step to another."""
-        loop, rows = self.loop, self.rows
+        rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
         parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, self.dtype)
         x, memory, cut, kept = (
@@ -336,8 +338,8 @@ class NativeStepper(Stepper):
         now: Any = [
             np.asarray(step, np.int32),
             x,
-            memories_of(loop.leader, memory[self.leaders]),
-            memories_of(loop.follower, memory[self.followers]),
+            memories_of(self.memories[0], memory[self.leaders]),
+            memories_of(self.memories[1], memory[self.followers]),
             cut.astype(np.int8),
         ]
         return Moment._make(now), self._sums(first, step, kept)
