@@ -114,7 +114,6 @@ def measure_ring(
         f"{name}, float{bits}",
         {"native": partial(rate, side.native, agents, [steps], side.reference, bits)}
         | _in_c(yardstick, agents, steps, lambda c: c.ring(agents, bits)),
-        _TURNS if agents < _MILLION else 2,
     )
 
 
