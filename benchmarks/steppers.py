@@ -3,6 +3,7 @@
 import importlib
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
@@ -100,17 +101,25 @@ def steppers(parts: ech.Parts, bits: int) -> Side:
 
 
 def rate(
-    stepper: Stepper, agents: int, counts: list[int], reference: np.ndarray | None, bits: int
+    stepper: Stepper,
+    agents: int,
+    counts: list[int],
+    reference: np.ndarray | None,
+    bits: int,
+    clock: Callable[[], float] = time.process_time,
 ) -> float:
-    """Return agent-steps per second of CPU time, of one turn that stores states every so often."""
+    """Return agent-steps per second of one turn that stores states every so often.
+
+    Of CPU time, or by another clock.
+    """
     steps = sum(counts)
     first, all_ = (None if reference is None else reference[: n + 1] for n in (1, steps))
     with precision(f"float{bits}"):  # type: ignore[arg-type]
         # From within a run: what is written once at its beginning is no step.
         now = stepper.advance(stepper.start(), np.array([1], np.int32), first).now
-        begin = time.process_time()
+        begin = clock()
         stepper.advance(now, np.array(counts, np.int32), all_)
-        return agents * steps / (time.process_time() - begin)
+        return agents * steps / (clock() - begin)
 
 
 # ---- many formations -----------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import echelon as ech
 from echelon.core import limits
 from echelon.core.limits import MOST_AGENTS, MOST_STEPS, horizon_fault
 from echelon.engine.prepare import check_memory
+from echelon.scenario import build as scenario_build
 
 HUGE = 10**23
 
@@ -58,12 +59,27 @@ def test_a_run_that_stores_too_much_is_told_what_would_fit(monkeypatch):
     with pytest.raises(ech.EchelonError, match="needs? .* GiB of memory, and 0.5 GiB fit") as no:
         ech.simulate(parts, long)
     every = int(str(no.value).partition("a `store_every` of ")[2].partition(",")[0])
-    check_memory(parts, long._replace(store_every=every))
+    check_memory(parts.model, 4, long._replace(store_every=every))
     with pytest.raises(ech.EchelonError):
-        check_memory(parts, long._replace(store_every=every // 2))
+        check_memory(parts.model, 4, long._replace(store_every=every // 2))
     # And so would a shorter run.
     times = float(str(no.value).partition("or a horizon ")[2].partition(" ")[0])
-    check_memory(parts, long._replace(horizon=round(1e7 / times * 0.99)))
+    check_memory(parts.model, 4, long._replace(horizon=round(1e7 / times * 0.99)))
+
+
+def test_a_run_without_room_is_refused_before_a_gain_is_made(monkeypatch):
+    """A gain may take long where agents are many."""
+
+    def make(*_):
+        raise AssertionError("a gain is made")
+
+    monkeypatch.setattr(limits, "memory", lambda: 2**20)
+    monkeypatch.setattr(scenario_build, "synthesize", make)
+    scenario = ech.load_scenario("paper")
+    with pytest.raises(ech.EchelonError, match="GiB of memory, and .* GiB fit"):
+        scenario_build.build(scenario, to_run=True)
+    with pytest.raises(AssertionError):
+        scenario_build.build(scenario)
 
 
 def test_this_machine_has_memory():

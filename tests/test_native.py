@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import echelon as ech
-from echelon.engine import crew, native, places, turns
+from echelon import kernels
+from echelon.engine import crew, native, order, room, turns
 from echelon.engine.drive import numbers
 from echelon.engine.prepare import prepare
 
@@ -200,7 +201,8 @@ def test_bits_do_not_depend_on_how_wide_a_vector_is(monkeypatch):
     assert wide.sums.errors.tobytes() == narrow.sums.errors.tobytes()
 
 
-def test_bits_do_not_depend_on_threads():
+def test_bits_do_not_depend_on_threads(monkeypatch):
+    monkeypatch.setattr(crew, "_SHARED", 1)  # what is read of agents is shared too
     model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(40)
     gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="parent"))
@@ -236,6 +238,53 @@ def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkey
         assert tiles.states.tobytes() == whole.states.tobytes()
         assert tiles.inputs.tobytes() == whole.inputs.tobytes()
         assert all(a.tobytes() == b.tobytes() for a, b in zip(tiles.sums, whole.sums, strict=True))
+
+
+@given(
+    bits=st.sampled_from([64, 32]),
+    agents=st.integers(1, 40),
+    rows=st.integers(0, 5),
+    seed=st.integers(0, 99),
+)
+def test_numbers_are_where_they_were_put_whoever_stands_where(bits, agents, rows, seed):
+    draws, lanes, kind = np.random.default_rng(seed), native.LANES[bits], np.dtype(f"f{bits // 8}")
+    stand = np.resize(draws.permutation(agents), -(-agents // lanes) * lanes)
+    blocks = kernels.aligned((len(stand) // lanes, rows + 3, lanes), kind)
+    wanted = draws.normal(size=(agents, rows)).astype(kind)
+    part = blocks[:, 1 : 1 + rows]
+    kernels.move(part, stand, wanted, True, 0, len(blocks))
+    np.testing.assert_array_equal(part.transpose(0, 2, 1).reshape(len(stand), rows), wanted[stand])
+    assert not blocks[:, 0].any() and not blocks[:, 1 + rows :].any()
+    for other in (kind, np.dtype(float)):
+        found = np.full((agents, rows), np.nan, other)
+        # In pieces, as threads do.
+        for first in range(len(blocks)):
+            kernels.move(part, stand, found, False, first, first + 1)
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_memory_is_taken_again_when_nobody_holds_any_of_it():
+    here, shape = room.Room(), (2**10, 2**8)
+    first = here.empty(shape, float)
+    first[:] = 1.0
+    kept, place = first[3, 5:7], first.ctypes.data
+    del first
+    second = here.empty(shape, float)
+    second[:] = 2.0
+    assert second.ctypes.data != place and (kept == 1.0).all()
+    del kept
+    assert here.empty(shape, float).ctypes.data == place
+    # Of another size there is none, and small ones are nothing to keep.
+    assert here.empty((2**19,), np.float32).shape == (2**19,)
+    assert here.empty((3, 0), float).shape == (3, 0)
+
+
+@given(keys=st.lists(st.integers(0, 9)))
+def test_keys_are_grouped_as_a_stable_sort_would(keys):
+    keys = np.array(keys, int)
+    starts, places = order.grouped(keys, 10)
+    np.testing.assert_array_equal(places, np.argsort(keys, kind="stable"))
+    np.testing.assert_array_equal(np.diff(starts), np.bincount(keys, minlength=10))
 
 
 def test_threads_of_which_not_all_were_started_do_not_wait_for_the_others():
@@ -350,15 +399,15 @@ def test_an_agent_that_is_lost_is_told_as_by_jax():
 
 
 def test_where_agents_stand_changes_no_bit(monkeypatch):
-    order = np.random.default_rng(0).permutation(60)
-    graph = ech.Graph.from_edges([(order[k], order[k + 1]) for k in range(59)])
+    line = np.random.default_rng(0).permutation(60)
+    graph = ech.Graph.from_edges([(line[k], line[k + 1]) for k in range(59)])
     model = ech.models.DoubleIntegrator(1)
     gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
     drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
     offsets = np.arange(60.0)[:, None] * [[1.0, 0.0]]
     parts = ech.Parts(model, graph, ech.Formation(offsets), drive, initial={"position": 1.0})
     (as_numbered, plain) = stepped(parts, run_settings(), (3, 20, 0), "native")
-    monkeypatch.setattr(places, "_LARGE", 2)
+    monkeypatch.setattr(order, "_LARGE", 2)
     (nearby, moved) = stepped(parts, run_settings(), (3, 20, 0), "native")
     assert as_numbered.states.tobytes() == nearby.states.tobytes()
     for name, a, b in zip(nearby.sums._fields, as_numbered.sums, nearby.sums, strict=True):

@@ -46,13 +46,11 @@ def compare(
     checked = [load_scenario(each, changes) for each in scenarios]
     from echelon.archive.folder import claim_folders
     from echelon.reports.comparison import comparison_mapping
-    from echelon.scenario.build import build, check_size
+    from echelon.scenario.build import build
     from echelon.studies.compare import known_labels
 
     labels = known_labels(method)
-    parts = [build(each) for each in checked]
-    for each, built in zip(checked, parts, strict=True):
-        check_size(each, built)
+    parts = [build(each, to_run=True) for each in checked]
     folders = claim_folders([each.name for each in checked], out, force)
     with STOP.hold():
         found = [

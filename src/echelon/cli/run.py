@@ -98,11 +98,10 @@ def _begin(
     checked = load_scenario(scenario, changes)
     from echelon.archive.chunks import Chunks
     from echelon.archive.folder import claim_folder
-    from echelon.scenario.build import build, check_size
+    from echelon.scenario.build import build
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
-    built = build(checked)
-    check_size(checked, built)
+    built = build(checked, to_run=True)
     chunks = Chunks(claim_folder(checked.name, out, force))
     with _undone(chunks):
         chunks.begin(checked)

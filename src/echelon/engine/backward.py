@@ -16,7 +16,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.code import LANES, Kernel, compiled, follows, plan_of
 from echelon.engine.loop import Loop, Moment, begin, signals
-from echelon.engine.native import STEPS, NativeStepper, beyond
+from echelon.engine.native import STEPS, NativeStepper, any_beyond
 from echelon.engine.own import Own
 from echelon.engine.places import Swarm
 from echelon.engine.pulled import Felt, Pulled, Transpose, heard_by, lean
@@ -188,7 +188,7 @@ class Backward:
             self.stepper.record(self.tape if first + self.stretch >= self.steps else None, first)
             made = self._advance(now, first)
             now, sums = made.now, made.sums if sums is None else sums.plus(made.sums)
-            if beyond(now.states, BITS).any():
+            if any_beyond(now.states, BITS):
                 return None
         return sums
 

@@ -14,10 +14,12 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.places import Places
 from echelon.engine.turns import pays, step_by_step, tile_by_tile
-from echelon.kernels import SLOTS, Code, aligned
+from echelon.kernels import SLOTS, Code, aligned, move
 
-_SHARED = 20_000
-"""Agents of a swarm from which on threads share its steps; they wait twice in each."""
+_SHARED, _WORTH = 20_000, 100_000
+"""Agents of a swarm from which on threads share its steps, where they wait for each other, and
+steps of one agent of formations: what wakes threads takes as long as fewer.
+"""
 
 
 @cache
@@ -77,11 +79,30 @@ class Crew:
             told = {"groups": len(some), "threads": 1, "count": len(turns)}
             _call(code, values | told, own | {"common": room, "turns": turns})
 
-        if self.pool is None or len(groups) < 2:
+        steps = values["steps"] * len(self.places.agents)
+        if self.pool is None or len(groups) < 2 or steps < _WORTH:
             fly(groups)
             return
         # More parts than threads, since another process may take a processor from one of them.
         share(self.pool, fly, np.array_split(groups, min(len(groups), 8)))
+
+    def move(self, blocks: Array, rows: range, values: Array, inward: bool = False) -> None:
+        """Read rows of blocks into values of the agents (N, rows), or write them there (`inward`).
+
+        The values are contiguous and of the precision of the blocks, or float64 to read into.
+        """
+        count, part = len(blocks), blocks[:, rows.start : rows.stop]
+        pool = self._own or self.pool
+
+        def some(ends: tuple[int, int]) -> None:
+            move(part, self.places.agents, values, inward, *ends)
+
+        if pool is None or part.size < _SHARED * len(rows):
+            if part.size:
+                some((0, count))
+            return
+        ends = np.linspace(0, count, 9, dtype=int).tolist()
+        share(pool, some, zip(ends[:-1], ends[1:], strict=True))
 
     def _swarm(
         self, code: Code, values: dict[str, int], firsts: dict[str, Array], common: Array

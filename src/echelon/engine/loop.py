@@ -45,21 +45,22 @@ class Loop(eqx.Module):
     order: Array
     switches: "Switches | None"
 
-    def stretch(self, step: int) -> tuple[int, int]:
-        """Return which row of the weights holds at a step, and for how many steps from it on."""
-        last = np.iinfo(np.int64).max
-        if self.switches is None:
-            return 0, last
-        steps, rows = self.switches
-        place = int(np.searchsorted(steps, step, side="right"))
-        return int(rows[place - 1]), int(np.append(steps, last)[place]) - step
-
 
 class Switches(NamedTuple):
     """From which steps on (K,), ascending from 0, which rows (K,) of the weights hold."""
 
     steps: Array
     rows: Array
+
+
+def stretch_at(loop: Loop, step: int) -> tuple[int, int]:
+    """Return which row of the weights holds at a step, and for how many steps from it on."""
+    last = np.iinfo(np.int64).max
+    if loop.switches is None:
+        return 0, last
+    steps, rows = loop.switches
+    place = int(np.searchsorted(steps, step, side="right"))
+    return int(rows[place - 1]), int(np.append(steps, last)[place]) - step
 
 
 class _Acted(NamedTuple):

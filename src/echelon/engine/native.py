@@ -12,17 +12,19 @@ from echelon.core.types import Array
 from echelon.engine.code import KERNELS, LANES, Make
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin, begin_forgetful, signals
+from echelon.engine.loop import Loop, Moment, begin, begin_forgetful, stretch_at
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
+from echelon.engine.room import Room
 from echelon.engine.scalars import memories_of, signals_of
+from echelon.engine.shown import offsets_of, shown_by
 from echelon.engine.sums import ALWAYS, Sums
 from echelon.engine.winds import draw_holds, holds_at_once
 from echelon.kernels import aligned, needed, stride
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some hundredths of a second."""
-_OPERATIONS, _ENOUGH = {64: 2e10, 32: 4e10}, 1_000
+_OPERATIONS, _ENOUGH = {64: 3e10, 32: 6e10}, 1_000
 """Of a chunk with no more steps than enough: about a second of one thread."""
 _LARGEST = {64: 1e5, 32: 1e3}
 """Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
@@ -37,6 +39,14 @@ def beyond(states: Array, bits: int) -> Array:
     """Return which states are beyond the range of the kernels' sines; NaN is not."""
     # Truths alone, since another array of so many numbers takes longer than all the rest of it.
     return (states > _LARGEST[bits]) | (states < -_LARGEST[bits])
+
+
+def any_beyond(states: Array, bits: int) -> bool:
+    """Tell whether one of the states is beyond that range."""
+    most = _LARGEST[bits]
+    # A third of the time of truths for all; of NaN no comparison holds, and the truths tell.
+    fit = -most <= states.min(initial=0.0) and states.max(initial=0.0) <= most
+    return not fit and bool(beyond(states, bits).any())
 
 
 @final
@@ -79,7 +89,7 @@ class NativeStepper(Stepper):
         together, lanes = len(loops) > 1, LANES[bits]
         known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
         self.places: Places = known
-        self.crew = Crew(self.places, pool, threads)
+        self.crew, self.room = Crew(self.places, pool, threads), Room()
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
@@ -88,6 +98,8 @@ class NativeStepper(Stepper):
         made = (make or KERNELS.of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
         self._signaled = signals_of(self.loop)
+        # Once, since to ask a law takes as long as many small steps.
+        self.memories = self.loop.leader.init(), self.loop.follower.init()
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
         # What is in the blocks, so that a chunk that goes on from it need not be written there.
@@ -114,23 +126,14 @@ class NativeStepper(Stepper):
             places.measure(self.found, far, bytes_)
         self.edges, self.heavy = self.found.edges, self.found.weights
 
-    def _read(self, *parts: range, out: Array | None = None) -> Array:
-        """Return parts of the rows of all agents, (N, rows), in an array that is given or new."""
-        ends = np.cumsum([len(rows) for rows in parts]).tolist()
-        dtype = self.dtype if out is None else out.dtype
-        turned = np.empty((len(self.blocks), self.plan.lanes, ends[-1]), dtype)
-        for rows, end in zip(parts, ends, strict=True):
-            part = self.blocks[:, rows.start : rows.stop]
-            turned[..., end - len(rows) : end] = part.transpose(0, 2, 1)
-        flat = turned.reshape(len(self.places.agents), -1)
-        # Places are right, and to look at each would take a copy.
-        return np.take(flat, self.places.of, axis=0, out=out, mode="clip")
+    def _read(self, rows: range, out: Array) -> Array:
+        """Read rows of all agents into an array (N, rows), and return it."""
+        self.crew.move(self.blocks, rows, out)
+        return out
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
-        lanes = self.places.lanes
-        shaped = values[self.places.agents].reshape(self.places.blocks, lanes, len(rows))
-        self.blocks[:, rows.start : rows.stop] = shaped.transpose(0, 2, 1)
+        self.crew.move(self.blocks, rows, np.ascontiguousarray(values, self.dtype), inward=True)
 
     # ---- steps ----
 
@@ -171,7 +174,7 @@ class NativeStepper(Stepper):
         if now is not self._held:
             self._load(now)
         made = self._fly(now, counts, reference)
-        if self.far is None or not beyond(made.states, self.bits).any():
+        if self.far is None or not any_beyond(made.states, self.bits):
             return made
         self._held = None
         self._left = int(now.step) if self._left < 0 else self._left
@@ -194,15 +197,19 @@ class NativeStepper(Stepper):
         first = int(now.step)
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
         step, agents = first, len(self.places.of)
-        x, u = (np.empty((len(counts), agents, len(r))) for r in (self.rows.state, self.rows.input))
+        begun, sizes = np.asarray(now.states), [len(self.rows.state), len(self.rows.input)]
+        x, u = (self.room.empty((len(counts), agents, size), float) for size in sizes)
+        # Nobody writes to either, and to copy many takes as long as a step.
+        same = len(counts) == 1 and begun.dtype == x.dtype
+        x = begun[None] if same else x
         for k, count in enumerate(counts.tolist()):
-            if step == first:
-                x[k] = now.states
-            else:
-                self._read(self.rows.state, out=x[k])
+            if step > first:
+                self._read(self.rows.state, x[k])
+            elif not same:
+                x[k] = begun
             if count:
                 self._run(step, count, first, table)
-                self._read(self.rows.input, out=u[k])
+                self._read(self.rows.input, u[k])
                 step += count
             elif step == first or counts[k - 1]:
                 self._look(step, first, table, u[k])
@@ -216,7 +223,7 @@ class NativeStepper(Stepper):
         changed = (self.blocks, self.edges, *self.mirrors)
         kept, drawn = [array.copy() for array in changed], self._drawn
         self._run(step, 1, first, table)
-        self._read(self.rows.input, out=out)
+        self._read(self.rows.input, out)
         self.mirrors.reverse()
         for array, before in zip(changed, kept, strict=True):
             array[:] = before
@@ -244,7 +251,7 @@ class NativeStepper(Stepper):
 
     def _switch(self, step: int) -> int:
         """Take the weights that hold at a step, and return for how many steps they do."""
-        row, count = self.loop.stretch(step)
+        row, count = stretch_at(self.loop, step)
         self.found = self.found._replace(weights=self.heavy[row])
         return count
 
@@ -296,12 +303,12 @@ class NativeStepper(Stepper):
     def _load(self, now: Moment) -> None:
         """Write a moment into the blocks."""
         rows, x = self.rows, np.asarray(now.states, self.dtype)
-        offsets = np.concatenate([np.asarray(loop.offsets, self.dtype) for loop in self.loops])
+        offsets = offsets_of(self.loops, self.dtype)
         self._write(rows.state, x)
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
         self._write(rows.own, np.repeat(self.own.values, len(self.loop.offsets), axis=0))
-        self._show(np.concatenate([x - offsets, *self._signals(now, offsets)], axis=1))
+        self._show(shown_by(self.loops, now, x, offsets, bool(self._signaled)))
         memory = np.zeros((len(x), len(rows.memory)))
         for who, tree in ((self.leaders, now.leader_memory), (self.followers, now.follower_memory)):
             leaves = [np.asarray(leaf).reshape(len(who), -1) for leaf in jax.tree.leaves(tree)]
@@ -310,31 +317,16 @@ class NativeStepper(Stepper):
         self._write(rows.memory, memory)
         self._drawn = -1
 
-    def _signals(self, now: Moment, offsets: Array) -> list[Array]:
-        """Return what neighbours hear of all agents beside their states, (N, s), if anything."""
-        if not self._signaled:
-            return []
-        counts = [len(self.loop.offsets), len(self.loop.leaders), len(self.loop.followers)]
-        found = list[Array]()
-        for k, loop in enumerate(self.loops):
-            all_, led, others = (slice(k * count, (k + 1) * count) for count in counts)
-            mine = now._replace(
-                states=now.states[all_],
-                leader_memory=jax.tree.map(lambda leaf, led=led: leaf[led], now.leader_memory),
-                follower_memory=jax.tree.map(lambda leaf, o=others: leaf[o], now.follower_memory),
-            )
-            found.append(np.asarray(signals(loop, mine, jnp.asarray(offsets[all_]))))
-        return [np.concatenate(found)]
-
     def _show(self, values: Array) -> None:
         """Write what neighbours read of all agents, (N, n), or more beside their states."""
         if self.plan.lines:
             self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
             return
-        shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         if self.plan.together:
-            self.mirrors[0][:] = shown.transpose(0, 2, 1).reshape(self.places.blocks, -1)
+            rows = self.mirrors[0].reshape(self.places.blocks, -1, self.plan.lanes)
+            self.crew.move(rows, range(self.plan.width), values, inward=True)
             return
+        shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
         wide = self.mirrors[0].reshape(*shown.shape[:2], -1)
         # Whether an angle is large is left open, and seen by the kernel.
         wide[:, :, : self.plan.width] = np.nan
@@ -342,26 +334,27 @@ class NativeStepper(Stepper):
 
     def _leave(self, first: int, step: int) -> tuple[Moment, Sums]:
         """Return what is in the blocks as a moment, and the sums from one step to another."""
-        loop, rows = self.loop, self.rows
+        rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
-        parts = (rows.state, rows.memory, rows.cut, sums)
-        # All at once, since each reads the memory of all agents in another order.
-        found = np.split(self._read(*parts), np.cumsum([len(r) for r in parts[:-1]]), axis=1)
-        x, memory, cut, kept = found
+        parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, self.dtype)
+        x, memory, cut, kept = (
+            self._read(part, self.room.empty((len(self.places.of), len(part)), kind))
+            for part, kind in (*parts, (sums, np.float64))
+        )
         now: Any = [
             np.asarray(step, np.int32),
-            np.ascontiguousarray(x),
-            memories_of(loop.leader, memory[self.leaders]),
-            memories_of(loop.follower, memory[self.followers]),
+            x,
+            memories_of(self.memories[0], memory[self.leaders]),
+            memories_of(self.memories[1], memory[self.followers]),
             cut.astype(np.int8),
         ]
         return Moment._make(now), self._sums(first, step, kept)
 
     def _clear_sums(self) -> None:
-        first = self.rows.errors.start
-        self.blocks[:, first:] = 0.0
-        self.blocks[:, self.rows.unsettled.start] = -1.0
-        self.blocks[:, self.rows.inside.start : self.rows.inside.stop] = ALWAYS
+        rows = self.rows
+        nothing = np.zeros((rows.total, 1), self.dtype)
+        nothing[rows.unsettled.start], nothing[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
+        self.blocks[:, rows.errors.start :] = nothing[rows.errors.start :]
         self.edges[..., -1, :] = 0.0
 
     def _sums(self, first: int, end: int, kept: Array) -> Sums:
@@ -394,4 +387,4 @@ class NativeStepper(Stepper):
 
 def _whole(parted: Array) -> Array:
     """Return sums of all steps and of the steady window (2, N) from those before it and in it."""
-    return np.stack([parted.sum(axis=1), parted[:, 1]])
+    return np.stack([parted[:, 0] + parted[:, 1], parted[:, 1]])

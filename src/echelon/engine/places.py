@@ -2,14 +2,13 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.csgraph as csgraph
 
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
+from echelon.engine.order import first_places, grouped, is_large, nearby, ordered, windows
 from echelon.engine.turns import Near
 from echelon.kernels import aligned, stride
 from echelon.network.exchange import Exchange
@@ -101,68 +100,8 @@ class Places(abc.ABC):
 
 _MOSTLY = 0.75
 """Of the blocks: how many find their neighbours one after the other where they lie in lines."""
-_WINDOW = 256
-"""Agents among which those of one degree are brought together: so few stay near each other."""
-_LARGE = 10_000
-"""Agents whose numbers no longer stay in a processor's own memory from one to the next."""
-
-
-def _ordered(loop: Loop, lanes: int, degrees: Array | None) -> tuple[Array, Array]:
-    """Return the agents in the order of their acting, and the first block of each level.
-
-    A level fills its last block with copies of its last agent, which do what that does and are read
-    by nobody.
-    """
-    levels = [loop.followers]
-    if loop.levels is not None:
-        levels = [loop.followers[np.unique(row)] for row in loop.levels]
-    rank = _nearby(loop)
-    levels = [level[np.argsort(rank[level], kind="stable")] for level in levels]
-    if degrees is not None:
-        window = [np.arange(len(level)) // _WINDOW for level in levels]
-        levels = [
-            level[np.lexsort((degrees[level], near))]
-            for level, near in zip(levels, window, strict=True)
-        ]
-    filled = [np.append(a, np.repeat(a[-1:], -len(a) % lanes)) for a in (loop.leaders, *levels)]
-    segments = np.cumsum([0, *(len(a) // lanes for a in filled)]).astype(np.int64)
-    return np.concatenate(filled), segments
-
-
-def _nearby(loop: Loop) -> Array:
-    """Return the place of each agent in an order in which those that hear each other are near.
-
-    It is their own where that is as good, and of few agents. Numbers of a neighbour that was
-    stepped long ago come from memory: a swarm numbered at random takes three times as long.
-    """
-    agents, exchange = len(loop.offsets), loop.exchange
-    own = np.arange(agents)
-    if agents < _LARGE:
-        return own
-    i, j = np.asarray(exchange.receivers), np.asarray(exchange.senders)
-    # Both ways, as the order wants a symmetric pattern, and directed edges have none.
-    both = np.concatenate([i, j]), np.concatenate([j, i])
-    links = sp.csr_array((np.ones(2 * len(i), np.int8), both), shape=(agents, agents))
-    order = _from_an_end(links)
-    if len(order) < agents:
-        order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
-    rank = np.empty(agents, int)
-    rank[order] = own
-    return rank if np.abs(rank[i] - rank[j]).sum() < np.abs(i - j).sum() else own
-
-
-def _from_an_end(links: Any) -> Array:
-    """Return the agents that one reaches from another, by how far they are from one at an end.
-
-    Neighbours are then at most about two layers apart, which are small where they begin at an end.
-    """
-    reached = csgraph.breadth_first_order(links, 0, return_predecessors=False)
-    return csgraph.breadth_first_order(links, reached[-1], return_predecessors=False)
-
-
-def _first(agents: Array) -> Array:
-    """Return where each agent stands; of copies the first stands for the agent."""
-    return np.unique(agents, return_index=True)[1]
+_FEW = 1_000
+"""Blocks that tell of all of them, whether their neighbours follow each other."""
 
 
 def senders_of(loop: Loop) -> Array:
@@ -181,30 +120,36 @@ class Swarm(Places):
     def __init__(self, loop: Loop, lanes: int) -> None:
         """Place the agents of a loop."""
         self.loop, self.lanes, self.groups, self.together = loop, lanes, 1, False
-        self._stand(None)
+        near = nearby(loop)
+        self._stand(near, None)
         degrees = np.bincount(np.asarray(loop.exchange.receivers), minlength=len(self.of))
-        if len(loop.offsets) >= _LARGE and not self.lines and self._uneven(degrees[self.agents]):
-            self._stand(degrees)
+        if is_large(len(loop.offsets)) and self._uneven(degrees[self.agents]):
+            some = np.linspace(0, self.blocks - 1, _FEW, dtype=int)
+            if not self._smooth(heard(loop, self, blocks=some))[1]:
+                self._stand(near, degrees)
+        self.heard = heard(loop, self)
+        self.smooth, self.lines = self._smooth(self.heard)
         # Ends that are near in memory follow each other; leaders are near to all.
-        i, j = np.sort(self.of[np.asarray(loop.meter.edges)], axis=1).T
-        self.edge_order = np.lexsort((j, i, np.where(i < self.segments[1] * lanes, j, i)))
+        ends = self.of[np.asarray(loop.meter.edges)].T
+        i, j = np.minimum(*ends), np.maximum(*ends)
+        leads, count = i < self.segments[1] * lanes, len(self.agents)
+        order = grouped(np.where(leads, i, j), count)[1]
+        self.edge_order = order[grouped(np.where(leads, j, i)[order], count)[1]]
+
+    def _smooth(self, heard: tuple[Array, Array, Array]) -> tuple[Array, bool]:
+        return smooth_blocks(*heard[:2], int(self.segments[1]) * self.lanes)
 
     def _uneven(self, degrees: Array) -> bool:
         """Tell whether blocks have fewer slots where those of one degree stand side by side."""
         # A block has as many slots as the most that one of its agents hears.
-        sorted_ = degrees[np.lexsort((degrees, np.arange(len(degrees)) // _WINDOW))]
+        sorted_ = np.sort(windows(degrees)) % (degrees.max() + 1)
         now, then = (part.reshape(-1, self.lanes).max(axis=1).sum() for part in (degrees, sorted_))
         return bool(then < 0.9 * now)
 
-    def _stand(self, degrees: Array | None) -> None:
+    def _stand(self, near: Array, degrees: Array | None) -> None:
         """Give all agents their places, those of one degree side by side where they are given."""
-        loop, lanes = self.loop, self.lanes
-        self.agents, self.segments = _ordered(loop, lanes, degrees)
-        self.of = _first(self.agents)
-        self.heard = heard(loop, self)
-        starts, positions, _ = self.heard
-        led = int(self.segments[1]) * lanes
-        self.smooth, self.lines = smooth_blocks(starts, positions, led)
+        self.agents, self.segments = ordered(self.loop, self.lanes, near, degrees)
+        self.of = first_places(self.agents)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other: what they show stands one after the other."""
@@ -270,7 +215,7 @@ class Formations(Places):
         formation = formation.reshape(self.groups, 1, lanes)
         each = len(self.loop.offsets) * formation + self.alone.agents[:, None]
         self.agents, self.segments = each.reshape(-1), self.alone.segments
-        self.of = _first(self.agents)
+        self.of = first_places(self.agents)
 
     def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
         """Return where agents find each other in a group: what they show stands row by row."""
@@ -335,32 +280,38 @@ def _follow(positions: Array) -> Array:
 
 
 def heard(
-    loop: Loop, places: Places, exchange: Exchange | None = None
+    loop: Loop,
+    places: Places,
+    exchange: Exchange | None = None,
+    blocks: Array | slice = slice(None),
 ) -> tuple[Array, Array, Array]:
     """Return whom each agent hears, slot by slot: the k-th neighbour of each of a block.
 
-    It is by the loop's edges, or by others where they are given.
+    It is by the loop's edges, or by others where they are given, of all blocks or of some.
 
     Returns:
         The first slot of each block (blocks + 1,), and of all slots the positions (slots, lanes)
         and weights (rows, slots, lanes).
     """
-    exchange, agents = exchange or loop.exchange, places.agents.reshape(-1, places.lanes)
-    order = np.argsort(np.asarray(exchange.receivers), kind="stable")
-    senders = np.asarray(exchange.senders)[order]
-    weights = np.atleast_2d(np.asarray(exchange.weights))[:, order]
-    ends = np.searchsorted(np.asarray(exchange.receivers)[order], np.arange(len(loop.offsets) + 1))
-    degrees = np.diff(ends)
-    slots = degrees[agents].max(axis=1)
-    first = np.concatenate([[0], np.cumsum(slots)]).astype(np.int64)
-    block = np.repeat(np.arange(places.blocks), slots)
-    k = (np.arange(first[-1]) - first[block])[:, None]
-    there = k < degrees[agents[block]]
-    edge = np.minimum(ends[agents[block]] + k, len(senders) - 1)
-    own = np.arange(agents.size).reshape(agents.shape)[block]
+    exchange, of = exchange or loop.exchange, places.of.astype(np.int32)
+    # By where they stand and not by their numbers, so that memory is read from end to end.
+    first, order = grouped(of[np.asarray(exchange.receivers)], len(places.agents))
+    said = of[np.asarray(exchange.senders)][order]
+    agents = places.agents.reshape(-1, places.lanes)[blocks]
+    begin, degrees = first[of[agents]], np.diff(first)[of[agents]]
+    own = np.arange(len(places.agents), dtype=np.int32).reshape(-1, places.lanes)[blocks]
+    slots = degrees.max(axis=1)
+    starts = np.concatenate([[0], np.cumsum(slots)]).astype(np.int64)
+    block = np.repeat(np.arange(len(agents)), slots)
+    k = (np.arange(starts[-1]) - starts[block]).astype(np.int32)[:, None]
+    there = k < degrees[block]
+    edge = np.minimum(begin[block] + k, len(said) - 1)
     # Who has fewer neighbours hears itself, from which it differs by nothing.
-    positions = np.where(there, places.of[senders[edge]], own)
-    return first, positions, np.where(there, weights[:, edge], 0.0)
+    positions = np.where(there, said[edge], own[block])
+    weights = np.atleast_2d(np.asarray(exchange.weights))
+    if (weights == 1.0).all():
+        return starts, positions, np.repeat(there[None], len(weights), axis=0).astype(float)
+    return starts, positions, np.where(there, weights[:, order][:, edge], 0.0)
 
 
 def edge_blocks(loop: Loop, places: "Swarm", dtype: np.dtype, far: int) -> tuple[Array, Array]:

@@ -30,9 +30,7 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    check_kind("parts", parts, Parts)
-    check_kind("settings", settings, Settings)
-    settings.check()
+    check_given(parts, settings)
     model, graph, formation = parts.model, parts.graph, parts.formation
     # Gains, plans and starts are the same in a float32 run, and so is what is promised of them.
     with precision("float64"):
@@ -57,16 +55,27 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     return Prepared(parts, problem, tuple(dict.fromkeys(warnings)))
 
 
-def check_memory(parts: Parts, settings: Settings) -> None:
-    """Check that what the run stores has room, before any of it is made.
+def check_given(parts: Parts, settings: Settings) -> None:
+    """Check what a run is asked for.
+
+    Raises:
+        EchelonError: it is something else, or a number of the settings is out of range.
+    """
+    check_kind("parts", parts, Parts)
+    check_kind("settings", settings, Settings)
+    settings.check()
+
+
+def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
+    """Check that what a run of so many agents stores has room, before anything is made for it.
 
     Raises:
         SimulationError: it has not, and what would.
     """
-    n, m = len(parts.model.state_names), len(parts.model.input_names)
+    n, m = len(model.state_names), len(model.input_names)
     every = settings.store_every
     # The last term is the reference.
-    numbers = parts.graph.agents * (n + m) + n
+    numbers = agents * (n + m) + n
     excess = excess_frames(1 + -(-settings.steps // every), numbers, every)
     if excess is not None:
         raise SimulationError(f"the run {excess}.")

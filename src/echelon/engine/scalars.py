@@ -85,9 +85,9 @@ def memory_size(law: Law) -> int:
     return sum(np.size(leaf) for leaf in leaves)
 
 
-def memories_of(law: Law, flat: Array) -> Memory:
-    """Return memories of agents from their numbers (agents, numbers)."""
-    leaves, tree = jax.tree.flatten(law.init())
+def memories_of(like: Memory, flat: Array) -> Memory:
+    """Return memories of agents, alike to one, from their numbers (agents, numbers)."""
+    leaves, tree = jax.tree.flatten(like)
     ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
     parts = zip(leaves, ends[:-1], ends[1:], strict=True)
     return tree.unflatten(

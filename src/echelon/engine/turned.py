@@ -6,7 +6,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.engine.code import Kernel
-from echelon.engine.loop import Loop
+from echelon.engine.loop import Loop, stretch_at
 from echelon.engine.places import Swarm, heard, senders_of, smooth_blocks
 from echelon.kernels import Unsupported, aligned, fed_widths, stride
 from echelon.network.exchange import Exchange
@@ -78,7 +78,7 @@ def reach_of(loop: Loop, places: Swarm, turned: Turned, kernel: Kernel) -> Reach
 def heard_back(loop: Loop, felt: Array) -> Array:
     """Return the slopes along what agents show (N, s), of those along what they hear at a start."""
     exchange, made = loop.exchange, np.zeros_like(felt)
-    weights = np.atleast_2d(np.asarray(exchange.weights))[loop.stretch(0)[0]]
+    weights = np.atleast_2d(np.asarray(exchange.weights))[stretch_at(loop, 0)[0]]
     along = weights[:, None] * felt[exchange.receivers]
     np.add.at(made, np.asarray(exchange.receivers), along)
     np.subtract.at(made, np.asarray(exchange.senders), along)

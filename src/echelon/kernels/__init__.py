@@ -6,6 +6,7 @@ from echelon.kernels.drivers import program
 from echelon.kernels.entries import Unsupported, nodes
 from echelon.kernels.frame import SLOTS, TURN, Body, Plan, stride
 from echelon.kernels.lowering import lower
+from echelon.kernels.moving import move
 from echelon.kernels.native import Code, aligned, is_installed, vectors
 from echelon.kernels.quotients import inverses_shared
 from echelon.kernels.scalar import Graph, Node, needed
@@ -26,6 +27,7 @@ __all__ = [
     "inverses_shared",
     "is_installed",
     "lower",
+    "move",
     "needed",
     "nodes",
     "program",

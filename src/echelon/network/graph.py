@@ -19,12 +19,13 @@ from echelon.network.edges import (
     check_size,
     count_agents,
     give_weights,
+    links,
     split_weights,
 )
 from echelon.network.eigenvalues import directed_spectrum, switching_spectrum, symmetric_spectrum
 from echelon.network.exchange import Exchange
 from echelon.network.radius import advising, pairs_within
-from echelon.network.reach import check_reached
+from echelon.network.reach import check_reached, nearest_leaders
 from echelon.network.spectrum import Spectrum
 from echelon.network.switching import Schedule, Stretch, unite
 from echelon.network.tree import ordered_outward, outward_edges, parents_of
@@ -88,7 +89,7 @@ class Graph:
     ) -> None:
         self.edges, self.weights, self.agents, self.schedule = edges, weights, agents, schedule
         self.leaders = check_leaders(leaders, self.agents)
-        self.followers = tuple(np.setdiff1d(np.arange(self.agents), self.leaders).tolist())
+        self.followers = tuple(np.delete(np.arange(self.agents), self.leaders).tolist())
         if not self.followers:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         check_reached(self)
@@ -167,19 +168,20 @@ class Graph:
     def path(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the line 0 - 1 - ... - (agents - 1); a directed one leads away from 0."""
         check_size(agents, 2, "path")
-        return cls([(i, i + 1) for i in range(agents - 1)], leaders, agents, directed)
+        return cls(links(np.arange(agents - 1), np.arange(1, agents)), leaders, agents, directed)
 
     @classmethod
     def ring(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the closed line."""
         check_size(agents, 3, "ring")
-        return cls([(i, (i + 1) % agents) for i in range(agents)], leaders, agents, directed)
+        all_ = np.arange(agents)
+        return cls(links(all_, (all_ + 1) % agents), leaders, agents, directed)
 
     @classmethod
     def star(cls, agents: int, leaders: Iterable[int] = (0,), directed: bool = False) -> "Graph":
         """Return the star with agent 0 in the middle."""
         check_size(agents, 2, "star")
-        return cls([(0, i) for i in range(1, agents)], leaders, agents, directed)
+        return cls(links(0, np.arange(1, agents)), leaders, agents, directed)
 
     @classmethod
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
@@ -192,8 +194,8 @@ class Graph:
         """Return rows x columns agents, numbered row by row, linked to the nearest four."""
         check_size(rows * columns, 2, "grid")
         number = np.arange(rows * columns).reshape(rows, columns)
-        across = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
-        down = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
+        across = links(number[:, :-1].ravel(), number[:, 1:].ravel())
+        down = links(number[:-1].ravel(), number[1:].ravel())
         return cls(np.concatenate([across, down]), leaders, rows * columns)
 
     @classmethod
@@ -324,9 +326,7 @@ class Graph:
 
     def nearest_leader(self) -> tuple[int, ...]:
         """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
-        hops = csgraph.dijkstra(self.told(), indices=self.leaders, unweighted=True)
-        # `argmin` takes the first of equals, and leaders are sorted.
-        return tuple(self.leaders[k] for k in np.argmin(np.atleast_2d(hops), axis=0))
+        return nearest_leaders(self)
 
     def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
         """Return the agents by how far they are from the leaders, each with its earlier neighbours.

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from echelon.core.errors import GraphError
@@ -58,12 +59,26 @@ def _cut_off(graph: "Graph", lost: Array) -> str:
 
 def lost_along(graph: "Graph", weights: Array) -> Array:
     """Return the agents that no leader reaches along the edges that have a weight (E,)."""
-    told = graph.told(weights)
     if not graph.directed:
-        _, label = csgraph.connected_components(told, directed=False)
-        return np.flatnonzero(~np.isin(label, label[list(graph.leaders)]))
+        # One way of each edge is enough, and half of what takes long where they are millions.
+        kept = weights > 0.0
+        edges = graph.edges if kept.all() else graph.edges[kept]
+        links = sp.coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
+        count, label = csgraph.connected_components(links.tocsr(), directed=False)
+        led = np.zeros(count, bool)
+        led[label[list(graph.leaders)]] = True
+        return np.flatnonzero(~led[label])
     among = {"indices": graph.leaders, "unweighted": True, "min_only": True}
-    return np.flatnonzero(np.isinf(csgraph.dijkstra(told, **among)))
+    return np.flatnonzero(np.isinf(csgraph.dijkstra(graph.told(weights), **among)))
+
+
+def nearest_leaders(graph: "Graph") -> tuple[int, ...]:
+    """Return what `Graph.nearest_leader` says."""
+    if len(graph.leaders) == 1:
+        return graph.leaders * graph.agents
+    hops = csgraph.dijkstra(graph.told(), indices=graph.leaders, unweighted=True)
+    # `argmin` takes the first of equals, and leaders are sorted.
+    return tuple(np.array(graph.leaders)[np.argmin(hops, axis=0)].tolist())
 
 
 def lost_at_times(graph: "Graph") -> str:

@@ -78,8 +78,11 @@ class _Faults:
             refuse(self.found)
 
 
-def build(scenario: Scenario) -> Built:
+def build(scenario: Scenario, to_run: bool = False) -> Built:
     """Return the parts and the settings of a scenario.
+
+    Where it is to run as it stands, what it stores must have room, and nothing may have been done
+    live, which a run cannot repeat.
 
     Raises:
         ScenarioError: one line for each part that cannot be made, with its place in the file.
@@ -101,9 +104,25 @@ def build(scenario: Scenario) -> Built:
             reference = _reference(scenario, model)
         # Before the laws: without a model and a graph each would be blamed for theirs.
         faults.settle()
+        if to_run:
+            # And before a gain is made, which takes long for many agents.
+            _check_run(scenario, faults, cast(ControlAffine, model), cast(Graph, graph))
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
         )
+
+
+def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph) -> None:
+    """Check that a scenario can be run as it stands, and that what is stored of it has room."""
+    with faults.at("live"):
+        if scenario.live:
+            raise ScenarioError(
+                f"got {len(scenario.live)} events, allowed is none in a run; `echelon live` "
+                "repeats them, and without `live` this is the scenario before them."
+            )
+    with faults.at("simulation"):
+        check_memory(model, graph.agents, _settings(scenario))
+    faults.settle()
 
 
 def _check_scenario(scenario: object) -> None:
@@ -155,24 +174,6 @@ def _initial(scenario: Scenario) -> Any:
     """Return spreads by state or group, and states by agent, in one mapping."""
     # States have names and agents numbers, so that no key meets another.
     return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
-
-
-def check_size(scenario: Scenario, built: Built) -> None:
-    """Check that a scenario can be run as it stands, and that what the run stores has room.
-
-    Raises:
-        ScenarioError: it has not, or holds what was done live, which a run cannot repeat.
-    """
-    faults = _Faults(scenario)
-    with faults.at("live"):
-        if scenario.live:
-            raise ScenarioError(
-                f"got {len(scenario.live)} events, allowed is none in a run; `echelon live` "
-                "repeats them, and without `live` this is the scenario before them."
-            )
-    with faults.at("simulation"):
-        check_memory(*built)
-    faults.settle()
 
 
 def run(
