@@ -260,6 +260,16 @@ def _is_square(node: Node) -> bool:
     return node.op == "mul" and node.args[0] is node.args[1]
 
 
+def is_at_least_0(node: Node) -> bool:
+    """Tell whether a number is known not to be below 0; it may be none, or -0."""
+    a = node.args
+    if node.op == "constant":
+        return node.value >= 0.0
+    if node.op in ("add", "mul", "div", "min"):
+        return all(map(is_at_least_0, a)) or node.op == "mul" and a[0] is a[1]
+    return node.op in ("sqrt", "abs", "pow2") or node.op == "max" and any(map(is_at_least_0, a))
+
+
 def _at_most(a: Node, b: Node) -> Node | None:
     """Return a comparison without the root of a sum of squares: the largest that has it decides."""
     if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not _is_square(a.args[0]):
