@@ -7,7 +7,7 @@ from echelon.kernels.entries import Unsupported, nodes
 from echelon.kernels.frame import SLOTS, TURN, Body, Plan, stride
 from echelon.kernels.lowering import lower
 from echelon.kernels.native import Code, aligned, is_installed, vectors
-from echelon.kernels.quotients import inverses_shared
+from echelon.kernels.products import shortened
 from echelon.kernels.scalar import Graph, Node, needed
 from echelon.kernels.winding import winds
 
@@ -23,13 +23,13 @@ __all__ = [
     "aligned",
     "fed_widths",
     "from_tape",
-    "inverses_shared",
     "is_installed",
     "lower",
     "needed",
     "nodes",
     "program",
     "shared",
+    "shortened",
     "stride",
     "vectors",
     "winds",

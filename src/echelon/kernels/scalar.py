@@ -5,8 +5,9 @@ as the time. It is made by an operation of `OPERATIONS` from other nodes, and an
 same operands is the same node. All code for vectors is made from such a graph.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias, final
 
 import numpy as np
@@ -75,9 +76,10 @@ class Node:
         value: the number of a constant, the name of a leaf.
         uniform: whether it is the same for all agents.
         truth: whether it is true or false, and no number.
+        kept: whether it is computed as it is written, and not in another order of its sums.
     """
 
-    __slots__ = ("args", "graph", "number", "op", "truth", "uniform", "value")
+    __slots__ = ("args", "graph", "kept", "number", "op", "truth", "uniform", "value")
     __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
 
     def __init__(
@@ -88,6 +90,7 @@ class Node:
         self.truth = op in TRUTHS or op == "constant" and isinstance(value, bool)
         if op == "select":
             self.truth = args[1].truth
+        self.kept = False
         graph.nodes.append(self)
 
     def __add__(self, other: Entry) -> "Node":
@@ -127,7 +130,7 @@ class Graph:
     """
 
     def __init__(self, bits: int = 64) -> None:
-        self.bits, self.nodes = bits, list[Node]()
+        self.bits, self.nodes, self._keeps = bits, list[Node](), False
         self._known: dict[Any, Node] = {}
 
     def constant(self, value: float | bool) -> Node:
@@ -158,7 +161,17 @@ class Graph:
     def _once(self, key: Any, op: str, args: tuple[Node, ...], value: Any, uniform: bool) -> Node:
         if key not in self._known:
             self._known[key] = Node(self, op, args, value, uniform)
+        self._known[key].kept |= self._keeps
         return self._known[key]
+
+    @contextlib.contextmanager
+    def as_written(self) -> Iterator[None]:
+        """Mark what is made meanwhile as `kept`: each rounding is where it was meant to be."""
+        before, self._keeps = self._keeps, True
+        try:
+            yield
+        finally:
+            self._keeps = before
 
 
 def needed(results: Iterable[Node]) -> list[Node]:
