@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from lanes import lowered, run, text_of
 from scipy.special import erf
 
-from echelon.core.numerics import precision
+from echelon.core.numerics import precision, rk4
 from echelon.kernels import Graph, Unsupported, native, needed
+from echelon.models import Quadrotor
 
 rng = np.random.default_rng(7)
 WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)
@@ -447,6 +448,24 @@ def test_a_lane_that_is_not_as_usual_changes_no_bit_of_the_others():
     assert alone[:, ::2].tobytes() == beside[:, ::2].tobytes()
     by_numpy = [np.sin(mixed[0]) * mixed[1], np.cos(np.sin(mixed[0]) + mixed[1]), np.cos(mixed[1])]
     np.testing.assert_allclose(beside, by_numpy, atol=1e-15)
+
+
+@pytest.mark.parametrize("bits", [64, 32])
+def test_what_is_usual_beside_a_lane_and_what_is_not_are_the_same_to_the_bit(bits):
+    model, u = Quadrotor(), jnp.array([0.3, 1e-5, -2e-5, 1e-6])
+
+    def step(v):
+        angle = jnp.arctan2(v[3], 1.0 + jnp.sqrt(v[4] * v[4] + 1.0))
+        return jnp.append(rk4(model.velocity, v, u.astype(v.dtype), 0.05), angle)
+
+    small = np.random.default_rng(3).uniform(-0.3, 0.3, (12, 16 * 64 // bits))
+    mixed = small.copy()
+    mixed[8, 1], mixed[3, 2], mixed[6, 3] = 2.0, 3.0, np.nan
+    alone, beside = (run(step, columns, bits) for columns in (small, mixed))
+    assert alone[:, 4:].tobytes() == beside[:, 4:].tobytes()
+    assert alone[:, 0].tobytes() == beside[:, 0].tobytes()
+    # Nothing is left to LLVM, which would put together what stands in one stretch of code alone.
+    assert "contract" not in text_of(step, 12, bits)[0]
 
 
 def test_much_that_few_need_stands_behind_a_branch():

@@ -29,6 +29,10 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "div": _divide,
     # A quotient that is cut to a whole number: no inverse takes its place, so that 49 / 49 is 1.
     "over": _divide,
+    # Sums with a product in one operation (`fused`): a b + c, a b - c and c - a b.
+    "fma": lambda a, b, c: a * b + c,
+    "fms": lambda a, b, c: a * b - c,
+    "fnma": lambda a, b, c: c - a * b,
     "neg": lambda a: -a,
     "abs": abs,
     "sqrt": lambda a: float(np.sqrt(a)),
@@ -225,6 +229,16 @@ def _product(a: Node, b: Node) -> Node | None:
     return None
 
 
+def _fused(op: str) -> Callable[[Node, Node, Node], Node | None]:
+    def simpler(a: Node, b: Node, c: Node) -> Node | None:
+        product = a * b if a.op == b.op == "constant" else _product(a, b)
+        if product is None and _is(c, 0.0):
+            product = a * b
+        return None if product is None else OPERATIONS[op](product, 1.0, c)
+
+    return simpler
+
+
 def _quotient(a: Node, b: Node) -> Node | None:
     if _is(a, 0.0) or _is(b, 1.0):
         return a
@@ -303,6 +317,7 @@ _SIMPLER: dict[str, Callable[..., Node | None]] = {
     "sub": _difference,
     "mul": _product,
     "div": _quotient,
+    **{op: _fused(op) for op in ("fma", "fms", "fnma")},
     "neg": _negation,
     "abs": lambda a: a if a.op == "abs" else None,
     "eq": lambda a, b: a.graph.make("not", a.graph.make("xor", a, b)) if a.truth else None,
