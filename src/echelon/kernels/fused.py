@@ -8,11 +8,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from echelon.kernels.frame import Body
+from echelon.kernels.order import lateness
 from echelon.kernels.scalar import Node, needed
 from echelon.kernels.usual import rewritten
-
-_LONG = {"div": 3, "sqrt": 4, "select": 0, "neg": 0}
-"""Operations that take longer than a product or less."""
 
 
 def fused(body: Body) -> Body:
@@ -21,12 +19,11 @@ def fused(body: Body) -> Body:
 
 
 def _fused(results: Sequence[Node]) -> Mapping[Node, Node]:
-    users = Counter(a for node in needed(results) for a in node.args)
+    nodes = needed(results)
+    users, late = Counter(a for node in nodes for a in node.args), lateness(nodes)
     users.update(results)
-    late = dict[Node, int]()
 
     def join(node: Node, args: Sequence[Node]) -> Node | None:
-        late[node] = max((late[a] for a in node.args), default=-1) + _LONG.get(node.op, 1)
         if node.op not in ("add", "sub") or node.uniform:
             return None
         alone = [k for k in (0, 1) if args[k].op == "mul" and users[node.args[k]] == 1]

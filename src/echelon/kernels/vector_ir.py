@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import final
 
 from echelon.kernels.arms import Arm, arms
+from echelon.kernels.order import lateness, one_by_one
 from echelon.kernels.scalar import Node, needed
 
 _INSTRUCTIONS = {
@@ -250,12 +251,12 @@ class Emitter:
         """Write all that results rest on, and go to a label where a truth of a level holds."""
         nodes = needed([*results, *(node for level in levels for node in level)])
         self._write([n for n in nodes if n.uniform])
-        rest = [n for n in nodes if not n.uniform]
+        rest, late = [n for n in nodes if not n.uniform], lateness(nodes)
         for level in levels:
-            wanted = set(needed(level))
-            rest = self._early([n for n in rest if n in wanted], rest, results)
+            wanted = [n for n in one_by_one(level, late) if not n.uniform]
+            rest = self._early(wanted, rest, results)
             self._leave(level, otherwise)
-        self._write(rest)
+        self._write(n for n in one_by_one(results, late) if not n.uniform)
 
     def _early(
         self, wanted: Sequence[Node], rest: Sequence[Node], results: Sequence[Node]
