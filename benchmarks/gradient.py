@@ -18,7 +18,7 @@ from engine import flock
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.engine.gradient import Run, by_jax, natively
+from echelon.engine.gradient import Native, Run, by_jax
 from echelon.engine.loop import assemble
 from echelon.engine.native import NativeStepper
 from echelon.engine.prepare import prepare
@@ -45,10 +45,10 @@ def ways(agents: int) -> dict[str, Callable[[], Any]]:
     gain = drive.gain
     values = {"P": gain.P, "R": gain.R, "coupling": np.asarray(gain.coupling)}
     run = Run(loop, values, problem.states, None if reference is None else reference[:_STEPS])
-    count = np.array([_STEPS], np.int32)
+    count, native = np.array([_STEPS], np.int32), Native(run, _STEPS)
     return {
         "forwards": lambda: stepper.advance(stepper.start(), count, reference),
-        "native": lambda: natively(run, _STEPS, squares),
+        "native": lambda: native.gradient(squares),
         "JAX": lambda: by_jax(run, _STEPS, squares),
     }
 

@@ -81,7 +81,7 @@ class Follower:
     def __init__(self, stepper: NativeStepper, bits: int) -> None:
         """Put all that is read into rows, and all that is written."""
         self.bits, self.lanes, own = bits, LANES[bits], stepper.own
-        body = body_of(own, bits, stepper.rows, False, stepper.follows)
+        body = body_of(own, bits, stepper.rows, False, bool(stepper.plan.table))
         places: dict[Any, int] = {}
 
         def read(node: Node, _: Any) -> Node | None:

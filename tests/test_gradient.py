@@ -152,9 +152,46 @@ def test_a_run_is_taken_back_in_stretches_as_in_one(monkeypatch):
     parts, settings = points(ech.Graph.path(11), "parent"), SHORT._replace(engine="native")
     once = ech.gradient(parts, settings, with_distances, WRT)
     monkeypatch.setattr(backward, "_TAPE", 1)
+    # The run that is ready has a tape already.
+    monkeypatch.setattr(gradients, "_ready", {})
     again = ech.gradient(parts, settings, with_distances, WRT)
     for name in WRT:
         np.testing.assert_array_equal(once.slopes[name], again.slopes[name])
+
+
+def regained(parts, p, coupling, r=2.0):
+    """The same parts, with another gain of the same form."""
+    method = ech.gains.FixedGain([[p]], R=[[r]], coupling=coupling)
+    law = ech.laws.Consensus(ech.synthesize(parts.model, parts.graph, method))
+    return parts.replace(drive=parts.drive.with_follower(law))
+
+
+@pytest.mark.parametrize("engine", ["jax", "native"])
+def test_a_run_that_is_ready_is_differentiated_anew_for_each_gain(monkeypatch, engine):
+    parts, settings = integrators(0.8, 1.5, 2.0), ech.Settings(0.7, 0.1, engine=engine)
+    wrt = ("P", "coupling")
+    # The last has other numbers where no slope is asked for, which native code holds as constants.
+    gains = ((1.5, 0.8, 2.0), (1.2, 0.9, 2.0), (1.5, 0.8, 2.0), (1.5, 0.8, 1.0))
+    ready = [ech.gradient(regained(parts, *gain), settings, squares, wrt) for gain in gains]
+    for gain, found in zip(gains, ready, strict=True):
+        monkeypatch.setattr(gradients, "_ready", {})
+        alone = ech.gradient(regained(parts, *gain), settings, squares, wrt)
+        assert found.value == alone.value and found.engine == engine
+        for name in wrt:
+            np.testing.assert_array_equal(found.slopes[name], alone.slopes[name])
+    assert ready[0].value == ready[2].value != ready[1].value
+
+
+def test_what_is_changed_in_place_or_refused_is_seen_by_the_next_gradient():
+    starts = np.array([[0.0], [0.7]])
+    parts, settings = integrators(0.8), ech.Settings(0.7, 0.1, engine="native")
+    parts = parts.replace(initial=starts)
+    first = ech.gradient(parts, settings, squares, ("initial",)).value
+    starts[1] *= 2.0
+    assert ech.gradient(parts, settings, squares, ("initial",)).value == pytest.approx(4.0 * first)
+    starts[1] = np.nan
+    with pytest.raises(ech.EchelonError, match="must be finite"):
+        ech.gradient(parts, settings, squares, ("initial",))
 
 
 class Stretched(ech.models.SingleIntegrator):

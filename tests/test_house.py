@@ -237,8 +237,6 @@ def test_every_dependency_is_pinned_and_no_index_is_named():
 
 def test_every_dependency_is_imported_or_has_its_reason():
     not_imported = {
-        "h5netcdf": "the engine by which xarray writes and reads run.nc",
-        "h5py": "what h5netcdf writes through, and does not bring",
         "pyarrow": "what pandas writes Parquet with",
     }
     extras = project()["optional-dependencies"]

@@ -19,7 +19,7 @@ from echelon.core.numerics import precision
 from echelon.core.words import Kind, Verdict
 from echelon.enclosure.series import enclose_derivatives
 from echelon.engine.prepare import prepare
-from echelon.promises.promise import promise
+from echelon.promises.promise import promise, promises
 from echelon.promises.statement import Hypothesis
 from echelon.verifier.verify import verify
 
@@ -170,6 +170,19 @@ def hovering():
     """Parts and settings of a leader that hovers, whose path is one piece, and the promise."""
     parts, settings = gentle("reference={name: hover}", "leader.start_error={x: 5}")
     return parts, settings, promise(parts, settings)
+
+
+def test_said_briefly_a_promise_is_the_same_but_for_motors_and_arrival(hovering):
+    parts, settings, whole = hovering
+    # Of other parts, since a promise is kept for those of which it was asked.
+    [brief] = promises(parts.replace(), [settings], briefly=True)
+    assert whole.tube.strain is not None and whole.tube.arrival is not None
+    assert brief.tube == whole.tube._replace(strain=None, arrival=None)
+    assert "motors" not in brief.sentence() and "within 1 cm" not in brief.sentence()
+    for name in ("promised", "reasons", "kind", "theorem", "rate", "hold", "certified"):
+        assert getattr(brief, name) == getattr(whole, name), name
+    rest = {name: line for name, line in whole.hypotheses.items() if name is not Hypothesis.LIMITS}
+    assert dict(brief.hypotheses) == rest
 
 
 def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):

@@ -12,7 +12,7 @@ from echelon.engine.result import Result
 from echelon.engine.simulate import reassemble
 from echelon.gains.file import save_gain
 from echelon.reports.run import report
-from echelon.results.dataset import dataset, save_dataset, summary
+from echelon.results.dataset import labelled, save_dataset, summary
 from echelon.results.recording import recording
 from echelon.scenario.build import build, note_origin
 from echelon.scenario.scenario import KEPT, load_scenario
@@ -69,7 +69,7 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
     """
     try:
         # The data first: a figure that fails then costs no run.
-        data = dataset(result)
+        data = labelled(result)
         save_dataset(data, folder / DATA)
         # NaN is no JSON: whoever reads the file with another parser would stop there.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
@@ -81,7 +81,7 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
             # Here, since matplotlib takes long to load, and a run without figures needs none of it.
             from echelon.plots.run import save_figures
 
-            save_figures(recording(data), folder)
+            save_figures(recording(data.dataset()), folder)
     except OSError as error:
         raise unwritable(folder, error) from error
 

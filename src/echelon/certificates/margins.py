@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from echelon.core.errors import GainError
 from echelon.core.linear import symmetric_basis
@@ -179,6 +178,8 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     def size(w: float, i: int, at: float = 0.0) -> float:
         return float(np.abs(loci(np.array([w]))[0, i])) - at
 
+    from scipy.optimize import root_scalar  # which few runs need, and takes long to load
+
     grid = _frequencies([loop.A, *closed])
     columns = enumerate(np.abs(loci(grid)).T)
     peaks = [_peaks(lambda w, i=i: size(w, i), grid, column) for i, column in columns]
@@ -188,7 +189,7 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
         for at, i in np.argwhere(np.diff(sizes > 1.0 / abs(k), axis=0)):
             ends, sharp = (grid[at], grid[at + 1]), 1e-13 * grid[at]
             edge = (i, 1.0 / abs(k))
-            w = scipy.optimize.root_scalar(size, edge, "brentq", ends, xtol=sharp).root
+            w = root_scalar(size, edge, "brentq", ends, xtol=sharp).root
             mu = loci(np.array([w]))[0]
             # Loci that cross together share the size and differ in phase: the first one counts.
             mu = mu[np.abs(np.abs(mu * k) - 1.0) < 1e-6]
@@ -339,8 +340,10 @@ def _peaks(f: Callable[[float], float], grid: Array, values: Array) -> Array:
 
 def lowest(f: Callable[[float], float], low: float, high: float) -> Any:
     """Return SciPy's account of the least f between two points, where it has one minimum."""
+    from scipy.optimize import minimize_scalar
+
     sharp = {"xatol": 1e-7 * (high - low)}
-    return scipy.optimize.minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
+    return minimize_scalar(f, None, (low, high), (), "bounded", options=sharp)
 
 
 def _unobservable(A: Array, C: Array) -> Array:

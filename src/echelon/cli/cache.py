@@ -10,6 +10,8 @@ from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Final
 
+from echelon.core.store import FOLDER
+
 _SETTINGS: Final = {
     # JAX keeps what took it a second or more: of the 24 pieces that `run paper` compiles, one.
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -28,7 +30,7 @@ def keep_compiled_code(environment: MutableMapping[str, str]) -> None:
     folder = cache_folder(environment)
     if folder is None or "JAX_COMPILATION_CACHE_DIR" in environment or not _prepare(folder):
         return
-    environment["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    environment["JAX_COMPILATION_CACHE_DIR"] = environment[FOLDER] = str(folder)
     for name, value in _SETTINGS.items():
         environment.setdefault(name, value)
     # A full disk, or an entry cut short by Ctrl-C: JAX compiles anew, and the run is the same.

@@ -1,12 +1,16 @@
 """What is computed once and then kept, since JAX compiles for every new function."""
 
+import contextlib
 import dataclasses
 import functools
+import pickle
 from collections.abc import Callable, Hashable
 from typing import Any, ParamSpec, TypeVar, final
 
 import jax
 import numpy as np
+
+from echelon.core import store
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -25,11 +29,12 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @functools.lru_cache(_MOST)
     def answer(call: "_Call") -> _R:
-        return function(*call.args, **call.named)
+        name = f"{function.__module__}.{function.__qualname__}"
+        return stored(lambda: function(*call.args, **call.named), name, call.args, call.named)
 
     @functools.wraps(function)
     def once(*args: _P.args, **named: _P.kwargs) -> _R:
-        call = _Call(_identify((args, tuple(named.items()))), args, named)
+        call = _Call(identify((args, named)), args, named)
         try:
             hash(call)
         except TypeError:
@@ -37,6 +42,25 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
         return answer(call)
 
     return once
+
+
+def stored(make: Callable[[], _R], what: str, *values: Any) -> _R:
+    """Return what is made of values, or what another process has made and kept of the same."""
+    file = store.place_of(what, *values)
+    if file is None:
+        return make()
+    packed = store.read(file)
+    # What cannot be read is made again, and what cannot be written is not kept.
+    if packed is not None:
+        with contextlib.suppress(Exception):
+            body, *buffers = pickle.loads(packed)
+            return pickle.loads(body, buffers=buffers)
+    made, parts = make(), list[pickle.PickleBuffer]()
+    with contextlib.suppress(Exception):
+        # Arrays apart, so that they are read-only when they come back.
+        body = pickle.dumps(made, 5, buffer_callback=parts.append)
+        store.keep(file, pickle.dumps([body, *(bytes(part) for part in parts)]))
+    return made
 
 
 @final
@@ -49,13 +73,18 @@ class _Call:
     named: dict[str, Any] = dataclasses.field(compare=False)
 
 
-def _identify(value: Any) -> Any:
-    """Return what is equal, and hashable, for values of the same types and bits alone."""
+def identify(value: Any) -> Any:
+    """Return what is equal, and hashable, for values of the same types and bits alone.
+
+    What is no value of a known kind stands for itself. Where that cannot be hashed, nor can this.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = dataclasses.fields(value)
-        return type(value), tuple(_identify(getattr(value, field.name)) for field in fields)
+        return type(value), tuple(identify(getattr(value, field.name)) for field in fields)
     if isinstance(value, tuple | list):
-        return type(value), tuple(map(_identify, value))
+        return type(value), tuple(map(identify, value))
+    if isinstance(value, dict):
+        return dict, tuple((identify(key), identify(each)) for key, each in value.items())
     # Numbers by their bytes too, since 0.0 equals -0.0, and NaN not itself.
     if isinstance(value, float | complex | np.ndarray | jax.Array):
         array = np.asarray(value)

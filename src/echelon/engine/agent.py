@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import NamedTuple, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jax.typing import ArrayLike
 
 from echelon.core.errors import SimulationError, check_kind, listing
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, State
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
@@ -153,19 +153,19 @@ class _Given(NamedTuple):
     memory: Memory
 
 
-@eqx.filter_jit
+@program
 def _begin(loop: Loop, law: Law, x: State) -> Memory:
     return law.begin(loop.model, x)
 
 
-@eqx.filter_jit
+@program
 def _signal(loop: Loop, law: Law, own: _Given) -> jax.Array:
     """Return what neighbours hear."""
     said = law.signal(loop.model, *own)
     return own.x - own.offset if said is None else said
 
 
-@eqx.filter_jit
+@program
 def _step(
     loop: Loop,
     leads: bool,

@@ -18,17 +18,19 @@ from echelon.engine.code import LANES, Kernel, compiled, follows, plan_of
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.native import STEPS, NativeStepper, beyond
 from echelon.engine.own import Own
-from echelon.engine.places import Swarm, heard, senders_of, smooth_blocks
+from echelon.engine.places import Swarm
 from echelon.engine.pulled import Felt, Pulled, Transpose, heard_by, lean
 from echelon.engine.scalars import Rows, signals_of
 from echelon.engine.sums import Sums
+from echelon.engine.turned import check_pairs, heard_back, reach_of, turned_about
 from echelon.engine.turns import step_by_step
-from echelon.kernels import SLOTS, Body, Unsupported, aligned, fed_widths, stride
-from echelon.network.exchange import Exchange
+from echelon.kernels import SLOTS, Body, Unsupported, aligned, fed_widths
 
 BITS = 64
 _TAPE = 256 * 2**20
 """Bytes of a tape, unless steps are so many that it takes the root of what all would."""
+_LIGHT = 32 * 2**20
+"""Bytes of a tape that is kept for the next run, since they take a while to be had."""
 _KEPT = 8
 """Pairs of kernels that are kept for other runs."""
 
@@ -110,7 +112,7 @@ class Slopes(NamedTuple):
 
 @final
 class Backward:
-    """A run of laws that is taken forwards and then back, once.
+    """A run of laws that is taken forwards and then back, as often as is asked.
 
     Args:
         own: the loop, and its numbers along which there are slopes.
@@ -130,12 +132,13 @@ class Backward:
         self.own, self.loop, self.steps, self.states = own, own.loop, steps, states
         self.places = Swarm(own.loop, LANES[BITS])
         if wants.spaced:
-            _check_pairs(own.loop)
+            check_pairs(own.loop)
         if all(wants):
             raise Unsupported("slopes of distances along the goals' offsets")
-        turned = _turned(own.loop, self.places)
+        turned = turned_about(own.loop, self.places)
         self.pair = _pair(own, (self.places.lines, turned.lines), wants)
-        self.reach, kernel = _reach(own.loop, self.places, turned, self.pair), self.pair.forward
+        self.reach = reach_of(own.loop, self.places, turned, self.pair.backward)
+        self.signals, kernel = signals_of(own.loop), self.pair.forward
         self.stepper = NativeStepper(
             [own.loop], states, BITS, None, make=lambda *_: kernel, places=self.places
         )
@@ -149,16 +152,29 @@ class Backward:
         size, moment = 8 * math.prod(shape), 8 * self.states.size * 2
         few = max(_TAPE // size, math.isqrt(self.steps * moment // size))
         self.stretch = min(self.steps, max(1, few))
-        self.tape = aligned((self.stretch, *shape), np.float64)
+        self.shape, self._room = (self.stretch, *shape), None
         self.felt = aligned((places.blocks, plan.rows, plan.lanes), np.float64)
         lined = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
         self.mirrors = [aligned(lined, np.float64) for _ in range(2)]
         self.fed = aligned((len(places.agents), max(1, fed_widths(plan)[1])), np.float64)
-        self.sizes = [math.prod(leaf.shape) for leaf in self._leaves()]
-        self.totals = aligned((max(1, sum(self.sizes)), plan.lanes), np.float64)
+        self.forms = [leaf.shape for leaf in self._leaves()]
+        self.totals = aligned((max(1, sum(map(math.prod, self.forms))), plan.lanes), np.float64)
+
+    @property
+    def tape(self) -> Array:
+        """The tape, which is there from the first run on."""
+        if self._room is None:
+            self._room = aligned(self.shape, np.float64)
+        return self._room
 
     def _leaves(self) -> list[Array]:
         return [leaf.astype(float) for leaf in self.own.leaves(self.own.values[0])]
+
+    def turn(self, loop: Loop) -> None:
+        """Go on with a loop that its own numbers cover."""
+        self.loop = loop
+        self.own.turn(loop)
+        self.stepper.turn(loop)
 
     # ---- forwards ----
 
@@ -203,6 +219,9 @@ class Backward:
                 self._advance(self.moments[first // self.stretch], first)
             self._back(first, min(self.steps, first + self.stretch))
         found = self._ended()
+        if self.tape.nbytes > _LIGHT:
+            self._room = None
+            self.stepper.record(None, 0)
         if not self.wants.spaced:
             return found
         # The transpose of a step adds what distances were after it; this is before the first.
@@ -281,13 +300,13 @@ class Backward:
         """Return the slopes, with what the beginning of the run adds to them."""
         felt, loop = self.pair.felt, self.loop
         found = self.felt.transpose(0, 2, 1).reshape(len(self.places.agents), -1)[self.places.of]
-        ends = np.cumsum(self.sizes)[:-1]
-        leaves = np.split(self.totals.sum(axis=1)[: sum(self.sizes)], ends) if self.sizes else []
-        leaves = [s.reshape(leaf.shape) for s, leaf in zip(leaves, self._leaves(), strict=True)]
-        heard = _heard_back(loop, self._shown()[:, : heard_by(loop)])
+        ends = np.cumsum([0, *map(math.prod, self.forms)]).tolist()
+        total, parts = self.totals.sum(axis=1), zip(self.forms, ends[:-1], ends[1:], strict=True)
+        leaves = [total[begin:end].reshape(form) for form, begin, end in parts]
+        heard = heard_back(loop, self._shown())
         states = found[:, felt.state]
         offsets = found[:, felt.offset] if self.wants.moved else np.zeros_like(states)
-        if not (len(felt.memory) or signals_of(loop)):
+        if not (len(felt.memory) or self.signals):
             return Slopes(leaves, states + heard, offsets - heard)
         more = self._begun(found[:, felt.memory], heard)
         leaves = [a + np.asarray(b) for a, b in zip(leaves, more[0], strict=True)]
@@ -295,11 +314,10 @@ class Backward:
 
     def _shown(self) -> Array:
         """Return the slopes along what agents heard at the first step, (N, s)."""
-        plan, places = self.pair.backward.plan, self.places
-        if plan.lines:
-            return self.mirrors[0].T[places.of]
-        wide = self.mirrors[0].reshape(len(places.agents), -1)
-        return wide[places.of]
+        places, shown = self.places, self.mirrors[0]
+        lined = self.pair.backward.plan.lines
+        shown = shown.T if lined else shown.reshape(len(places.agents), -1)
+        return shown[places.of, : self.signals or self.states.shape[1]]
 
     def _begun(self, memory: Array, heard: Array) -> Any:
         """Return the slopes along leaves, starts and offsets of how agents begin."""
@@ -322,77 +340,3 @@ class Backward:
                 flat = flat[:, size:]
             felt.append(jax.tree.unflatten(jax.tree.structure(tree), leaves))
         return pull((*felt, jnp.asarray(heard)))
-
-
-# ---- the transposed graph ------------------------------------------------------------------------
-
-
-class _Turned(NamedTuple):
-    """Who heard each agent, as `places.heard` has whom it hears; whose positions are in lines."""
-
-    starts: Array
-    positions: Array
-    weights: Array
-    smooth: Array
-    lines: bool
-
-
-class _Reach(NamedTuple):
-    """The same as a kernel reads it, and whom each agent feeds: `places.Found` turned about."""
-
-    neighbour_starts: Array
-    neighbours: Array
-    weights: Array
-    smooth: Array
-    sources: Array
-    leaders: Array
-
-
-def _check_pairs(loop: Loop) -> None:
-    """Refuse edges that are not each heard by both their ends, with a weight of 1.
-
-    Raises:
-        Unsupported: some are.
-    """
-    exchange = loop.exchange
-    both = len(exchange.receivers) == 2 * len(loop.meter.edges)
-    if not both or loop.switches is not None or (np.asarray(exchange.weights) != 1.0).any():
-        raise Unsupported("slopes along distances of edges that are not all heard both ways alike")
-
-
-def _turned(loop: Loop, places: Swarm) -> _Turned:
-    exchange = loop.exchange
-    turned = Exchange(exchange.senders, exchange.receivers, exchange.weights)
-    starts, positions, weights = heard(loop, places, turned)
-    agents = places.agents.reshape(-1, places.lanes)
-    own = np.arange(agents.size).reshape(agents.shape)
-    block = np.repeat(np.arange(places.blocks), np.diff(starts))
-    # A copy feels nothing, so that what is added up over all lanes counts each agent once.
-    once = (places.of[agents] == own)[block]
-    positions, weights = np.where(once, positions, own[block]), np.where(once, weights, 0.0)
-    return _Turned(starts, positions, weights, *smooth_blocks(starts, positions))
-
-
-def _reach(loop: Loop, places: Swarm, turned: _Turned, pair: _Pair) -> _Reach:
-    plan, nearest = pair.backward.plan, np.asarray(loop.meter.nearest)
-    heavy = aligned(turned.weights.shape, np.float64)
-    heavy[:] = turned.weights
-    far, (_, fed) = 1 if plan.lines else stride(plan.width, plan.lanes), fed_widths(plan)
-    return _Reach(
-        turned.starts,
-        np.ascontiguousarray(turned.positions * far, np.int32),
-        heavy,
-        turned.smooth.astype(np.int8),
-        (places.of[senders_of(loop)[places.agents]] * fed).astype(np.int32),
-        (places.of[nearest[places.agents]] * fed).astype(np.int32),
-    )
-
-
-def _heard_back(loop: Loop, felt: Array) -> Array:
-    """Return the slopes along what agents show (N, s), of those along what they hear at a start."""
-    exchange, made = loop.exchange, np.zeros_like(felt)
-    weights = np.atleast_2d(np.asarray(exchange.weights))[loop.stretch(0)[0]]
-    along = weights[:, None] * felt[exchange.receivers]
-    np.add.at(made, np.asarray(exchange.receivers), along)
-    np.subtract.at(made, np.asarray(exchange.senders), along)
-    return made

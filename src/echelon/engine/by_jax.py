@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.devices import advance_parted, mesh_of
 from echelon.engine.drive import Chunk, Stepper
@@ -68,12 +69,12 @@ class JaxStepper(Stepper):
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
-        return begin(self.loop, jnp.asarray(self.states))
+        return begin(self.loop, self.states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
-        now, (states, inputs), sums = step(self.loop, now, jnp.asarray(counts), reference)
+        now, (states, inputs), sums = step(self.loop, now, counts, reference)
         return Chunk(now, *on_host((states, inputs, sums)))
 
 
@@ -112,7 +113,7 @@ class JaxFormations(Stepper):
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
-        made = _advance_all(self.loop, self.axes, now, jnp.asarray(counts), reference)
+        made = _advance_all(self.loop, self.axes, now, counts, reference)
         (x, u), sums = on_host(made[1:])
         # As if it were one swarm: the formations stand along the second axis, or the first.
         twice = {name: _merged(getattr(sums, name), 1) for name in ("errors", "tracking")}
@@ -132,12 +133,12 @@ _ALL = Moment(None, 0, 0, 0, 0)  # type: ignore[arg-type]
 _SUMS: Any = Sums(*[0] * len(Sums._fields))._replace(steps=None, errors=1, tracking=1)
 
 
-@eqx.filter_jit
+@program
 def _begin_all(loop: Loop, axes: Any, states: jax.Array) -> Moment:
     return eqx.filter_vmap(begin, in_axes=(axes, 0), out_axes=_ALL)(loop, states)
 
 
-@eqx.filter_jit
+@program
 def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, wanted: Any) -> Any:
     each = (axes, _ALL, None, None)
     return eqx.filter_vmap(advance, in_axes=each, out_axes=(_ALL, 1, _SUMS))(

@@ -22,7 +22,9 @@ _KEPT = 8
 
 def follows(loop: Loop) -> bool:
     """Tell whether the leaders of a loop follow a reference."""
-    return loop.leader.reference_states(loop.model, jnp.zeros(1)) is not None
+    # Traced, since to compile it in another precision than the run's parts takes seconds.
+    wanted = jax.eval_shape(lambda: loop.leader.reference_states(loop.model, jnp.zeros(1)))
+    return wanted is not None
 
 
 class Kernel(NamedTuple):
@@ -103,12 +105,18 @@ class Kernels:
         """
         # Of wind and noise too: their rows are there only where these are.
         wind = jax.tree.structure(own.loop.motion.wind)
-        key = (own.signature, wind, bits, together, lines, weighted)
-        if key not in self._made:
+        signature = own.signature
+        key = (signature, wind, bits, LANES[bits], together, lines, weighted)
+        found = None if signature is None else self._made.get(key)
+        if found is None:
             # The oldest goes: a sweep over models has one after the other.
-            while len(self._made) >= _KEPT:
-                self._made.pop(next(iter(self._made)))
+            for old in list(self._made)[: 1 - _KEPT]:
+                self._made.pop(old, None)
             rows = Rows.of(own.loop, own.count)
             plan = plan_of(own, rows, bits, together, lines, weighted, False)
-            self._made[key] = compiled(rows, plan, self._codes)
-        return self._made[key]
+            found = self._made[key] = compiled(rows, plan, self._codes)
+        return found
+
+
+KERNELS = Kernels()
+"""Those of runs one by one."""

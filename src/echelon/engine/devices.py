@@ -6,12 +6,12 @@ one; within it each device moves its own agents, and JAX brings it what they hea
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from echelon.core.errors import SimulationError
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.loop import Loop, Moment, advance
 from echelon.engine.sums import Sums
@@ -42,7 +42,7 @@ def mesh_of(devices: int, agents: int) -> Mesh:
     return Mesh(np.array(there[:devices]), ("agents",))
 
 
-@eqx.filter_jit
+@program
 def advance_parted(
     mesh: Mesh, loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
 ) -> tuple[Moment, tuple[Any, Any], Sums]:

@@ -1,8 +1,8 @@
 """How a cost of a run changes with its gain and its starts: the closed loop differentiated."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -11,14 +11,17 @@ import numpy as np
 
 from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.jaxpr import read_by
+from echelon.core.kept import identify, kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.backward import Backward, Wants
+from echelon.engine.drive import Drive, Problem
 from echelon.engine.laws import Laws, choose_engine
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
-from echelon.engine.own import Own, bare
+from echelon.engine.own import Own, alike, bare
 from echelon.engine.parts import Parts
-from echelon.engine.prepare import Prepared, prepare
+from echelon.engine.prepare import prepare
 from echelon.engine.settings import Settings
 from echelon.engine.simulate import sample_reference
 from echelon.engine.sums import Sums, distance_of, reference_at
@@ -70,22 +73,17 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
             laws, or have no gain; a variable is unknown; `settings.engine` is `native`, and there
             is no such code.
     """
-    prepared = prepare(parts, settings)
-    values = _values(prepared, wrt)
-    drive = prepared.parts.drive
-    assert isinstance(drive, Laws)
     with precision("float64"):
-        loop = assemble(prepared.problem, drive.leader, drive.follower)
-        run = Run(
-            loop, values, prepared.problem.states, sample_reference(prepared, 0, settings.steps)
-        )
-        return choose_engine(
+        ready = _taken(parts, settings, tuple(wrt))
+        found = choose_engine(
             settings,
-            len(run.states),
-            lambda: natively(run, settings.steps, cost),
-            lambda why: by_jax(run, settings.steps, cost, why),
+            len(ready.run.states),
+            lambda: ready.natively(cost),
+            lambda why: by_jax(ready.run, settings.steps, cost, why),
             _WORTH,
         )
+    _give(ready)
+    return found
 
 
 class Run(NamedTuple):
@@ -97,12 +95,93 @@ class Run(NamedTuple):
     reference: Array | None
 
 
-def by_jax(run: Run, steps: int, cost: Cost, instead: str = "") -> Gradient:
-    """Return the gradient by JAX's reverse mode over steps of JAX, `instead` of native code."""
-    (value, sums), slopes = _differentiate(*run, steps, cost)
-    found = {name: _symmetric(name, np.asarray(slope)) for name, slope in slopes.items()}
-    told = (f"JAX takes the steps back, since {instead}.",) * bool(instead)
-    return Gradient(float(value), found, jax.tree.map(np.asarray, sums), warnings=told)
+# ---- what is ready to be run again ---------------------------------------------------------------
+
+
+_READY = 4
+"""Runs that are kept for other calls."""
+_ready: dict[Hashable, "_Ready"] = {}
+
+
+def _taken(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> "_Ready":
+    """Return a run for a caller's own use, made ready unless it was before."""
+    key = _content(parts, settings, wrt)
+    ready = _ready.pop(key, None) if key is not None else None
+    if ready is None or not ready.turn(parts):
+        ready = _Ready(parts, settings, wrt, key)
+    return ready
+
+
+def _give(ready: "_Ready") -> None:
+    """Keep a run for the next caller."""
+    if ready.key is not None:
+        _ready[ready.key] = ready
+        for key in list(_ready)[:-_READY]:
+            _ready.pop(key, None)
+
+
+def _content(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable:
+    """Return all that a run rests on but the followers' gain; None where that cannot be told.
+
+    By its bits: what somebody changes in place is another run.
+    """
+    if not isinstance(parts, Parts):
+        return None
+    drive = parts.drive
+    if isinstance(drive, Laws) and drive.gain is not None:
+        law: Any = eqx.tree_at(lambda law: law.gain, drive.follower, None)
+        parts = parts.replace(drive=drive.with_follower(law))
+    try:
+        key = identify((parts, settings, wrt))
+        hash(key)
+    except TypeError:
+        return None
+    return key
+
+
+@final
+class _Ready:
+    """A run that is checked and made ready, and is differentiated one time after the other."""
+
+    def __init__(
+        self, parts: Parts, settings: Settings, wrt: tuple[str, ...], key: Hashable
+    ) -> None:
+        self.key, self.wrt, self.prepared = key, wrt, prepare(parts, settings)
+        drive, problem = self.prepared.parts.drive, self.prepared.problem
+        values = _values(problem, drive, wrt)
+        assert isinstance(drive, Laws)
+        loop = assemble(problem, drive.leader, drive.follower)
+        reference = sample_reference(self.prepared, 0, settings.steps)
+        self.run = Run(loop, values, problem.states, reference)
+        self.gain, self._native = identify(parts.drive.gain), None
+
+    def turn(self, parts: Parts) -> bool:
+        """Take the same parts with another gain; tell whether that is all that changes.
+
+        What a law of the same form does is as it was when that was checked.
+        """
+        gain = identify(parts.drive.gain)
+        if gain == self.gain:
+            return True
+        problem, known, given = self.prepared.problem, self.prepared.parts.drive, parts.drive
+        assert isinstance(known, Laws) and isinstance(given, Laws)
+        follower = given.follower.prepared(problem.model, problem.graph)
+        drive = Laws(known.leader, follower.following(known.leader, problem.model))
+        loop = assemble(problem, known.leader, drive.follower)
+        if not alike(loop, self.run.loop):
+            return False
+        drive.accept(problem)
+        values = _values(problem, drive, self.wrt)
+        self.run, self.gain = self.run._replace(loop=loop, values=values), gain
+        if self._native is not None and not self._native.turn(self.run):
+            self._native = None
+        return True
+
+    def natively(self, cost: Cost) -> Gradient:
+        """Return the gradient of a cost by native code."""
+        if self._native is None:
+            self._native = Native(self.run, self.prepared.problem.settings.steps)
+        return self._native.gradient(cost)
 
 
 # ---- by native code ------------------------------------------------------------------------------
@@ -112,29 +191,73 @@ _PARTS = {"P": ("P",), "R": ("R", "R_inverse"), "coupling": ("coupling",)}
 """What of a gain changes with a variable."""
 
 
-def natively(run: Run, steps: int, cost: Cost) -> Gradient:
-    """Return the gradient by native code.
+@final
+class Native:
+    """A run that native code takes back, for one cost after the other.
 
-    Raises:
-        Unsupported: there is none.
-        MissingExtraError: llvmlite is not installed.
+    Args:
+        run: what is run.
+        steps: how many.
     """
-    names = [part for name in run.values for part in _PARTS.get(name, ())]
-    own, order = _own(run.loop, names)
-    spaced = Sums(*read_by(cost, run.loop.meter.nothing())).spacing
-    back = Backward(own, run.states, run.reference, steps, Wants(spaced, "offsets" in run.values))
-    sums = back.run()
-    if sums is None:
-        raise Unsupported("states beyond the range of its sines")
-    value, along = _slopes_of(cost, sums)
-    found = back.pull(along)
-    parts = dict(zip(order, found.leaves, strict=True))
-    parts |= {"initial": found.states, "offsets": found.offsets}
-    if "R" in parts:
-        inverse = run.loop.follower.gain.R_inverse  # type: ignore[attr-defined]
-        parts["R"] = parts["R"] - inverse.T @ parts["R_inverse"] @ inverse.T
-    slopes = {name: _symmetric(name, parts[name]) for name in run.values}
-    return Gradient(float(value), slopes, sums, "native")
+
+    def __init__(self, run: Run, steps: int) -> None:
+        """Find the numbers of the gain along which there are slopes."""
+        self.run, self.steps = run, steps
+        names = [part for name in run.values for part in _PARTS.get(name, ())]
+        self._own, self._order = _own(run.loop, names)
+        self._sums = tuple(np.shape(part) for part in run.loop.meter.nothing())
+        self._ways = dict[bool, Backward | Unsupported]()
+
+    def turn(self, run: Run) -> bool:
+        """Take another gain; tell whether its numbers alone are others."""
+        if not self._own.covers(run.loop):
+            return False
+        self.run = run
+        for way in self._ways.values():
+            if isinstance(way, Backward):
+                way.turn(run.loop)
+        return True
+
+    def gradient(self, cost: Cost) -> Gradient:
+        """Return the gradient of a cost.
+
+        Raises:
+            Unsupported: there is no such code.
+            MissingExtraError: llvmlite is not installed.
+        """
+        way = self._way(_is_spaced(cost, self._sums))
+        sums = way.run()
+        if sums is None:
+            raise Unsupported("states beyond the range of its sines")
+        value, along = _slopes_of(cost, sums)
+        found = way.pull(along)
+        parts = dict(zip(self._order, found.leaves, strict=True))
+        parts |= {"initial": found.states, "offsets": found.offsets}
+        if "R" in parts:
+            inverse = self.run.loop.follower.gain.R_inverse  # type: ignore[attr-defined]
+            parts["R"] = parts["R"] - inverse.T @ parts["R_inverse"] @ inverse.T
+        slopes = {name: _symmetric(name, parts[name]) for name in self.run.values}
+        return Gradient(float(value), slopes, sums, "native")
+
+    def _way(self, spaced: bool) -> Backward:
+        """Return the way back of costs, whether they rest on distances or not."""
+        if spaced not in self._ways:
+            run, wants = self.run, Wants(spaced, "offsets" in self.run.values)
+            given = self._own, run.states, run.reference, self.steps, wants
+            try:
+                self._ways[spaced] = Backward(*given)
+            except Unsupported as reason:
+                self._ways[spaced] = reason
+        way = self._ways[spaced]
+        if isinstance(way, Unsupported):
+            raise way
+        return way
+
+
+@kept
+def _is_spaced(cost: Cost, shapes: tuple[tuple[int, ...], ...]) -> bool:
+    """Tell whether a cost rests on distances."""
+    return Sums(*read_by(cost, Sums(*map(np.zeros, shapes)))).spacing
 
 
 def _own(loop: Loop, names: Sequence[str]) -> tuple[Own, list[str]]:
@@ -152,7 +275,7 @@ def _own(loop: Loop, names: Sequence[str]) -> tuple[Own, list[str]]:
     return Own([loop], unlike), [leaf for leaf in marked if isinstance(leaf, str)]
 
 
-@eqx.filter_jit
+@program
 def _slopes_of(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
     """Return a cost of sums, and its slopes along those that have some."""
     names = ("errors", "tracking", "outputs", "effort", "spacing")
@@ -164,14 +287,21 @@ def _slopes_of(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
 # ---- by JAX --------------------------------------------------------------------------------------
 
 
-def _values(prepared: Prepared, wrt: Sequence[str]) -> dict[str, Array]:
+def by_jax(run: Run, steps: int, cost: Cost, instead: str = "") -> Gradient:
+    """Return the gradient by JAX's reverse mode over steps of JAX, `instead` of native code."""
+    (value, sums), slopes = _differentiate(*run, steps, cost)
+    found = {name: _symmetric(name, np.asarray(slope)) for name, slope in slopes.items()}
+    told = (f"JAX takes the steps back, since {instead}.",) * bool(instead)
+    return Gradient(float(value), found, jax.tree.map(np.asarray, sums), warnings=told)
+
+
+def _values(problem: Problem, drive: Drive, wrt: Sequence[str]) -> dict[str, Array]:
     """Return what a cost is differentiated by, by name."""
-    drive, gain = prepared.parts.drive, prepared.parts.drive.gain
+    gain = drive.gain
     if not isinstance(drive, Laws):
         raise SimulationError(
             f"a run driven by `{type(drive).__name__}` cannot be differentiated, one by `Laws` can."
         )
-    problem = prepared.problem
     known = {"initial": np.asarray(problem.states), "offsets": problem.formation.offsets}
     if gain is not None:
         known |= {"P": gain.P, "R": gain.R, "coupling": np.asarray(gain.coupling)}
@@ -191,7 +321,7 @@ def _symmetric(name: str, slope: Array) -> Array:
     return 0.5 * (slope + slope.T) if name in ("P", "R") else slope
 
 
-@eqx.filter_jit
+@program
 def _differentiate(
     loop: Loop,
     values: dict[str, Array],

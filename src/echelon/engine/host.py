@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import SimulationError
+from echelon.core.program import program
 from echelon.core.types import Array, Inputs, States
 from echelon.engine.drive import Chunk, Problem, Stepper, Stopped
 from echelon.engine.motion import Motion
@@ -160,7 +160,7 @@ class _Made:
         return Chunk(now, states, inputs, on_host(self.sums), self.stopped)
 
 
-@eqx.filter_jit
+@program
 def _hold_inputs(
     motion: Motion,
     meter: Meter,

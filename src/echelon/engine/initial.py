@@ -1,6 +1,6 @@
 """Where the agents start: leaders on their reference, followers about their goals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -62,25 +62,30 @@ class Starts:
 
     def __call__(self, seed: int) -> np.ndarray:
         """Return the states (N, n) for a seed."""
+        return self.of([seed])[0]
+
+    def of(self, seeds: Sequence[int]) -> np.ndarray:
+        """Return the states (K, N, n) for some seeds."""
         if self.given is not None:
-            return self.given.copy()
+            return np.repeat(self.given[None], len(seeds), axis=0)
         leaders = list(self.graph.leaders)
         # Drawn for all agents and scaled afterwards, so that another spread keeps the directions,
         # and another choice of leaders the followers' draws.
-        deviations = self.spread * np.random.default_rng(seed).uniform(-1.0, 1.0, self.shape)
-        deviations[leaders] = 0.0
+        draws = [np.random.default_rng(seed).uniform(-1.0, 1.0, self.shape) for seed in seeds]
+        deviations = self.spread * np.reshape(draws, (len(seeds), *self.shape))
+        deviations[:, leaders] = 0.0
         states = self.goals + deviations
         _place(states, self.named, self.graph)
-        states[[agent for agent in leaders if agent in self.named]] += self.error
+        states[:, [agent for agent in leaders if agent in self.named]] += self.error
         return states
 
 
 def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:
-    """Put the given agents into their given states."""
+    """Put the given agents into their given states, in all of some starts (K, N, n)."""
     for agent, state in given.items():
         _check_agent(agent, graph)
-        states[agent] = _read_states(
-            state, states.shape[1:], f"the initial state of agent {agent} has", "(states,)"
+        states[:, agent] = _read_states(
+            state, states.shape[2:], f"the initial state of agent {agent} has", "(states,)"
         )
 
 

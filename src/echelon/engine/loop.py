@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.program import program
 from echelon.core.types import Array, Input, Inputs, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.drive import Problem
@@ -128,7 +129,7 @@ def _levels(graph: Graph) -> Array:
     return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
 
 
-@eqx.filter_jit
+@program
 def begin(loop: Loop, states: States) -> Moment:
     """Return the moment at which a run begins from states (N, n)."""
 
@@ -142,6 +143,13 @@ def begin(loop: Loop, states: States) -> Moment:
         follower_memory=remember(loop.follower, loop.followers),
         cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
     )
+
+
+def begin_forgetful(loop: Loop, states: Any) -> Moment:
+    """Return that moment for laws that remember nothing, without JAX: its calls cost many steps."""
+    cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
+    step: Any = np.zeros((), np.int32)
+    return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)
 
 
 # ---- one step ------------------------------------------------------------------------------------
@@ -199,7 +207,7 @@ def _disagreement(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array:
     return exchange(y, y, jax.vmap(loop.model.difference))
 
 
-@eqx.filter_jit
+@program
 def signals(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array | None:
     """Return what neighbours hear of the agents (N, s); None where it is their states."""
     x = jnp.asarray(now.states)
@@ -292,7 +300,7 @@ def step(loop: Loop, now: Moment, acted: Control) -> Moment:
 # ---- many steps ----------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
+@program
 def advance(
     loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
 ) -> tuple[Moment, tuple[Any, Any], Sums]:
@@ -321,7 +329,7 @@ def advance(
     return now, stored, sums
 
 
-@eqx.filter_jit
+@program
 def final_states(loop: Loop, starts: jax.Array, steps: int) -> jax.Array:
     """Return the states (S, N, n) after `steps` steps from each of the starts (S, N, n)."""
 

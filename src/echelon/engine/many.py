@@ -8,7 +8,6 @@ other.
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from typing import NamedTuple, TypeAlias, final
 from weakref import WeakKeyDictionary
 
@@ -31,11 +30,11 @@ from echelon.engine.motion import Motion
 from echelon.engine.native import NativeStepper, beyond
 from echelon.engine.parts import Parts
 from echelon.engine.prepare import Prepared, check_memory, prepare
-from echelon.engine.record import Recorder, Stretch
+from echelon.engine.record import Record, Recorder, Stretch, completed, inside_at_last
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
 from echelon.engine.simulate import result_of, sample_reference, simulate
-from echelon.engine.sums import Sums, on_host
+from echelon.engine.sums import ALWAYS, Sums, on_host
 
 Run: TypeAlias = tuple[Parts, Settings]
 Told: TypeAlias = Callable[[int, int], None]
@@ -94,30 +93,19 @@ class Fleet:
 
     def _families(self, runs: Sequence[Run]) -> list[list[_Job]]:
         """Return the runs that can be stepped together, family by family."""
-        families: dict[Hashable, list[_Job]] = {}
+        cases: dict[int, tuple[_Case, list[int]]] = {}
         for place, (parts, settings) in enumerate(runs):
             try:
-                job = self._job(place, parts, settings)
+                case = self._case(parts, settings)
             except EchelonError:
-                job = None  # `simulate` says it again
-            if job is not None:
-                families.setdefault(job.case.family, []).append(job)
-        found = (_accepted(jobs) for jobs in families.values())
-        return [jobs for jobs in found if jobs and _fit(jobs)]
-
-    def _job(self, place: int, parts: Parts, settings: Settings) -> _Job | None:
-        """Return a run as a job; None where no laws drive it."""
-        case = self._case(parts, settings)
-        if case.loop is None or settings.devices > 1:
-            return None
-        prepared, loop = case.prepared, case.loop
-        problem = prepared.problem._replace(settings=settings, states=case.starts(settings.seed))
-        if parts.world.disturbance is not None:
-            with precision("float64"):
-                motion = Motion.of(parts.model, parts.world, settings)
-            problem = problem._replace(motion=motion)
-            loop = eqx.tree_at(lambda x: x.motion, loop, motion)
-        return _Job(place, case, prepared._replace(problem=problem), loop)
+                continue  # `simulate` says it again
+            if case.loop is not None and settings.devices == 1:
+                cases.setdefault(id(case), (case, []))[1].append(place)
+        families: dict[Hashable, list[_Job]] = {}
+        for case, places in cases.values():
+            jobs = _jobs(case, places, [runs[place][1] for place in places])
+            families.setdefault(case.family, []).extend(jobs)
+        return [jobs for jobs in families.values() if jobs and _fit(jobs)]
 
     def _case(self, parts: Parts, settings: Settings) -> _Case:
         known, alike = self._cases.setdefault(parts, {}), settings._replace(seed=0)
@@ -154,13 +142,10 @@ class Fleet:
             except (SimulationError, TypeError):
                 # A model that wants its numbers as numbers is traced for each of them.
                 return {}
-        # Each by itself then goes on by JAX.
         seconds = (time.perf_counter() - began) / len(jobs)
-        return {
-            job.place: record.result(k, job.prepared, stepper, seconds)
-            for k, job in enumerate(jobs)
-            if not record.far[k]
-        }
+        made = record.results([job.prepared for job in jobs], stepper, seconds)
+        # Each by itself then goes on by JAX.
+        return {job.place: r for job, r, far in zip(jobs, made, record.far, strict=True) if not far}
 
 
 @final
@@ -171,7 +156,7 @@ class _Flock:
         self.count, self.grid, self.first, self.bits = count, grid, first, bits
         self.times, self._states = list[Array](), list[Array]()
         self._inputs, self._references = list[Array](), list[Array]()
-        nothing = on_host(first.problem.meter.nothing())
+        nothing = on_host(first.problem.meter.nothing(np))
         self.sums = Sums(*(np.stack([part] * count) for part in nothing))
         self.finite, self.far = np.ones(count, bool), np.zeros(count, bool)
 
@@ -208,34 +193,33 @@ class _Flock:
             self._references.append(reference[points - first][stored])
         return int(stored.sum())
 
-    @cached_property
-    def _whole(self) -> tuple[Array, Array, Array, Array | None]:
-        """Times, states and inputs of each run, and the reference."""
+    def results(
+        self, prepared: Sequence[Prepared], stepper: Stepper, seconds: float
+    ) -> Iterator[Result]:
+        """Yield the runs, each of which took so many seconds."""
         states, inputs = (
             np.ascontiguousarray(np.concatenate(parts).swapaxes(0, 1))
             for parts in (self._states, self._inputs)
         )
+        usual = self._usual(states, inputs)
         reference = np.concatenate(self._references) if self._references else None
-        return np.concatenate(self.times), states, inputs, reference
+        engine, warnings, times = stepper.engine, stepper.warnings, np.concatenate(self.times)
+        for k, (each, parts) in enumerate(zip(prepared, zip(*self.sums, strict=True), strict=True)):
+            frames, sums = (times, states[k], inputs[k], reference), Sums._make(parts)
+            whole = Stretch(0, self.grid.steps, *frames, sums, (), None, seconds)
+            record = completed(whole) if usual[k] else self._closed(each, whole)
+            yield result_of(each, record, engine, warnings)
 
-    def result(self, k: int, prepared: Prepared, stepper: Stepper, seconds: float) -> Result:
-        """Return one of the runs."""
-        times, states, inputs, reference = self._whole
-        stretch = Stretch(
-            first=0,
-            done=self.grid.steps,
-            times=times,
-            states=states[k],
-            inputs=inputs[k],
-            reference=reference,
-            sums=Sums(*(part[k] for part in self.sums)),
-            moment=(),
-            stopped=None,
-            seconds=seconds,
-        )
-        recorder = Recorder(prepared.problem, self.grid, stretch.sums, [stretch])
-        record = recorder.close(Outcome.INTERRUPTED)
-        return result_of(prepared, record, stepper.engine, stepper.warnings)
+    def _closed(self, prepared: Prepared, whole: Stretch) -> Record:
+        recorder = Recorder(prepared.problem, self.grid, whole.sums, [whole])
+        return recorder.close(Outcome.INTERRUPTED)
+
+    def _usual(self, states: Array, inputs: Array) -> Array:
+        """Return which runs (K,) end as most do: finite and in their chart."""
+        meter = self.first.problem.meter
+        inside = inside_at_last(meter, self.sums.inside, states[:, -1], self.grid.steps)
+        finite = [np.isfinite(part).all(axis=(1, 2, 3)) for part in (states, inputs)]
+        return np.all([*finite, (inside >= ALWAYS).all(axis=(1, 2))], axis=0)
 
 
 def _split(sums: Sums, count: int) -> Sums:
@@ -264,20 +248,29 @@ def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | Eche
         return error
 
 
-def _accepted(jobs: list[_Job]) -> list[_Job]:
-    """Return the runs whose starts the laws take; each case has numbers of its own."""
-    cases: dict[int, list[_Job]] = {}
-    for job in jobs:
-        cases.setdefault(id(job.case), []).append(job)
-    refused = set[int]()
-    for some in cases.values():
-        parts = some[0].prepared.parts
-        assert isinstance(parts.drive, Laws)
-        states = np.stack([job.prepared.problem.states for job in some])
-        with precision("float64"):
-            told = parts.drive.refusals(parts.model, parts.graph, states)
-        refused |= {some[k].place for k, _, _ in told}
-    return [job for job in jobs if job.place not in refused]
+def _jobs(case: _Case, places: Sequence[int], chosen: Sequence[Settings]) -> list[_Job]:
+    """Return the runs of a case whose starts the laws take."""
+    parts = case.prepared.parts
+    assert isinstance(parts.drive, Laws)
+    try:
+        states = case.starts.of([settings.seed for settings in chosen])
+    except EchelonError:
+        return []  # `simulate` says it again
+    with precision("float64"):
+        refused = {k for k, _, _ in parts.drive.refusals(parts.model, parts.graph, states)}
+        each = zip(places, chosen, states, strict=True)
+        return [_job(case, *its) for k, its in enumerate(each) if k not in refused]
+
+
+def _job(case: _Case, place: int, settings: Settings, states: Array) -> _Job:
+    prepared, loop = case.prepared, case.loop
+    assert loop is not None
+    problem = prepared.problem._replace(settings=settings, states=states)
+    if prepared.parts.world.disturbance is not None:
+        motion = Motion.of(problem.model, prepared.parts.world, settings)
+        problem = problem._replace(motion=motion)
+        loop = eqx.tree_at(lambda x: x.motion, loop, motion)
+    return _Job(place, case, prepared._replace(problem=problem), loop)
 
 
 def _fit(jobs: list[_Job]) -> bool:

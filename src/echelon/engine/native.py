@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.code import LANES, Kernels, Make, follows
+from echelon.engine.code import KERNELS, LANES, Make
 from echelon.engine.crew import Crew
 from echelon.engine.drive import Chunk, Stepper
-from echelon.engine.loop import Loop, Moment, begin, signals
+from echelon.engine.loop import Loop, Moment, begin, begin_forgetful, signals
 from echelon.engine.own import Own
 from echelon.engine.places import Formations, Places, Swarm, heard
 from echelon.engine.scalars import memories_of, signals_of
@@ -50,7 +50,7 @@ class NativeStepper(Stepper):
         far: what goes on where a state is beyond the range of the kernels' sines; None where the
             caller looks.
         pool: threads that step formations; None for the caller's alone.
-        make: makes the kernel, or has made it before.
+        make: makes the kernel, or has made it before; those of all runs when left out.
         unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
             weights of edges anyway; None where nothing is turned.
         threads: that share the steps of one formation; by its size when left out.
@@ -75,7 +75,6 @@ class NativeStepper(Stepper):
         """Write and compile the step."""
         self.own = Own(loops, unlike)
         self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
-        self.follows = follows(self.loop)
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
         known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
@@ -86,7 +85,7 @@ class NativeStepper(Stepper):
         self.leaders = (each + self.loop.leaders).reshape(-1)
         self.followers = (each + self.loop.followers).reshape(-1)
         lines, turned = self.places.lines, unlike is not None
-        made = (make or Kernels().of)(self.own, bits, together, lines, turned)
+        made = (make or KERNELS.of)(self.own, bits, together, lines, turned)
         self.code, self.rows, self.plan, self.common = made
         self._signaled = signals_of(self.loop)
         self._work = 1 + len(needed(self.plan.others.results()))
@@ -159,14 +158,13 @@ class NativeStepper(Stepper):
 
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
-        parts = np.split(np.asarray(self.states), len(self.loops))
-        # Where nothing is remembered all begin alike.
-        loops = self.loops if len(self.rows.memory) else self.loops[:1]
-        found = [begin(loop, jnp.asarray(x)) for loop, x in zip(loops, parts)]
-        found = [jax.tree.map(np.asarray, moment) for moment in found]
-        found *= len(self.loops) // len(found)
+        states = np.asarray(self.states, self.dtype)
+        if not len(self.rows.memory):
+            return begin_forgetful(self.loop, states)
+        each = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
+        found = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in each]
         many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(each[1:] for each in found))
-        return Moment(found[0].step, *many)._replace(states=np.asarray(self.states, self.dtype))
+        return Moment(found[0].step, *many)._replace(states=states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
@@ -182,7 +180,7 @@ class NativeStepper(Stepper):
     def turn(self, loop: Loop) -> None:
         """Go on in a loop of one formation that is like the one before, but for its numbers."""
         self.loop, self.loops = loop, [loop]
-        self.own.values = self.own.of(loop)[None]
+        self.own.turn(loop)
         self.heavy[:] = heard(loop, self.places)[2]
         # Offsets, numbers and the wind are written with a moment.
         self._held = None

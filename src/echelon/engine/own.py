@@ -3,6 +3,9 @@
 Or between one formation now and later, where somebody turns its knobs.
 """
 
+import dataclasses
+import hashlib
+import operator
 from collections.abc import Hashable, Sequence
 from typing import Any, final
 
@@ -13,6 +16,9 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
 
+_LARGE = 4096
+"""Bytes of an array of which a digest is remembered."""
+
 
 def _apart(loop: Loop) -> list[Any]:
     """Return the parts of a loop that have rows or draws of their own."""
@@ -21,7 +27,10 @@ def _apart(loop: Loop) -> list[Any]:
 
 def bare(loop: Loop) -> Loop:
     """Return a loop without what has rows or draws of its own."""
-    return eqx.tree_at(_apart, loop, [None] * 4, is_leaf=lambda x: x is None)
+    # By hand, since `tree_at` walks the whole loop several times.
+    meter = dataclasses.replace(loop.meter, offsets=None, spacings=None)
+    motion = dataclasses.replace(loop.motion, wind=None)
+    return dataclasses.replace(loop, offsets=None, meter=meter, motion=motion)
 
 
 def is_number(leaf: Any) -> bool:
@@ -46,19 +55,26 @@ class Own:
 
     def __init__(self, loops: Sequence[Loop], unlike: Loop | None = None) -> None:
         """Find the numbers that differ."""
-        self.loop = loops[0]
+        self._take(loops[0])
         # By identity: runs that differ in their starts alone share one loop.
         distinct = list({id(loop): loop for loop in loops}.values())
         places = {id(loop): k for k, loop in enumerate(distinct)}
         others = [] if unlike is None else [unlike]
-        flat = [jax.tree.leaves(bare(loop)) for loop in [*distinct, *others]]
+        flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in [*distinct[1:], *others])]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
-        values = np.stack([self.of(loop) for loop in distinct])
+        values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
+
+    def _take(self, loop: Loop) -> None:
+        self.loop = loop
+        self._flat, self._tree = jax.tree.flatten(bare(loop))
 
     def of(self, loop: Loop) -> Array:
         """Return the numbers (k,) of a loop that is like the others."""
-        pairs = zip(jax.tree.leaves(bare(loop)), self._masks, strict=True)
+        return self._values(jax.tree.leaves(bare(loop)))
+
+    def _values(self, leaves: Sequence[Any]) -> Array:
+        pairs = zip(leaves, self._masks, strict=True)
         found = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
         return np.concatenate([np.zeros(0), *found])
 
@@ -67,25 +83,38 @@ class Own:
         """How many numbers differ."""
         return self.values.shape[1]
 
+    def covers(self, loop: Loop) -> bool:
+        """Tell whether a loop is like the first but for these numbers."""
+        leaves, tree = jax.tree.flatten(bare(loop))
+        same = _forms(leaves, tree) == _forms(self._flat, self._tree)
+        return same and self._fixed(leaves) == self._fixed(self._flat)
+
+    def turn(self, loop: Loop) -> None:
+        """Take another loop that is like the first but for these numbers in its place."""
+        self._take(loop)
+        self.values = self._values(self._flat)[None]
+
     @property
     def signature(self) -> Hashable:
         """What decides the program, the same for other values; None where it cannot be told."""
-        leaves, tree = jax.tree.flatten(bare(self.loop))
-        fixed = (
-            (np.where(mask, 0.0, leaf).tobytes() if mask.any() else np.asarray(leaf).tobytes())
-            for leaf, mask in zip(leaves, self._masks, strict=True)
-        )
-        key = (tree, *fixed, *(mask.tobytes() for mask in self._masks))
+        key = (self._tree, *self._fixed(self._flat), *(mask.tobytes() for mask in self._masks))
         try:
             hash(key)
         except TypeError:
             return None
         return key
 
+    def _fixed(self, leaves: Sequence[Any]) -> list[bytes]:
+        """Return what says the leaves without the numbers that differ."""
+        return [
+            _said(np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf))
+            for leaf, mask in zip(leaves, self._masks, strict=True)
+        ]
+
     def leaves(self, entries: Array) -> list[Array]:
         """Return the leaves in which something differs, of these entries where it does."""
         found, at = list[Array](), 0
-        for leaf, mask in zip(jax.tree.leaves(bare(self.loop)), self._masks, strict=True):
+        for leaf, mask in zip(self._flat, self._masks, strict=True):
             if not mask.any():
                 continue
             filled = np.asarray(leaf, float).astype(object)
@@ -98,10 +127,24 @@ class Own:
         """Return the loop with these leaves in the place of those in which something differs."""
         if not leaves:
             return self.loop
-        given, (old, tree) = iter(leaves), jax.tree.flatten(bare(self.loop))
-        new = [next(given) if m.any() else leaf for leaf, m in zip(old, self._masks, strict=True)]
-        kept = [part for part in _apart(self.loop)]
-        return eqx.tree_at(_apart, tree.unflatten(new), kept, is_leaf=lambda x: x is None)
+        given, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
+        new = self._tree.unflatten([next(given) if m.any() else leaf for leaf, m in pairs])
+        return eqx.tree_at(_apart, new, _apart(self.loop), is_leaf=lambda x: x is None)
+
+
+def _said(array: Array) -> bytes:
+    """Return the bits of an array; of a large one, such as a graph's, a digest that is kept."""
+    return array.tobytes() if array.nbytes < _LARGE else hashlib.sha256(array.tobytes()).digest()
+
+
+def alike(loop: Loop, other: Loop) -> bool:
+    """Tell whether two loops are alike but for what stands in their leaves."""
+    return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
+
+
+def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
+    arrays = [np.asarray(leaf) for leaf in leaves]
+    return tree, [(array.dtype, array.shape) for array in arrays]
 
 
 def _differing(leaves: Sequence[Any]) -> Array:

@@ -9,7 +9,7 @@ from echelon.core.errors import Outcome
 from echelon.core.types import Array
 from echelon.engine.drive import Chunk, Problem, numbers
 from echelon.engine.grid import Grid
-from echelon.engine.sums import ALWAYS, Sums, outside
+from echelon.engine.sums import ALWAYS, Meter, Sums, outside
 
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
@@ -160,7 +160,8 @@ class Recorder:
 
     def _completed(self, whole: Stretch) -> tuple[Outcome, str]:
         """Return how a run ended that reached its horizon: whether all stayed in their chart."""
-        inside = self._inside(whole)
+        last, meter = whole.states[-1], self.problem.meter
+        inside = inside_at_last(meter, self.sums.inside, last, self.grid.steps)
         if not inside.size or inside.min() >= ALWAYS:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
         model = self.problem.model
@@ -174,12 +175,6 @@ class Recorder:
             f"and {high} {unit}".rstrip()
             + ", and what follows is not the agent's motion."
         )
-
-    def _inside(self, whole: Stretch) -> Array:
-        """Return `Sums.inside` with the moment at which the last step ends, where none begins."""
-        meter = self.problem.meter
-        last = outside(whole.states[-1][:, meter.charted], *meter.chart.T)
-        return np.minimum(self.sums.inside, np.where(last, self.grid.steps, ALWAYS))
 
     def _role(self, agent: int) -> str:
         return "Leader" if agent in self.problem.graph.leaders else "Follower"
@@ -198,6 +193,26 @@ class Recorder:
             reached = whole.done * self.problem.settings.dt
         said = whole.stopped or f"The run was {_VERBS[unfinished]}"
         return unfinished, f"{said} at t = {reached:.6g} s; what was computed is kept."
+
+
+def completed(whole: Stretch) -> Record:
+    """Return the record of a run that reached its horizon, finite and in its chart."""
+    ended = Outcome.COMPLETED, Outcome.COMPLETED.value
+    frames = whole.times, whole.states, whole.inputs, whole.reference
+    return Record(*frames, whole.sums, *ended, whole.seconds)
+
+
+def inside_at_last(meter: Meter, inside: Array, last: Array, steps: int) -> Array:
+    """Return `Sums.inside` (..., N, k) with the moment of the last step's end, which begins none.
+
+    Args:
+        meter: of the run.
+        inside: as it was counted at the beginning of each step.
+        last: the states (..., N, n) at the end.
+        steps: of the run.
+    """
+    beyond = outside(last[..., meter.charted], *meter.chart.T)
+    return np.minimum(inside, np.where(beyond, steps, ALWAYS))
 
 
 def join(stretches: Sequence[Stretch]) -> Stretch | None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TypeAlias, final
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from echelon.core.errors import Outcome, SimulationError
@@ -129,7 +129,7 @@ def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -
 def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Stretch]) -> Recorder:
     problem = prepared.problem
     grid = Grid(problem.settings, stepper.longest)
-    return Recorder(problem, grid, on_host(problem.meter.nothing()), before)
+    return Recorder(problem, grid, on_host(problem.meter.nothing(np)), before)
 
 
 def _result(
@@ -209,6 +209,6 @@ def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None
     """Return what the leaders follow from a step on, (steps, n) in float64."""
     with precision("float64"):
         # In float64: after three hours float32 has a millisecond between two times.
-        times = prepared.problem.settings.dt * jnp.arange(first, first + steps)
+        times = jax.device_put(prepared.problem.settings.dt * np.arange(first, first + steps))
         reference = prepared.parts.drive.reference_states(prepared.parts.model, times)
         return None if reference is None else np.asarray(reference, np.float64)

@@ -130,22 +130,22 @@ class Meter(eqx.Module):
             measured=measured,
         )
 
-    def nothing(self) -> Sums:
-        """Return the sums of no step."""
+    def nothing(self, xp: Any = jnp) -> Sums:
+        """Return the sums of no step, as arrays of JAX or of NumPy."""
         # The precision that is switched on now: float32 within a float32 run.
-        dtype = jnp.zeros(()).dtype
+        dtype = jax.dtypes.canonicalize_dtype(np.float64)
         agents, leaders, q = len(self.offsets), len(self.leaders), len(self.model.output_names)
         return Sums(
-            steps=jnp.zeros(2, jnp.int32),
-            errors=jnp.zeros((2, agents), dtype),
-            tracking=jnp.zeros((2, leaders), dtype),
-            outputs=jnp.zeros((leaders, q), dtype),
-            effort=jnp.zeros(agents, dtype),
-            spacing=jnp.zeros(len(self.edges), dtype),
-            limited=jnp.zeros(agents, jnp.int32),
-            unsettled=jnp.full(agents, -1, jnp.int32),
-            inside=jnp.full((agents, len(self.charted)), ALWAYS, jnp.int32),
-            chatter=jnp.zeros(agents, jnp.int32),
+            steps=xp.zeros(2, np.int32),
+            errors=xp.zeros((2, agents), dtype),
+            tracking=xp.zeros((2, leaders), dtype),
+            outputs=xp.zeros((leaders, q), dtype),
+            effort=xp.zeros(agents, dtype),
+            spacing=xp.zeros(len(self.edges), dtype),
+            limited=xp.zeros(agents, np.int32),
+            unsettled=xp.full(agents, -1, np.int32),
+            inside=xp.full((agents, len(self.charted)), ALWAYS, np.int32),
+            chatter=xp.zeros(agents, np.int32),
         )
 
     def read(

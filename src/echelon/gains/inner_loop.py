@@ -1,6 +1,5 @@
 """An inner loop that makes the paper's Assumption 5 hold, and the monotone P that comes with it."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +7,7 @@ import scipy.linalg
 
 from echelon.core.errors import GainError, listing
 from echelon.core.linear import Weight, riccati, symmetric_part
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.gains.gain import Feedback, Method
 from echelon.gains.weights import weights_of
@@ -100,7 +100,7 @@ def symmetric_states(model: ControlAffine) -> list[int]:
     return [k for k in range(len(base)) if slopes[k] == 0.0]
 
 
-@eqx.filter_jit
+@program
 def _sensitivity(model: ControlAffine, states: jax.Array) -> jax.Array:
     """Return for each state the largest derivative of f and g along it, (n,)."""
 

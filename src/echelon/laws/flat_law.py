@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import LawError, ModelError, listing
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State
 from echelon.laws.flat_loop import FlatLoop, Held
 from echelon.laws.law import Law, LocalView
@@ -302,7 +303,7 @@ def _charted(model: ControlAffine, name: str, value: float) -> bool:
     return low < value < high
 
 
-@eqx.filter_jit
+@program
 def _pushes(chains: Chains, model: ControlAffine, states: jax.Array, output: int) -> jax.Array:
     """Return how the first integrator before an input moves what it reaches of an output, (K,)."""
     order = chains.degrees[output] - max(chains.integrators)

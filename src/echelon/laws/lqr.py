@@ -14,11 +14,12 @@ import scipy.linalg
 
 from echelon.core.errors import LawError
 from echelon.core.linear import symmetric_part
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
-from echelon.references.flatness import follow_at
+from echelon.references.flatness import first_state, followed_states
 from echelon.references.guide import Guide
 from echelon.references.reference import check_kind_of, check_reference
 
@@ -74,11 +75,11 @@ class PathLQR(Law):
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""
-        return follow_at(model, self.reference, jnp.zeros(1))[0][0]
+        return first_state(model, self.reference)
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return x_r at each of `times`, (T, n)."""
-        return follow_at(model, self.reference, times)[0]
+        return followed_states(model, self.reference, times)
 
     def own_mode(self, model: ControlAffine) -> float | None:
         """Return the slowest rate (1/s, below 0) at which e'P e promises errors to shrink."""
@@ -170,7 +171,7 @@ def _decay(P: Array, W: Array) -> Array:
     return np.asarray(-0.5 * np.linalg.eigvalsh(root @ W @ root.swapaxes(1, 2)).min())
 
 
-@eqx.filter_jit
+@program
 def _slopes(
     model: ControlAffine, reference: Guide, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

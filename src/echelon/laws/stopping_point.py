@@ -29,7 +29,7 @@ from echelon.laws.flat_loop import Held
 from echelon.laws.law import Law, LocalView
 from echelon.models.model import ControlAffine, FlatBound
 from echelon.network.graph import Graph
-from echelon.references.flatness import follow_at
+from echelon.references.flatness import first_state, followed_states
 from echelon.references.guide import Guide
 from echelon.references.reference import Reference, check_reference
 
@@ -266,13 +266,13 @@ class StoppingLeader(FlatLaw):
         """Return the reference's state at time zero, or the trim."""
         if self.reference is None:
             return jnp.asarray(np.asarray(model.trim[0], float))
-        return follow_at(model, self.reference, jnp.zeros(1))[0][0]
+        return first_state(model, self.reference)
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
         """Return x_r at each of `times`, (T, n)."""
         if self.reference is None:
             return None
-        return follow_at(model, self.reference, times)[0]
+        return followed_states(model, self.reference, times)
 
     def own_mode(self, model: ControlAffine) -> float:
         """Return the slowest mode of the leader about its reference, 1/s."""

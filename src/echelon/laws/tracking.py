@@ -5,7 +5,6 @@ It serves the paper's Assumption 4.
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import LawError, ReferenceError
@@ -16,7 +15,7 @@ from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
 from echelon.network.spectrum import Spectrum
-from echelon.references.flatness import follow_at
+from echelon.references.flatness import first_state, follow_at, followed_states
 from echelon.references.guide import Guide
 from echelon.references.reference import check_kind_of, check_reference
 
@@ -57,7 +56,7 @@ class Tracking(Law):
             check_gain_fits(self, model, self.reaction.P.shape, self.reaction.R.shape)
         gain = tracking_gain(self, model, graph, self.gain)
         # Refused here, since a run would only say that the leader diverged at once.
-        begin = follow_at(model, self.reference, jnp.zeros(1))
+        begin = follow_at(model, self.reference, np.zeros(1))
         if not all(np.isfinite(part).all() for part in begin):
             raise ReferenceError(
                 f"the reference `{type(self.reference).__name__}` cannot be followed by "
@@ -75,11 +74,11 @@ class Tracking(Law):
 
     def start(self, model: ControlAffine) -> State:
         """Return the reference's state at time zero."""
-        return follow_at(model, self.reference, jnp.zeros(1))[0][0]
+        return first_state(model, self.reference)
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return x_r at each of `times`, (T, n)."""
-        return follow_at(model, self.reference, times)[0]
+        return followed_states(model, self.reference, times)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""

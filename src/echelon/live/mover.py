@@ -3,13 +3,13 @@
 import abc
 from typing import Any, NamedTuple, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import MissingExtraError
 from echelon.core.numerics import Precision, precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.loop import Loop, Moment, begin, control, step
 from echelon.engine.native import NativeStepper, beyond
@@ -95,7 +95,7 @@ class _Native(Mover):
 
     def _reference(self, now: Moment, count: int) -> Array | None:
         """Return what the meter measures leaders against, which nobody asks for here."""
-        if not self.stepper.follows:
+        if not self.stepper.plan.table:
             return None
         times = self.loop.motion.dt * (int(now.step) + jnp.arange(count + 1))
         return np.asarray(_followed(self.loop.leader, self.loop.model, times), np.float64)
@@ -104,7 +104,7 @@ class _Native(Mover):
         return beyond(states, 64)
 
 
-@eqx.filter_jit
+@program
 def _followed(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
     return leader.reference_states(model, times)
 
@@ -127,7 +127,7 @@ class _ByJax(Mover):
         return ~np.isfinite(states)
 
 
-@eqx.filter_jit
+@program
 def _advance(loop: Loop, now: Moment, count: Array) -> tuple[Moment, Any]:
     """Take steps, and return the moment with the inputs (N, m) there."""
 

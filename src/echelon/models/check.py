@@ -3,11 +3,12 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.kept import kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.trace import check_function, in_short
 from echelon.models.heading import check_heading
 from echelon.models.linearization import AtTrim, at_trim
@@ -37,8 +38,13 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     Raises:
         ModelError: the first fault found, as one sentence.
     """
+    return _warnings_of(model, _check_kind(model))
+
+
+@kept
+def _warnings_of(model: ControlAffine, name: str) -> tuple[str, ...]:
+    """Return the warnings of a model after all checks; once for a model."""
     with precision("float64"):
-        name = _check_kind(model)
         _check_names(model, name)
         x, u = _check_constants(model, name)
         _check_functions(model, name, x, u)
@@ -160,8 +166,7 @@ def _check_limit(model: ControlAffine, name: str, u: np.ndarray) -> None:
     width = np.where(np.isfinite(high - low), high - low, 1.0 + np.abs(G @ u))
     away = np.random.default_rng(0).normal(size=(len(_REACH), len(u)))
     away *= (_REACH / np.abs(away @ G.T / width).max(axis=1))[:, None]
-    for asked in u + away:
-        delivered = np.asarray(model.limit(jnp.asarray(asked)))
+    for asked, delivered in zip(u + away, limited(model, u + away), strict=True):
         rows, brought = G @ asked, G @ delivered
         allowed = ((low <= rows) & (rows <= high)).all()
         # NaN is within nothing, and an input that is allowed must come back to the bit.
@@ -213,7 +218,7 @@ def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarr
     for (what, function), shape in zip(
         (functions | {"limit": model.limit}).items(), shapes, strict=True
     ):
-        at = jnp.asarray(u if what == "limit" else x)
+        at = u if what == "limit" else x
         check_function(
             ModelError, f"`{what}` of `{name}`", function, at, shape=shape, advice=_ADVICE
         )
@@ -274,9 +279,19 @@ def trim_shortfall(model: ControlAffine, wanted: np.ndarray | None = None) -> di
     asked, delivered = np.asarray(model.trim[1], float), at_trim(model).delivered
     if wanted is not None and (wanted != asked).any():
         with precision("float64"):
-            asked, delivered = wanted, np.asarray(model.limit(jnp.asarray(wanted)))
+            asked, delivered = wanted, limited(model, wanted[None])[0]
     triples = zip(model.input_names, delivered.tolist(), asked.tolist(), strict=True)
     return {name: Shortfall(got, wanted) for name, got, wanted in triples if got != wanted}
+
+
+def limited(model: ControlAffine, asked: np.ndarray) -> np.ndarray:
+    """Return what the actuators deliver of each of some inputs (K, m)."""
+    return np.asarray(_limited(model, asked))
+
+
+@program
+def _limited(model: ControlAffine, asked: jax.Array) -> jax.Array:
+    return jax.vmap(model.limit)(asked)
 
 
 def is_limited(model: ControlAffine) -> bool:
@@ -287,9 +302,9 @@ def is_limited(model: ControlAffine) -> bool:
 def at_limits(model: ControlAffine, u: np.ndarray) -> tuple[str, ...]:
     """Return which normalized inputs cannot be changed by a little both ways about u (m,)."""
     moved = _LITTLE * np.asarray(model.input_scale, float).T
+    asked = np.concatenate([u + moved, u - moved])
     with precision("float64"):
-        asked = np.concatenate([u + moved, u - moved])
-        got = np.stack([np.asarray(model.limit(jnp.asarray(each))) for each in asked])
+        got = limited(model, asked)
     changed = (got != asked).any(axis=1).reshape(2, -1).any(axis=0)
     return tuple(n for n, cut in zip(model.input_names, changed, strict=True) if cut)
 

@@ -7,7 +7,6 @@ E turns the inputs. So what a law does about one heading it can do about all, in
 import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, Scalar, State
 
 if TYPE_CHECKING:
@@ -146,12 +146,12 @@ def heading_gap(model: "ControlAffine") -> float:
     x = trim + draw.uniform(-0.5, 0.5, (_SAMPLES, len(trim)))
     angles = draw.uniform(-np.pi, np.pi, _SAMPLES)
     with precision("float64"):
-        found = _gaps(model, jnp.asarray(x), jnp.asarray(angles))
+        found = _gaps(model, x, angles)
     gaps, sizes = map(np.asarray, found)
     return float((gaps / np.maximum(1.0, sizes)).max())
 
 
-@eqx.filter_jit
+@program
 def _gaps(model: "ControlAffine", x: jax.Array, angles: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the gap (S, n, 1 + m) at each sample, and the size of what it is of (n, 1 + m)."""
     D, E = state_turn(model), input_turn(model)

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State, States
 from echelon.models.model import ControlAffine
 from echelon.models.secants import Gap, Sides, sides, stencil
@@ -63,13 +63,13 @@ def at_trim(model: ControlAffine) -> AtTrim:
     x, u = (np.asarray(part, float) for part in model.trim)
     # Gains are kept in files, so they must not depend on the precision of the run that needs them.
     with precision("float64"):
-        found = _evaluate(model, jnp.asarray(x), jnp.asarray(u), jnp.asarray(stencil(x)))
+        found = _evaluate(model, x, u, stencil(x))
     *there, around = map(_freeze, found)
     said, seen = np.concatenate([there[3], there[4].reshape(-1, len(x))]), sides(x, around)
     return AtTrim(*there, bends=_bends(seen, u), gap=seen.gap(said))  # pyright: ignore
 
 
-@eqx.filter_jit
+@program
 def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[jax.Array]:
     functions = (model.drift, model.input_map, model.output)
     slopes = [jax.jacfwd(function)(x) for function in functions]

@@ -6,13 +6,12 @@ With it stands what the graph and the model make of the offsets: rigidity and sy
 from collections.abc import Iterable, Mapping, Sequence
 from typing import final
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, States
 from echelon.models.model import ControlAffine
 from echelon.network.graph import Graph
@@ -264,7 +263,7 @@ def _describe_change(
     base = np.asarray(model.trim[0], float)
     # Near the trim where nothing else is asked, so that no angle leaves its chart.
     states = base + np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, len(base)))
-    both = jnp.asarray(np.concatenate([states, states + offset]))
+    both = np.concatenate([states, states + offset])
     for name, (values, slopes) in _local(model, both).items():
         here, there = np.split(np.asarray(values), 2)
         # A change that happens to vanish at a state rarely vanishes with its slope.
@@ -279,7 +278,7 @@ def _describe_change(
     return None
 
 
-@eqx.filter_jit
+@program
 def _local(model: ControlAffine, states: States) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Return f and g at states (S, n), each with its Jacobian."""
     parts = {"drift": model.drift, "input map": model.input_map}

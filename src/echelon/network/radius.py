@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial.distance import pdist, squareform
 
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
@@ -43,6 +41,9 @@ def _advice(places: Array, radius: float) -> str:
     """
     if len(places) > _MOST:
         return ""
+    from scipy.sparse.csgraph import minimum_spanning_tree
+    from scipy.spatial.distance import pdist, squareform
+
     least = minimum_spanning_tree(squareform(pdist(places))).max()
     if least <= radius:
         return ""

@@ -21,7 +21,7 @@ from echelon.optimal.formation_plan import plan_formation
 from echelon.optimal.horizon import MPC, Answer, Course, Horizon
 from echelon.optimal.objectives import TrackingOptions, grid
 from echelon.references.demand import reference_warnings
-from echelon.references.flatness import follow_at, reference_targets
+from echelon.references.flatness import followed_states, reference_targets
 from echelon.references.guide import Guide
 from echelon.references.reference import check_kind_of
 
@@ -61,7 +61,7 @@ class _Optimized(Drive):
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
         """Return the reference's states (T, n); None without a reference."""
-        return None if self.reference is None else follow_at(model, self.reference, times)[0]
+        return None if self.reference is None else followed_states(model, self.reference, times)
 
 
 @final

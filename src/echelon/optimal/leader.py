@@ -22,7 +22,7 @@ from echelon.network.graph import Graph
 from echelon.optimal.formation_plan import plan_tracking
 from echelon.optimal.objectives import TrackingOptions, grid
 from echelon.references.demand import reference_warnings
-from echelon.references.flatness import follow_at, reference_targets
+from echelon.references.flatness import followed_states, reference_targets
 from echelon.references.guide import Guide
 
 _STEP = 0.005
@@ -136,7 +136,7 @@ class OptimalTracking(Law):
 
     def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
         """Return the reference's states (T, n), which the plan comes close to."""
-        return follow_at(model, self.reference, times)[0]
+        return followed_states(model, self.reference, times)
 
     def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
         """Return the leader's input."""

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
@@ -202,7 +201,10 @@ def _behind(roots: Array, m: Array, times: Array) -> Array:
     steps = np.maximum(np.diff(whole), 0.0)
     # m falls, so in a cell of both times it is at most what it was at the earlier one.
     earlier = np.concatenate([m[:1], m[:-2]])
-    return scipy.signal.fftconvolve(steps, earlier)[: len(steps)] * (1.0 + _SLACK)
+    # As many zeros as numbers, so that no end comes round to the other.
+    size = 2 ** (2 * len(steps) - 1).bit_length()
+    both = np.fft.rfft(steps, size) * np.fft.rfft(earlier, size)
+    return np.fft.irfft(both, size)[: len(steps)] * (1.0 + _SLACK)
 
 
 def _left(roots: Array, starts: Array, times: Array) -> Array:

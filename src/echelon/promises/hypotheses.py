@@ -6,14 +6,13 @@ left of one, or why.
 
 from collections.abc import Iterator, Sequence
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.jacobians import offsets_are_symmetries
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Verdict
 from echelon.engine.drive import Drive
@@ -66,11 +65,11 @@ def _trim_applied(case: Case) -> Statement:
 def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:
     """Return the drift at the goals about the trim, (N, n), with the law's inner loop if any."""
     with precision("float64"):
-        goals = jnp.asarray(np.asarray(model.trim[0], float) + offsets)
+        goals = np.asarray(model.trim[0], float) + offsets
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 
-@eqx.filter_jit
+@program
 def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)

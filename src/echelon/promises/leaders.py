@@ -2,11 +2,11 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.program import program
 from echelon.core.types import Array, States
 from echelon.engine.parts import Parts
 from echelon.engine.settings import Settings
@@ -132,6 +132,6 @@ def excursion(parts: Parts, paths: Array) -> Array:
     return np.abs(np.asarray(_differences(parts.model, states, trim))).max(axis=0)
 
 
-@eqx.filter_jit
+@program
 def _differences(model: ControlAffine, states: States, base: jax.Array) -> jax.Array:
     return jax.vmap(lambda x: model.difference(x, base))(states)

@@ -7,13 +7,13 @@ for as long as it is the nearest sample, is a sign and no proof.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.core import linear
 from echelon.core.linear import exponential, held_radius, held_step
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.engine.laws import Laws
@@ -246,7 +246,7 @@ def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
     # Rows of one number, so that every path and every swarm is compiled once.
     full = (np.concatenate([part, np.repeat(part[-1:], more, axis=0)]) for part in rows)
     law = without_certificates(parts.drive.follower)
-    found = _about(parts.model, law, *map(jnp.asarray, [*full][:4]))
+    found = _about(parts.model, law, *[*full][:4])
     A, B, alone, felt = (np.asarray(part)[:count] for part in found)
     if rows.rates.any():
         # In axes that turn, delta turns the other way by itself.
@@ -256,7 +256,7 @@ def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
     return Slopes(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
 
 
-@eqx.filter_jit
+@program
 def _about(
     model: ControlAffine, law: Law, t: jax.Array, x: States, v: jax.Array, y: States
 ) -> tuple[jax.Array, ...]:

@@ -9,7 +9,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, cast, final
+from typing import Any, TypeAlias, cast, final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -246,40 +246,47 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    known = _kept.setdefault(parts, {})
-    if settings not in known:
-        prepared = prepare(parts, settings)
-        with precision("float64"):
-            known[settings] = _compute(prepared, settings)
-        # A result holds the prepared parts, and asks again.
-        _kept.setdefault(prepared.parts, {})[settings] = known[settings]
-    return known[settings]
+    known = _kept.get(parts, {}).get(settings)
+    return known or _made(prepare(parts, settings), parts, settings)
 
 
-def promises(parts: Parts, settings: Sequence[Settings]) -> Iterator[Promise | EchelonError]:
-    """Yield what is promised of parts under settings that differ in the seed alone.
+def _made(prepared: Prepared, parts: Parts, settings: Settings, briefly: bool = False) -> Promise:
+    """Return what is promised of parts, and keep it if it is all of it."""
+    with precision("float64"):
+        found = _compute(prepared, settings, briefly)
+    # A result holds the prepared parts, and asks again.
+    for each in (parts, prepared.parts) if found.hold is None or not briefly else ():
+        _kept.setdefault(each, {})[settings] = found
+    return found
 
-    Each is what `promise` returns, or raises; what no seed changes is computed once.
+
+_Each: TypeAlias = Iterator[Promise | EchelonError]
+
+
+def promises(parts: Parts, settings: Sequence[Settings], briefly: bool = False) -> _Each:
+    """Yield what `promise` returns, or raises, under settings that differ in the seed alone.
+
+    What no seed changes is computed once; `briefly` leaves out arrival and motors (T5).
     """
     for k, each in enumerate(settings):
         try:
-            found = _first(parts, each)
+            found = _first(parts, each, briefly)
         except EchelonError as error:
             # Others may start where the laws have a meaning.
             yield error
             continue
-        yield from _alike(settings[k:], *found)
+        yield from _alike(settings[k:], *found, briefly)
         return
 
 
-def _first(parts: Parts, settings: Settings) -> tuple[Promise, Prepared]:
+def _first(parts: Parts, settings: Settings, briefly: bool) -> tuple[Promise, Prepared]:
     """Return what is promised under any such settings, and the parts under these."""
     prepared, alike = prepare(parts, settings), settings._replace(seed=0)
-    known = (s for s in _kept.get(parts, {}) if s._replace(seed=0) == alike)
-    return promise(parts, next(known, settings)), prepared
+    known = (p for s, p in _kept.get(parts, {}).items() if s._replace(seed=0) == alike)
+    return next(known, None) or _made(prepared, parts, settings, briefly), prepared
 
 
-def _each(prepared: Prepared, settings: Sequence[Settings]) -> Iterator[Promise | EchelonError]:
+def _each(prepared: Prepared, settings: Sequence[Settings], briefly: bool) -> _Each:
     """Yield what is promised of starts of which each is looked at by itself."""
     starts = Starts(prepared.parts)
     for each in settings:
@@ -287,19 +294,20 @@ def _each(prepared: Prepared, settings: Sequence[Settings]) -> Iterator[Promise 
         try:
             with precision("float64"):
                 prepared.parts.drive.accept(problem)
-                found: Promise | EchelonError = _compute(prepared._replace(problem=problem), each)
+                started = prepared._replace(problem=problem)
+                found: Promise | EchelonError = _compute(started, each, briefly)
         except EchelonError as error:
             found = error
         yield found
 
 
 def _alike(
-    settings: Sequence[Settings], first: Promise, prepared: Prepared
-) -> Iterator[Promise | EchelonError]:
+    settings: Sequence[Settings], first: Promise, prepared: Prepared, briefly: bool
+) -> _Each:
     """Yield the promises where the first is accepted."""
     if first.hold is not None or _asks_where(prepared.parts, first.loop) and first.frozen is None:
         # A tube is of where agents start; or nobody leaves the trim, and a seed may be what does.
-        yield from _each(prepared, settings)
+        yield from _each(prepared, settings, briefly)
         return
     with precision("float64"):
         states = np.stack(list(map(Starts(prepared.parts), (each.seed for each in settings))))
@@ -342,12 +350,12 @@ def _asks_where(parts: Parts, loop: Loop) -> bool:
     return loop.every and parts.drive.metric(parts.model) is not None
 
 
-def _compute(prepared: Prepared, settings: Settings) -> Promise:
+def _compute(prepared: Prepared, settings: Settings, briefly: bool = False) -> Promise:
     parts, states = prepared.parts, prepared.problem.states
     leaders, loop = leaders_of(parts, states), loop_of(parts)
     run = stopping_of(parts, settings, states)
     if run is not None:
-        return _anywhere(run, Case(parts, settings, loop, leaders, None, None, None))
+        return _anywhere(run, Case(parts, settings, loop, leaders, None, None, None), briefly)
     region = region_of(parts, leaders)
     case = Case(
         parts,
@@ -379,9 +387,9 @@ def _compute(prepared: Prepared, settings: Settings) -> Promise:
     )
 
 
-def _anywhere(run: Stopping, case: Case) -> Promise:
+def _anywhere(run: Stopping, case: Case, briefly: bool) -> Promise:
     """Return what is promised under the law `stopping-point`."""
-    found, drifts = tube_of(run), drift_reason(run)
+    found, drifts = tube_of(run, briefly), drift_reason(run)
     lines = [*agent_lines(case), *condition_lines(run), *found.lines]
     lines += [drifts] if drifts is not None else []
     kept = MappingProxyType({cast(Hypothesis, x.statement): x for x in lines})

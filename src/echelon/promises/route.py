@@ -2,11 +2,10 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.program import program
 from echelon.core.types import Array, Input, State, States
 from echelon.engine.laws import Laws
 from echelon.engine.parts import Parts
@@ -71,8 +70,7 @@ class Route(NamedTuple):
             return Rows(still, np.tile(self.trim, (count, 1)), sent, states, still)
         first = Rows(*(np.repeat(part[:1], count, axis=0) for part in self.rows))
         away = np.repeat(self.headings[:1], count)
-        seen = jnp.asarray(states)
-        seen = _turned_back(model, seen, jnp.asarray(away)) if away.any() else seen
+        seen = _turned_back(model, states, away) if away.any() else states
         return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
@@ -80,11 +78,11 @@ def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> Route:
     """Return where the leader goes: its reference, or by itself where its input rests."""
     model, times = parts.model, np.linspace(0.0, settings.horizon, MOMENTS)
     trim, m = np.asarray(model.trim[0], float), len(model.input_names)
-    twice = jnp.asarray(np.concatenate([times, times + _SHORT]))
+    twice = jax.device_put(np.concatenate([times, times + _SHORT]))
     wanted = parts.drive.reference_states(model, twice)
     if wanted is not None:
-        v = np.asarray(_inputs(model, wanted[:MOMENTS], wanted[MOMENTS:]))
-        states = np.asarray(wanted[:MOMENTS])
+        states, soon = np.split(np.asarray(wanted), 2)
+        v = _inputs(model, states, soon)
         known = np.isfinite(states).all(axis=1) & np.isfinite(v).all(axis=1)
         return _seen(parts, times[known], states[known], v[known])
     own = None
@@ -104,18 +102,18 @@ def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> Route:
     if not (parts.drive.follower.turning and len(times)):
         return path
     away = states[:, heading_index(model)] - rest_heading(model)
-    found = _in_heading(model, *map(jnp.asarray, (states, inputs, away)))
+    found = _in_heading(model, states, inputs, away)
     back, sent, rates = map(np.asarray, found)
     return path._replace(states=back, inputs=sent, headings=away, rates=rates)
 
 
-@eqx.filter_jit
+@program
 def _turned_back(model: ControlAffine, states: States, angles: jax.Array) -> States:
     """Return states (K, n) in axes that are turned by angles (K,)."""
     return jax.vmap(lambda x, angle: turned(model, x, -angle))(states, angles)
 
 
-@eqx.filter_jit
+@program
 def _in_heading(
     model: ControlAffine, states: States, inputs: jax.Array, angles: jax.Array
 ) -> tuple[States, jax.Array, jax.Array]:
@@ -128,12 +126,21 @@ def _in_heading(
     return _turned_back(model, states, angles), sent, jax.vmap(rate)(states, inputs)
 
 
-@eqx.filter_jit
-def _inputs(model: ControlAffine, now: States, soon: States) -> jax.Array:
+def _inputs(model: ControlAffine, now: Array, soon: Array) -> Array:
     """Return the normalized inputs that take agents from states to others _SHORT later."""
+    found, maps = map(np.asarray, _pushes(model, now, soon))
+    known = np.isfinite(found).all(axis=1) & np.isfinite(maps).all(axis=(1, 2))
+    inputs = np.full((len(maps), maps.shape[2]), np.nan)
+    inputs[known] = np.einsum("kmn,kn->km", np.linalg.pinv(maps[known]), found[known])
+    return inputs
 
-    def one(x: State, later: State) -> Input:
+
+@program
+def _pushes(model: ControlAffine, now: States, soon: States) -> tuple[States, jax.Array]:
+    """Return what inputs add to the drift there (K, n), and their maps (K, n, m)."""
+
+    def one(x: State, later: State) -> tuple[State, jax.Array]:
         moved = model.difference(later, x) / _SHORT - model.normalized_drift(x)
-        return jnp.linalg.lstsq(model.normalized_input_map(x), moved)[0]
+        return moved, model.normalized_input_map(x)
 
     return jax.vmap(one)(now, soon)

@@ -3,14 +3,15 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
 from echelon.certificates.responses import Chain
+from echelon.core.kept import kept
 from echelon.core.linear import held_radius
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Verdict
 from echelon.engine.laws import Laws
@@ -128,10 +129,18 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | N
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
-    return Stopping(parts, settings, states, flat, np.asarray(drive.leader.begins(parts.model)))
+    return Stopping(parts, settings, states, flat, _begun(drive.leader, parts.model))
 
 
-@eqx.filter_jit
+@kept
+def _begun(leader: StoppingLeader, model: ControlAffine) -> Array:
+    """Return where the leader's path begins, as `begins` does, read-only."""
+    found = np.array(leader.begins(model))
+    found.setflags(write=False)
+    return found
+
+
+@program
 def _flat(
     model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
 ) -> jax.Array:
@@ -302,7 +311,7 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     return Statement(Hypothesis.EXACT, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text)
 
 
-@eqx.filter_jit
+@program
 def _pushed(
     model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -32,10 +32,11 @@ class Tube(NamedTuple):
         left: how far the nearest agent stays from the border of the chart, at least, in the unit of
             the bounded derivative; infinite where there is no border.
         steepest: how far the bounded output's speed may be off the leader's at the start.
-        arrival: when all are within 1 cm, if it can be told.
+        arrival: when all are within 1 cm, if it can be told and was asked for.
         who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
-        strain: what the motors give; None where they have no limits, or may not suffice.
+        strain: what the motors give; None where they have no limits, or may not suffice, or were
+            not asked for.
         graphs: which graphs are meant, and this one, in words.
     """
 
@@ -93,8 +94,12 @@ class _Found(NamedTuple):
     lines: tuple[Statement, ...]
 
 
-def tube_of(run: Stopping) -> _Found:
-    """Return what T5 promises, and its lines: the inner gains, the set, and the starts."""
+def tube_of(run: Stopping, briefly: bool = False) -> _Found:
+    """Return what T5 promises, and its lines: the inner gains, the set, and the starts.
+
+    And when agents arrive and what motors give, which is most of the work and on which nothing else
+    rests, unless it is to be said `briefly`.
+    """
     model, chains = run.parts.model, run.law.ready.chains
     longest = int(np.argmax(chains.degrees))
     try:
@@ -120,12 +125,14 @@ def tube_of(run: Stopping) -> _Found:
     if any(line.fails for line in lines):
         return _Found(None, tuple(lines))
     who = _who(run, borders)
-    arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
     far = math.inf if not borders else float(left)
     told = tuple(border.told for border in borders)
+    tube = Tube(kind, run.rate, gains, far, steepest, None, who, told, None, _graphs(run))
+    if briefly:
+        return _Found(tube, tuple(lines))
+    arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
     strain, line = strain_of(run)
-    tube = Tube(kind, run.rate, gains, far, steepest, arrival, who, told, strain)
-    return _Found(tube._replace(graphs=_graphs(run)), (*lines, line))
+    return _Found(tube._replace(arrival=arrival, strain=strain), (*lines, line))
 
 
 def _graphs(run: Stopping) -> tuple[str, str]:

@@ -7,12 +7,12 @@ leaves delta' = (A - w G - c lambda B R^-1 B'P) delta, with A and B taken there:
 
 from collections.abc import Iterator
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.lmi import rate_of
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
 from echelon.engine.laws import Laws
@@ -118,7 +118,7 @@ def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None
     return None
 
 
-@eqx.filter_jit
+@program
 def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return how a state and a normalized input z (n + m,) move in turning axes, with the slope."""
     n, spin = len(model.state_names), jnp.asarray(state_turn(model).slope)
@@ -131,7 +131,7 @@ def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Arra
     return left(z), jax.jacfwd(left)(z)
 
 
-@eqx.filter_jit
+@program
 def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the slopes of the motion at a state and a normalized input, A (n, n) and B (n, m)."""
 

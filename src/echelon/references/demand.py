@@ -5,13 +5,12 @@ And whether it is a motion of the model at all.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.kept import kept
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.models.model import ControlAffine
 from echelon.references.flatness import follow_at
@@ -64,15 +63,14 @@ def asked(model: ControlAffine, reference: Guide, horizon: float, samples: int =
     near = min(_NEAR, 1e-2 * horizon)
     times = np.linspace(near, horizon - near, samples)
     with precision("float64"):
-        around = jnp.asarray(np.concatenate([times - near, times, times + near]))
-        x, u = follow_at(model, reference, around)
+        x, u = follow_at(model, reference, np.concatenate([times - near, times, times + near]))
         before, now, after = x.reshape(3, samples, -1)
         inputs = u.reshape(3, samples, -1)[1]
         rate = np.asarray(_rate(model, before, now, after, near))
         wanted = np.asarray(_velocities(model, now, inputs))
-    ratios = demand(model, np.asarray(inputs))
+    ratios = demand(model, inputs)
     k = int(np.argmax(ratios))
-    speed, acceleration = _motion(model, np.asarray(x).reshape(3, samples, -1), near)
+    speed, acceleration = _motion(model, x.reshape(3, samples, -1), near)
     root = np.sqrt(np.asarray(model.weights[0], float))
     away = root * np.abs(rate - wanted)
     j, i = np.unravel_index(int(away.argmax()), away.shape)
@@ -82,7 +80,7 @@ def asked(model: ControlAffine, reference: Guide, horizon: float, samples: int =
         acceleration,
         float(ratios[k]),
         float(times[k]),
-        np.asarray(inputs)[k],
+        inputs[k],
         float(away[j, i]) / max(fastest, np.finfo(float).tiny),
         (int(i), float(np.abs(rate - wanted)[j, i]), float(times[j])),
     )
@@ -136,7 +134,7 @@ def flat_inputs(model: ControlAffine, reference: Guide, times: Array) -> Array:
     """Return the inputs (T, m) that follow a reference exactly, by the model's flatness map."""
     # Up to four nested derivatives of a path leave float32 too few digits to judge limits by.
     with precision("float64"):
-        return np.asarray(follow_at(model, reference, jnp.asarray(times))[1])
+        return np.asarray(follow_at(model, reference, times)[1])
 
 
 def demand(model: ControlAffine, inputs: Array) -> Array:
@@ -156,7 +154,7 @@ def demand(model: ControlAffine, inputs: Array) -> Array:
         return np.where(moved == 0.0, 0.0, np.abs(moved) / np.maximum(room, 0.0)).max(axis=1)
 
 
-@eqx.filter_jit
+@program
 def _rate(
     model: ControlAffine, before: jax.Array, now: jax.Array, after: jax.Array, near: float
 ) -> jax.Array:
@@ -166,7 +164,7 @@ def _rate(
     )
 
 
-@eqx.filter_jit
+@program
 def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> jax.Array:
     return jax.vmap(model.velocity)(states, inputs)
 

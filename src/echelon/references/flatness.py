@@ -1,36 +1,49 @@
 """The states and inputs of a model that follow a reference."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from echelon.core.errors import LawError, PlanError
 from echelon.core.numerics import precision
-from echelon.core.types import Array
+from echelon.core.program import program
+from echelon.core.types import Array, State
 from echelon.models.model import ControlAffine
 from echelon.references.guide import Guide
 from echelon.references.reference import check_reference
 
-_FEW = 512
-"""Of so many times or fewer all are followed by one program, since compiling is what costs."""
+_FEW, _MANY = 512, 4096
+"""Up to so many times are followed by one program, some at once: compiling is what costs."""
 
 
-def follow_at(
-    model: ControlAffine, reference: Guide, times: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def follow_at(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> tuple[Any, Any]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
+    if isinstance(times, Tracer) or len(times) > _MANY:
+        return _follow_all(model, reference, times)
     count = len(times)
-    padded = jnp.pad(times, (0, max(0, _FEW - count)), mode="edge")
-    x, u = _follow_all(model, reference, padded)
-    return x[:count], u[:count]
+    padded = np.pad(np.asarray(times), (0, -count % _FEW), mode="edge")
+    found = [_follow_all(model, reference, few) for few in np.split(padded, len(padded) // _FEW)]
+    x, u = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    return x, u
 
 
-@eqx.filter_jit
+def followed_states(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> jax.Array:
+    """Return the states (T, n) that follow a reference exactly at times (T,)."""
+    # As laws return them, and without a program of its own as `asarray` has.
+    return jax.device_put(follow_at(model, reference, times)[0])
+
+
+def first_state(model: ControlAffine, reference: Guide) -> State:
+    """Return the state (n,) that follows a reference at time zero."""
+    return jax.device_put(follow_at(model, reference, np.zeros(1))[0][0])
+
+
+@program
 def _follow_all(
-    model: ControlAffine, reference: Guide, times: jax.Array
+    model: ControlAffine, reference: Guide, times: Array | jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     return jax.vmap(lambda t: reference.follow(model, t))(times)
 
@@ -63,7 +76,7 @@ def reference_targets(model: ControlAffine, reference: Guide | None, times: Arra
     except LawError as error:
         raise PlanError(str(error)) from None
     with precision("float64"):
-        x, u = map(np.asarray, follow_at(model, reference, jnp.asarray(times)))
+        x, u = follow_at(model, reference, times)
     if not (np.isfinite(x).all() and np.isfinite(u).all()):
         raise PlanError(
             f"the reference `{type(reference).__name__}` cannot be followed by "
@@ -91,6 +104,6 @@ def _targets(model: ControlAffine, x: Array, v: Array) -> Targets:
     return Targets(x, outputs, v)
 
 
-@eqx.filter_jit
+@program
 def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
     return jax.vmap(model.output)(states)

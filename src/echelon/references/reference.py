@@ -60,7 +60,7 @@ class Reference(Guide):
                 ReferenceError,
                 f"the point of `{type(self).__name__}`",
                 self,
-                jnp.zeros(()),
+                np.zeros(()),
                 shape=(len(COORDINATES),),
                 advice="it must be written with `jax.numpy` and take one time",
             )
@@ -103,6 +103,7 @@ def _turns(reference: Reference, place: int, rest: float) -> bool:
     return bool((hull.vertices != rest).any() or hull.error.any())
 
 
+@kept
 def _check_map(model: ControlAffine) -> None:
     """Trace the flatness map, and check the state and the input that it returns."""
     name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
@@ -111,7 +112,7 @@ def _check_map(model: ControlAffine) -> None:
             LawError,
             f"`flat` of `{name}`",
             model.flat,
-            jnp.zeros((model.flat_order + 1, len(model.flat_outputs))),
+            np.zeros((model.flat_order + 1, len(model.flat_outputs))),
             advice="it must be written with `jax.numpy` and take the outputs' derivatives",
         ).result
     if not isinstance(found, tuple | list) or len(found) != 2:

@@ -15,6 +15,7 @@ from echelon.engine.result import Result
 from echelon.models.model import ControlAffine
 from echelon.promises.promise import promise
 from echelon.results.foreseen import heard_in
+from echelon.results.labelled import Labelled
 from echelon.results.lyapunov import lyapunov
 from echelon.results.metrics import (
     EdgeMetrics,
@@ -48,8 +49,11 @@ def dataset(result: Result) -> "xr.Dataset":
     `limit_low` <= `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format`
     the number of this list.
     """
-    import xarray as xr
+    return labelled(result).dataset()
 
+
+def labelled(result: Result) -> Labelled:
+    """Return what `dataset` is made of."""
     model, per_agent = result.model, ("time", "agent", "state")
     variables: dict[str, Any] = {
         "states": (per_agent, result.states),
@@ -79,7 +83,7 @@ def dataset(result: Result) -> "xr.Dataset":
         "output": list(model.output_names),
         "output_unit": ("output", _output_units(model)),
     }
-    return xr.Dataset(variables, coordinates, _attributes(result))
+    return Labelled(variables, coordinates, _attributes(result))
 
 
 def _edges(result: Result) -> dict[str, Any]:
@@ -183,15 +187,18 @@ def _attributes(result: Result) -> dict[str, Any]:
     }
 
 
-def save_dataset(run: "Result | xr.Dataset", path: Path) -> None:
+def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
     """Write the dataset of a run as netCDF, whole or not at all.
 
     Raises:
         OSError: it cannot be written.
     """
     # In memory first: on a disk that is full the library under it ends the whole process.
-    data = dataset(run) if isinstance(run, Result) else run
-    write_whole(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
+    data = labelled(run) if isinstance(run, Result) else run
+    if isinstance(data, Labelled):
+        write_whole(path, data.netcdf())
+    else:
+        write_whole(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:

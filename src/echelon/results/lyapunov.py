@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.drive import Drive
 from echelon.engine.motion import Motion
@@ -75,8 +75,8 @@ def lyapunov(result: Result) -> Lyapunov | None:
     if P is None or not len(result.times) or not goes_both_ways(graph):
         return None
     with precision("float64"), np.errstate(over="ignore", invalid="ignore"):
-        x, u = jnp.asarray(result.states), jnp.asarray(result.inputs)
-        steps = jnp.asarray(np.rint(result.times / result.settings.dt).astype(np.int32))
+        x, u = result.states, result.inputs
+        steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
         now, after = (
             _seen(result.model, each, np.asarray(each.states) - offsets) for each in fields
@@ -108,10 +108,10 @@ _Difference: TypeAlias = Callable[[Array, Array], Array]
 
 def _difference(model: ControlAffine) -> _Difference:
     """Return the difference of states (T, E, n) that the laws take: angles may wind."""
-    return lambda x, y: np.asarray(_differences(model, jnp.asarray(x), jnp.asarray(y)))
+    return lambda x, y: np.asarray(_differences(model, x, y))
 
 
-@eqx.filter_jit
+@program
 def _differences(model: ControlAffine, x: jax.Array, y: jax.Array) -> jax.Array:
     return jax.vmap(jax.vmap(model.difference))(x, y)
 
@@ -149,7 +149,7 @@ class _Fields(NamedTuple):
     rates: jax.Array | None
 
 
-@eqx.filter_jit
+@program
 def _fields(
     drive: Drive,
     model: ControlAffine,
@@ -202,7 +202,7 @@ def _seen(model: ControlAffine, fields: _Fields, y: Array) -> tuple[Array, Array
     return y, f - turning, xdot - turning
 
 
-@eqx.filter_jit
+@program
 def _turned_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> jax.Array:
     """Return values (T, N, n) in axes that are turned by angles (T,)."""
     return jax.vmap(jax.vmap(state_turn(model), (0, None)))(values, -angles)

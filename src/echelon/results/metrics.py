@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
+from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.result import Result, finite_or_none
 from echelon.engine.sums import SETTLED, output_error
@@ -127,12 +126,10 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
     leader = result.graph.leaders[0] if leader is None else leader
     wanted = result.reference + result.formation.offsets[leader]
     with precision("float64"):
-        return np.asarray(
-            _output_errors(result.model, jnp.asarray(result.states[:, leader]), jnp.asarray(wanted))
-        )
+        return np.asarray(_output_errors(result.model, result.states[:, leader], wanted))
 
 
-@eqx.filter_jit
+@program
 def _output_errors(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
     return jax.vmap(lambda x, wanted: output_error(model, x, wanted))(x, wanted)
 

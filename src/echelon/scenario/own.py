@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+from echelon.core import store
 from echelon.core.errors import EchelonError, ScenarioError, did_you_mean, listing
 from echelon.core.trace import in_short
 
@@ -56,6 +57,8 @@ def _imported(file: Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     # Before it runs, as `import` does: dataclasses look up their own module there.
     sys.modules[spec.name] = module
+    # It may change anything, and what it makes is not known by its text.
+    store.close()
     with own_code(f"the file `{file}` does not import"):
         spec.loader.exec_module(module)
     return module

@@ -1,12 +1,12 @@
 """How much the inputs themselves stretch distances, and so which theorem is to be had."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.certificates.domain import Domain
 from echelon.certificates.jacobians import has_constant_input_map
+from echelon.core.program import program
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Verdict
 from echelon.engine.parts import Parts
@@ -56,7 +56,7 @@ def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[fl
     return 0.5 * float(np.abs(values).max()), Kind.SAMPLES
 
 
-@eqx.filter_jit
+@program
 def _input_slopes(model: ControlAffine, states: States) -> jax.Array:
     """Return the derivatives of g S, (S, n, m, n)."""
     return jax.vmap(jax.jacfwd(model.normalized_input_map))(states)

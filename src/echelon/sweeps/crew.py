@@ -94,4 +94,5 @@ def _promised(built: Sequence[Built]) -> Iterator[Promise | EchelonError]:
     """Yield what is promised of runs, of which neighbours often differ in the seed alone."""
     for _, alike in groupby(built, key=lambda each: id(each.parts)):
         runs = list(alike)
-        yield from promises(runs[0].parts, [each.settings for each in runs])
+        # A dataset has no place for what motors give.
+        yield from promises(runs[0].parts, [each.settings for each in runs], briefly=True)
