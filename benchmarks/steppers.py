@@ -114,8 +114,10 @@ def rate(
         # From within a run: what is written once at its beginning is no step.
         now = stepper.advance(stepper.start(), np.array([1], np.int32), first).now
         begin = time.process_time()
-        stepper.advance(now, np.array(counts, np.int32), all_)
-        return agents * steps / (time.process_time() - begin)
+        made = stepper.advance(now, np.array(counts, np.int32), all_)
+        spent = time.process_time() - begin
+        assert np.isfinite(made.now.states).all(), "what is lost is no agent that is stepped"
+        return agents * steps / spent
 
 
 # ---- many formations -----------------------------------------------------------------------------
