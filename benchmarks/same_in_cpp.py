@@ -41,6 +41,9 @@ for (long step = 0; step < steps; step++) for (long b = 0; b < blocks; b++) {{
 _INFIX = {"add": "+", "sub": "-", "apart": "-", "mul": "*", "div": "/", "over": "/"}
 _INFIX |= {"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
 _CALLS = {
+    "fma": "{0} * {1} + {2}",
+    "fms": "{0} * {1} - {2}",
+    "fnma": "{2} - {0} * {1}",
     "sqrt": "(V)_mm512_sqrt_{s}((__m512{t}){0})",
     "floor": "(V)_mm512_roundscale_{s}((__m512{t}){0}, 9)",
     "ceil": "(V)_mm512_roundscale_{s}((__m512{t}){0}, 10)",

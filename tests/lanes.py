@@ -2,7 +2,19 @@
 
 import numpy as np
 
-from echelon.kernels import SLOTS, Body, Code, Graph, Plan, aligned, lower, nodes, program, shared
+from echelon.kernels import (
+    SLOTS,
+    Body,
+    Code,
+    Graph,
+    Plan,
+    aligned,
+    lower,
+    nodes,
+    program,
+    shared,
+    shortened,
+)
 
 NOTHING = Body({}, {}, {}, {}, {}, [], [], [])
 
@@ -13,6 +25,7 @@ def lowered(function, count, bits=64):
     x = np.empty(count, object)
     x[:] = [graph.leaf("row", k) for k in range(count)]
     found = [node for part in lower(function, graph, [x]) for node in nodes(graph, part)]
+    found = [shortened(found)[node] for node in found]
     return [graph.make("select", n, 1.0, 0.0) if n.truth else n for n in found]
 
 

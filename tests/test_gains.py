@@ -135,6 +135,21 @@ def test_riccati_of_a_double_integrator_has_a_closed_form(q, s, r, drag):
     assert gain.P == pytest.approx(np.array([[first, middle], [middle, last]]), rel=1e-8)
 
 
+def test_what_is_not_coupled_is_exactly_0_in_riccati_s_solution():
+    model = Quadrotor()
+    A, B = linearize(model)
+    Q, R = (np.diag(numbers) for numbers in model.weights)
+    P = Riccati().feedback(model, linearize(model)).P
+    at_once = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    np.testing.assert_allclose(P, at_once, rtol=0, atol=1e-11 * np.abs(at_once).max())
+    # x with vx, pitch and q; y with vy, roll and p; z with vz; yaw with r.
+    chains = [0, 3, 7, 10], [1, 4, 6, 9], [2, 5], [8, 11]
+    assert (P != 0.0).sum() == sum(len(chain) ** 2 for chain in chains)
+    # A weight couples them.
+    Q[0, 1] = Q[1, 0] = 0.1
+    assert (Riccati(Q=Q).feedback(model, linearize(model)).P != 0.0).sum() == 64 + 4 + 4
+
+
 def test_riccati_of_a_single_integrator_is_the_geometric_mean_of_its_weights():
     gain = synthesize(SingleIntegrator(2), LINE, Riccati(Q=[4.0, 9.0], R=[1.0, 4.0], coupling=2.5))
     assert gain.P == pytest.approx(np.diag([2.0, 6.0]))

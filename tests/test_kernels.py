@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from lanes import lowered, run, text_of
 from scipy.special import erf
 
-from echelon.core.numerics import precision
-from echelon.kernels import Graph, Unsupported, native
+from echelon.core.numerics import precision, rk4
+from echelon.kernels import Graph, Unsupported, native, needed
+from echelon.models import Quadrotor
 
 rng = np.random.default_rng(7)
 WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)
@@ -397,6 +398,43 @@ def test_nothing_is_told_twice_and_what_is_plain_is_folded():
     assert (x * 0.0).value == 0.0 and (graph.constant(2.0) * 3.0).value == 6.0
 
 
+def products(function, count):
+    return sum(node.op == "mul" for node in needed(lowered(function, count)))
+
+
+def test_what_products_have_in_common_is_multiplied_once():
+    J, rates = np.array([1.0, 2.5, 4.0]), np.array([2.0, 3.0, -5.0])
+    # Euler's equations: three products of two rates, and a number for each.
+    assert products(lambda w: -jnp.cross(w, J * w) / J, 3) == 6
+    found = run(lambda w: -jnp.cross(w, J * w) / J, rates[:, None])
+    np.testing.assert_allclose(found[:, 0], -np.cross(rates, J * rates) / J, rtol=1e-15)
+    # An integrator's stages, and what is the same in all of them.
+    assert products(lambda v: (v[0] + 2.0 * v[1] + 2.0 * v[2] + v[3]) / 6.0, 4) == 2
+    assert products(lambda v: v[0] * 0.5 * v[1] + v[2] * 0.5 * v[1] + v[3] * v[1], 4) == 2
+    both = lowered(lambda v: jnp.stack([v[2] * (3.0 * v[0]), v[3] * (3.0 * v[0])]), 4)
+    assert sum(node.op == "mul" for node in needed(both)) == 3
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda v: v[0] - ((1.0 + v[0]) - 1.0),
+        lambda v: (v[0] + v[1]) - v[1],
+        lambda v: (v[0] + 1e8 * v[1]) - 1e8 * v[1],
+        lambda v: jnp.expm1(v[0]) - jnp.sin(v[0]),
+    ],
+)
+def test_what_rounding_is_meant_to_do_is_left_to_it(function):
+    columns = np.random.default_rng(5).normal(size=(2, 64)) * 1e-7
+    [found] = run(function, columns)
+    np.testing.assert_allclose(found, by_jax(function, columns)[0], rtol=0, atol=4e-22)
+
+
+def test_numbers_too_large_to_be_put_together_are_multiplied_as_written():
+    [found] = run(lambda v: 1e-30 * (1e-30 * (1e35 * v[0] * (1e30 * v[1]))), np.ones((2, 4)), 32)
+    np.testing.assert_allclose(found, 1e5, rtol=1e-6)
+
+
 def test_a_lane_that_is_not_as_usual_changes_no_bit_of_the_others():
     def turned(v):
         return jnp.stack([jnp.sin(v[0]) * v[1], jnp.cos(jnp.sin(v[0]) + v[1]), jnp.cos(v[1])])
@@ -410,6 +448,24 @@ def test_a_lane_that_is_not_as_usual_changes_no_bit_of_the_others():
     assert alone[:, ::2].tobytes() == beside[:, ::2].tobytes()
     by_numpy = [np.sin(mixed[0]) * mixed[1], np.cos(np.sin(mixed[0]) + mixed[1]), np.cos(mixed[1])]
     np.testing.assert_allclose(beside, by_numpy, atol=1e-15)
+
+
+@pytest.mark.parametrize("bits", [64, 32])
+def test_what_is_usual_beside_a_lane_and_what_is_not_are_the_same_to_the_bit(bits):
+    model, u = Quadrotor(), jnp.array([0.3, 1e-5, -2e-5, 1e-6])
+
+    def step(v):
+        angle = jnp.arctan2(v[3], 1.0 + jnp.sqrt(v[4] * v[4] + 1.0))
+        return jnp.append(rk4(model.velocity, v, u.astype(v.dtype), 0.05), angle)
+
+    small = np.random.default_rng(3).uniform(-0.3, 0.3, (12, 16 * 64 // bits))
+    mixed = small.copy()
+    mixed[8, 1], mixed[3, 2], mixed[6, 3] = 2.0, 3.0, np.nan
+    alone, beside = (run(step, columns, bits) for columns in (small, mixed))
+    assert alone[:, 4:].tobytes() == beside[:, 4:].tobytes()
+    assert alone[:, 0].tobytes() == beside[:, 0].tobytes()
+    # Nothing is left to LLVM, which would put together what stands in one stretch of code alone.
+    assert "contract" not in text_of(step, 12, bits)[0]
 
 
 def test_much_that_few_need_stands_behind_a_branch():

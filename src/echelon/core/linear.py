@@ -5,6 +5,7 @@ from typing import TypeAlias, cast
 
 import numpy as np
 import scipy.linalg
+from scipy.sparse.csgraph import connected_components
 
 from echelon.core.errors import GainError
 from echelon.core.numerics import INTEGRATORS
@@ -159,8 +160,13 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
     # SciPy refuses empty matrices, and an integrator has no state that an inner loop must damp.
     if not len(A):
         return np.zeros((0, 0))
+    P = np.zeros_like(A, float)
     try:
-        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+        # Part by part, so that what has nothing to do with each other is 0 and not rounding: it
+        # then costs nothing in a step.
+        for part in _uncoupled(A, B, Q, R):
+            own = np.ix_(part, part)
+            P[own] = scipy.linalg.solve_continuous_are(A[own], B[part], Q[own], R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise GainError(
             f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "
@@ -168,6 +174,14 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
         ) from error
     # Rounding leaves P asymmetric, and routines that read one triangle would differ from the rest.
     return symmetric_part(P)
+
+
+def _uncoupled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> list[np.ndarray]:
+    """Return the sets of states that neither the dynamics nor an input nor a weight couples."""
+    coupled = np.block([[(A != 0.0) | (Q != 0.0), B != 0.0], [B.T != 0.0, R != 0.0]])
+    count, label = connected_components(coupled, directed=False)
+    parts = (np.flatnonzero(label[: len(A)] == k) for k in range(count))
+    return [part for part in parts if len(part)]
 
 
 Weight: TypeAlias = Sequence[float] | Sequence[Sequence[float]] | Array

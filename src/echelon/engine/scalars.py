@@ -14,7 +14,7 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.engine.loop import Loop, act_alone, tell, what_limits_did
 from echelon.engine.own import Own
-from echelon.kernels import Body, Graph, Node, Unsupported, inverses_shared, lower, nodes
+from echelon.kernels import Body, Graph, Node, Unsupported, lower, nodes, shortened
 from echelon.laws.law import Law, LocalView, Memory
 
 
@@ -241,7 +241,7 @@ def body_of(
         mirror=[*apart(done.state, known.offset), *done.saying],
         difference=_difference(loop, graph, len(known.x), len(done.said)),
     )
-    return body.become(inverses_shared(body.all()))
+    return body.become(shortened(body.all()))
 
 
 def _parted(known: Known, twice: list[Node]) -> list[Node]:

@@ -8,7 +8,7 @@ from echelon.kernels.frame import SLOTS, TURN, Body, Plan, stride
 from echelon.kernels.lowering import lower
 from echelon.kernels.moving import move
 from echelon.kernels.native import Code, aligned, is_installed, vectors
-from echelon.kernels.quotients import inverses_shared
+from echelon.kernels.products import shortened
 from echelon.kernels.scalar import Graph, Node, needed
 from echelon.kernels.winding import winds
 
@@ -24,7 +24,6 @@ __all__ = [
     "aligned",
     "fed_widths",
     "from_tape",
-    "inverses_shared",
     "is_installed",
     "lower",
     "move",
@@ -32,6 +31,7 @@ __all__ = [
     "nodes",
     "program",
     "shared",
+    "shortened",
     "stride",
     "vectors",
     "winds",

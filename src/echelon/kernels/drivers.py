@@ -30,6 +30,7 @@ from echelon.kernels.frame import (
     only_if,
     store_row,
 )
+from echelon.kernels.fused import fused
 from echelon.kernels.neighbours import exchange, led, line, measure_edges, write_mirror
 from echelon.kernels.scalar import Node, needed
 from echelon.kernels.threads import tell_done, wait
@@ -40,6 +41,7 @@ from echelon.kernels.vector_ir import Emitter, Writer, number
 def program(plan: Plan) -> str:
     """Return a kernel as text for LLVM."""
     w, numbers, plan = Writer(plan.bits, plan.lanes), shared(plan), apart(plan)
+    plan = plan._replace(first=fused(plan.first), others=fused(plan.others))
     w.label("entry")
     slots = dict[str, str]()
     for place, name in enumerate(SLOTS):

@@ -22,7 +22,7 @@ from echelon.kernels.polynomials import (
     polynomial,
     sine_series,
 )
-from echelon.kernels.scalar import Node
+from echelon.kernels.scalar import Node, is_at_least_0
 
 
 def _reduce(x: Node, k: Node, period: Fraction) -> Node:
@@ -211,17 +211,31 @@ def logistic(x: Node) -> Node:
 
 def atan2(y: Node, x: Node) -> Node:
     """Return the angle of the point (x, y)."""
+    whole = _angle(y, x)
+    if not is_at_least_0(x):
+        return whole
+    # What lies ahead mostly does so by less than tan(pi/8): then the ratio is taken as it is.
+    t = y / x
+    beside = y.graph.make("rare", _less(y.graph.constant(0.41**2), t * t))
+    return choose(beside, whole, signed(_small_angle(t), y))
+
+
+def _small_angle(t: Node) -> Node:
+    """Return arctan t for |t| up to tan(pi/8)."""
+    s = t * t
+    series = economized(arctangent_series, math.tan(math.pi / 8) ** 2, EPS[t.graph.bits])
+    return t + t * s * polynomial(s, series)
+
+
+def _angle(y: Node, x: Node) -> Node:
+    """Return the angle of any point (x, y)."""
     g, a, b = y.graph, size(y), size(x)
     low, high = g.make("min", a, b), g.make("max", a, b)
     # Two infinite sides are alike, and no sides at all make no angle.
     ratio = choose(g.make("eq", low, high), choose(g.make("eq", high, 0.0), 0.0, 1.0), low / high)
     # NaN is equal to nothing, so `low / high` keeps it. About 1 instead of 0 beyond tan(pi/8).
     far = _less(math.tan(math.pi / 8), ratio)
-    t = choose(far, (ratio - 1.0) / (ratio + 1.0), ratio)
-    s = t * t
-    width = math.tan(math.pi / 8) ** 2
-    series = economized(arctangent_series, width, EPS[g.bits])
-    angle = t + t * s * polynomial(s, series)
+    angle = _small_angle(choose(far, (ratio - 1.0) / (ratio + 1.0), ratio))
     angle = choose(far, math.pi / 4 + angle, angle)
     rest = float(PI / 2 - Fraction(math.pi / 2))
     angle = choose(_less(b, a), math.pi / 2 - (angle - rest), angle)

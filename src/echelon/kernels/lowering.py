@@ -93,7 +93,11 @@ def _rules(graph: Graph) -> dict[str, Rule]:
         return lambda *args: graph.make(name, *map(entry, args))
 
     def function(of: Callable[..., Node]) -> Callable[..., Node]:
-        return lambda *args: of(*(node(graph, a) for a in args))
+        def written(*args: Any) -> Node:
+            with graph.as_written():
+                return of(*(node(graph, a) for a in args))
+
+        return written
 
     own = {name: op(name) for name in _SAME}
     own |= {name: function(getattr(elementary, name)) for name in _ELEMENTARY}
@@ -102,7 +106,7 @@ def _rules(graph: Graph) -> dict[str, Rule]:
         "ge": lambda a, b: graph.make("le", entry(b), entry(a)),
         "rem": function(elementary.remainder),
         "pow": function(elementary.power),
-        "exp2": lambda a: elementary.exp(node(graph, a) * float(np.log(2.0))),
+        "exp2": function(lambda a: elementary.exp(a * float(np.log(2.0)))),
         "clamp": lambda low, x, high: graph.make(
             "min", graph.make("max", entry(low), entry(x)), entry(high)
         ),

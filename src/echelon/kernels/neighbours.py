@@ -97,8 +97,8 @@ def _sums(
         for k, node in enumerate(wanted):
             value = emitter.value(node)
             if weight is not None:
-                value = w.put(f"fmul contract {w.vector} {value}, {weight}")
-            on[k] = w.put(f"fadd contract {w.vector} {totals[k]}, {value}")
+                value = w.put(f"fmul {w.vector} {value}, {weight}")
+            on[k] = w.put(f"fadd {w.vector} {totals[k]}, {value}")
     return totals
 
 

@@ -5,8 +5,9 @@ as the time. It is made by an operation of `OPERATIONS` from other nodes, and an
 same operands is the same node. All code for vectors is made from such a graph.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias, final
 
 import numpy as np
@@ -28,6 +29,10 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "div": _divide,
     # A quotient that is cut to a whole number: no inverse takes its place, so that 49 / 49 is 1.
     "over": _divide,
+    # Sums with a product in one operation (`fused`): a b + c, a b - c and c - a b.
+    "fma": lambda a, b, c: a * b + c,
+    "fms": lambda a, b, c: a * b - c,
+    "fnma": lambda a, b, c: c - a * b,
     "neg": lambda a: -a,
     "abs": abs,
     "sqrt": lambda a: float(np.sqrt(a)),
@@ -75,9 +80,10 @@ class Node:
         value: the number of a constant, the name of a leaf.
         uniform: whether it is the same for all agents.
         truth: whether it is true or false, and no number.
+        kept: whether it is computed as it is written, and not in another order of its sums.
     """
 
-    __slots__ = ("args", "graph", "number", "op", "truth", "uniform", "value")
+    __slots__ = ("args", "graph", "kept", "number", "op", "truth", "uniform", "value")
     __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
 
     def __init__(
@@ -88,6 +94,7 @@ class Node:
         self.truth = op in TRUTHS or op == "constant" and isinstance(value, bool)
         if op == "select":
             self.truth = args[1].truth
+        self.kept = False
         graph.nodes.append(self)
 
     def __add__(self, other: Entry) -> "Node":
@@ -127,7 +134,7 @@ class Graph:
     """
 
     def __init__(self, bits: int = 64) -> None:
-        self.bits, self.nodes = bits, list[Node]()
+        self.bits, self.nodes, self._keeps = bits, list[Node](), False
         self._known: dict[Any, Node] = {}
 
     def constant(self, value: float | bool) -> Node:
@@ -158,7 +165,17 @@ class Graph:
     def _once(self, key: Any, op: str, args: tuple[Node, ...], value: Any, uniform: bool) -> Node:
         if key not in self._known:
             self._known[key] = Node(self, op, args, value, uniform)
+        self._known[key].kept |= self._keeps
         return self._known[key]
+
+    @contextlib.contextmanager
+    def as_written(self) -> Iterator[None]:
+        """Mark what is made meanwhile as `kept`: each rounding is where it was meant to be."""
+        before, self._keeps = self._keeps, True
+        try:
+            yield
+        finally:
+            self._keeps = before
 
 
 def needed(results: Iterable[Node]) -> list[Node]:
@@ -212,6 +229,16 @@ def _product(a: Node, b: Node) -> Node | None:
     return None
 
 
+def _fused(op: str) -> Callable[[Node, Node, Node], Node | None]:
+    def simpler(a: Node, b: Node, c: Node) -> Node | None:
+        product = a * b if a.op == b.op == "constant" else _product(a, b)
+        if product is None and _is(c, 0.0):
+            product = a * b
+        return None if product is None else OPERATIONS[op](product, 1.0, c)
+
+    return simpler
+
+
 def _quotient(a: Node, b: Node) -> Node | None:
     if _is(a, 0.0) or _is(b, 1.0):
         return a
@@ -260,6 +287,16 @@ def _is_square(node: Node) -> bool:
     return node.op == "mul" and node.args[0] is node.args[1]
 
 
+def is_at_least_0(node: Node) -> bool:
+    """Tell whether a number is known not to be below 0; it may be none, or -0."""
+    a = node.args
+    if node.op == "constant":
+        return node.value >= 0.0
+    if node.op in ("add", "mul", "div", "min"):
+        return all(map(is_at_least_0, a)) or node.op == "mul" and a[0] is a[1]
+    return node.op in ("sqrt", "abs", "pow2") or node.op == "max" and any(map(is_at_least_0, a))
+
+
 def _at_most(a: Node, b: Node) -> Node | None:
     """Return a comparison without the root of a sum of squares: the largest that has it decides."""
     if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not _is_square(a.args[0]):
@@ -280,6 +317,7 @@ _SIMPLER: dict[str, Callable[..., Node | None]] = {
     "sub": _difference,
     "mul": _product,
     "div": _quotient,
+    **{op: _fused(op) for op in ("fma", "fms", "fnma")},
     "neg": _negation,
     "abs": lambda a: a if a.op == "abs" else None,
     "eq": lambda a, b: a.graph.make("not", a.graph.make("xor", a, b)) if a.truth else None,

@@ -75,6 +75,7 @@ def rewritten(results: Sequence[Node], instead: Instead) -> dict[Node, Node]:
             made[node] = node
         else:
             made[node] = node.graph.make(node.op, *args)
+            made[node].kept |= node.kept
     return made
 
 

@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import final
 
 from echelon.kernels.arms import Arm, arms
+from echelon.kernels.order import lateness, one_by_one
 from echelon.kernels.scalar import Node, needed
 
 _INSTRUCTIONS = {
-    **{name: f"f{name} contract {{T}} {{0}}, {{1}}" for name in ("add", "sub", "mul", "div")},
+    **{name: f"f{name} {{T}} {{0}}, {{1}}" for name in ("add", "sub", "mul", "div")},
+    "fma": "call {T} @llvm.fmuladd.{S}({T} {0}, {T} {1}, {T} {2})",
     "apart": "fsub {T} {0}, {1}",
     "over": "fdiv {T} {0}, {1}",
     "neg": "fneg {T} {0}",
@@ -41,6 +43,9 @@ _INSTRUCTIONS = {
     "or": "or {T} {0}, {1}",
     "xor": "xor {T} {0}, {1}",
 }
+
+_TAKEN_OFF = {"fms": 2, "fnma": 0}
+"""What of a product and a sum is turned about; a processor does that by the way."""
 
 
 def number(value: float, bits: int) -> str:
@@ -133,6 +138,10 @@ class Writer:
             return _BITS[op](self, args[0], uniform)
         if op == "not":
             return self.put(f"xor {own} {args[0]}, {'true' if uniform else 'splat (i1 true)'}")
+        if op in _TAKEN_OFF:
+            place = _TAKEN_OFF[op]
+            turned = self.put(f"fneg {own} {args[place]}")
+            args, op = [*args[:place], turned, *args[place + 1 :]], "fma"
         pattern = _INSTRUCTIONS[op]
         if "@" in pattern:
             name = pattern[pattern.index("@") + 1 : pattern.index("(")].format(S=suffix)
@@ -242,12 +251,12 @@ class Emitter:
         """Write all that results rest on, and go to a label where a truth of a level holds."""
         nodes = needed([*results, *(node for level in levels for node in level)])
         self._write([n for n in nodes if n.uniform])
-        rest = [n for n in nodes if not n.uniform]
+        rest, late = [n for n in nodes if not n.uniform], lateness(nodes)
         for level in levels:
-            wanted = set(needed(level))
-            rest = self._early([n for n in rest if n in wanted], rest, results)
+            wanted = [n for n in one_by_one(level, late) if not n.uniform]
+            rest = self._early(wanted, rest, results)
             self._leave(level, otherwise)
-        self._write(rest)
+        self._write(n for n in one_by_one(results, late) if not n.uniform)
 
     def _early(
         self, wanted: Sequence[Node], rest: Sequence[Node], results: Sequence[Node]
