@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 import echelon as ech
 from echelon.core import numerics
 from echelon.core.errors import GainError
-from echelon.core.linear import observability_rank, uncontrollable_modes
+from echelon.core.linear import observability_rank, riccati, uncontrollable_modes
 from echelon.core.words import Kind
-from echelon.gains import Feedback, FixedGain, Method, Riccati
+from echelon.gains import Feedback, FixedGain, InnerLoop, Method, Riccati
 from echelon.gains.file import gain_as_mapping
 from echelon.gains.gain import synthesize
 from echelon.models import (
@@ -259,6 +259,50 @@ def test_a_position_without_weight_cannot_be_held():
     for Q in ([0.0, 1.0], [0.0, 0.0]):
         with pytest.raises(GainError):
             synthesize(DoubleIntegrator(1), LINE, Riccati(Q=Q))
+
+
+@pytest.mark.parametrize(
+    ("model", "method"),
+    [
+        (DoubleIntegrator(2), InnerLoop(Q=[1.0, 1.0, 1.0, 0.0], R=[1.0, 1.0])),
+        (DoubleIntegrator(2), InnerLoop(Q=[1.0, 1.0, 0.0, 1.0], R=[1.0, 1.0])),
+        (DoubleIntegrator(2), Riccati(Q=[0.0, 0.0, 1.0, 1.0], R=[1.0, 1.0])),
+        (SingleIntegrator(2), Riccati(Q=[0.0, 1.0], R=[1.0, 1.0])),
+        (SingleIntegrator(2), Riccati(Q=[0.0, 0.0], R=[1.0, 1.0])),
+    ],
+)
+def test_an_undamped_mode_without_weight_is_refused_beside_others(model, method):
+    with pytest.raises(GainError, match="has no stabilizing solution .*weighted by `Q`.$"):
+        synthesize(model, LINE, method)
+
+
+@pytest.mark.parametrize(
+    ("A", "B", "Q"),
+    [
+        (np.diag([0.0, -1.0]), np.eye(2), np.diag([0.0, 1.0])),
+        ([[0.0, 1.0], [-1.0, 0.0]], np.eye(2), np.zeros((2, 2))),
+        (np.zeros((2, 2)), np.eye(2), np.ones((2, 2))),
+        (np.eye(4, k=1), np.eye(4)[:, 3:], np.diag([0.0, 1.0, 1.0, 1.0])),
+        (np.diag([1.0, -1.0]), [[0.0], [1.0]], np.eye(2)),
+    ],
+)
+def test_riccati_finds_no_solution_that_does_not_stabilize(A, B, Q):
+    A, B = np.array(A), np.array(B)
+    with pytest.raises(GainError, match="has no stabilizing solution"):
+        riccati(A, B, Q, np.eye(B.shape[1]))
+
+
+def test_riccati_keeps_loops_that_are_slow_and_fast_at_once():
+    one, two = np.eye(1), np.eye(2)
+    for q in (1e-24, 1e-12, 1e-4):
+        assert riccati(0.0 * one, one, q * one, one).item() == pytest.approx(q**0.5)
+        chain = riccati(np.eye(2, k=1), two[:, 1:], np.diag([max(q, 1e-18), 1.0]), one)
+        assert chain[0, 1] == pytest.approx(max(q, 1e-18) ** 0.5)
+    # An actuator of 1e8 1/s in a loop of 0.01 1/s, and a state that decays without any weight.
+    fast = np.array([[0.0, 1.0], [0.0, -1e8]])
+    P = riccati(fast, 1e8 * two[:, 1:], np.diag([1e-4, 0.0]), one)
+    assert P[0, 0] == pytest.approx(0.01, rel=1e-6)
+    assert not riccati(-one, one, 0.0 * one, one).any()
 
 
 # ---- methods ----

@@ -12,6 +12,7 @@ from echelon.core.numerics import INTEGRATORS
 from echelon.core.types import Array
 
 _DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
+_AXIS = 64 * float(np.finfo(float).eps)  # of the fastest mode's rate, that of rounding
 
 
 def held_step(
@@ -166,7 +167,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
         # then costs nothing in a step.
         for part in _uncoupled(A, B, Q, R):
             own = np.ix_(part, part)
-            P[own] = scipy.linalg.solve_continuous_are(A[own], B[part], Q[own], R)
+            P[own] = _stabilizing(A[own], B[part], Q[own], R)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise GainError(
             f"the Riccati equation has no stabilizing solution ({str(error).rstrip('.').lower()}); "
@@ -174,6 +175,23 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.nd
         ) from error
     # Rounding leaves P asymmetric, and routines that read one triangle would differ from the rest.
     return symmetric_part(P)
+
+
+def _stabilizing(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return SciPy's solution, after checking that it stabilizes.
+
+    Raises:
+        LinAlgError: a mode is left on the imaginary axis.
+    """
+    P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    S = B @ np.linalg.solve(R, B.T)
+    # The Hamiltonian's eigenvalues are those of A - S P and their mirror images. They are 0 where
+    # rounding of P moves the loop's by a little; and its rates are those of the loop in any units.
+    modes = np.linalg.eigvals(np.block([[A, -S], [-Q, -A.T]]))
+    slowest = min(np.abs(modes.real).min(), -np.linalg.eigvals(A - S @ P).real.max())
+    if not slowest > _AXIS * np.abs(modes).max():
+        raise np.linalg.LinAlgError("a mode stays on the imaginary axis")
+    return P
 
 
 def _uncoupled(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray) -> list[np.ndarray]:
