@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 import echelon as ech
 from echelon.core import limits
+from echelon.core.errors import ModelError, Outcome
 from echelon.core.limits import MOST_AGENTS, MOST_STEPS, horizon_fault
+from echelon.engine.many import Fleet
 from echelon.engine.prepare import check_memory
 from echelon.scenario import build as scenario_build
 
@@ -65,6 +67,25 @@ def test_a_run_that_stores_too_much_is_told_what_would_fit(monkeypatch):
     # And so would a shorter run.
     times = float(str(no.value).partition("or a horizon ")[2].partition(" ")[0])
     check_memory(parts.model, 4, long._replace(horizon=round(1e7 / times * 0.99)))
+
+
+class Nameless(ech.models.SingleIntegrator):
+    @property
+    def state_names(self):
+        return None
+
+
+@pytest.mark.parametrize("model", ["car", None, ech.models.SingleIntegrator, Nameless(2)])
+def test_a_model_is_checked_before_its_states_are_counted_and_ends_no_other_run(model):
+    agent, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    right = ech.Parts(agent, graph, ech.Formation.from_offsets(agent, graph, {}), drive)
+    wrong = right.replace(model=model)
+    with pytest.raises(ModelError):
+        ech.simulate(wrong, settings())
+    first, second = Fleet(1).fly([(wrong, settings()), (right, settings())])
+    assert isinstance(first, ModelError)
+    assert isinstance(second, ech.Result) and second.outcome is Outcome.COMPLETED
 
 
 def test_a_run_without_room_is_refused_before_a_gain_is_made(monkeypatch):

@@ -29,7 +29,7 @@ from echelon.engine.loop import Loop, assemble
 from echelon.engine.motion import Motion
 from echelon.engine.native import NativeStepper, beyond
 from echelon.engine.parts import Parts
-from echelon.engine.prepare import Prepared, check_given, check_memory, prepare
+from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.record import Record, Recorder, Stretch, completed, inside_at_last
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
@@ -110,9 +110,7 @@ class Fleet:
     def _case(self, parts: Parts, settings: Settings) -> _Case:
         known, alike = self._cases.setdefault(parts, {}), settings._replace(seed=0)
         if alike not in known:
-            check_given(parts, settings)
-            check_memory(parts.model, parts.graph.agents, settings)
-            prepared = prepare(parts, settings)
+            prepared = prepare(parts, settings, to_store=True)
             drive = prepared.parts.drive
             with precision("float64"):
                 loop = family = None

@@ -24,8 +24,13 @@ class Prepared(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def prepare(parts: Parts, settings: Settings) -> Prepared:
+def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepared:
     """Check all parts and complete those that depend on others, in float64.
+
+    Args:
+        parts: agents, graph, formation, what drives them, starts and world.
+        settings: of the run.
+        to_store: whether a whole run will be stored, which must then have room.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
@@ -36,6 +41,9 @@ def prepare(parts: Parts, settings: Settings) -> Prepared:
     with precision("float64"):
         warnings = check_model(model) + parts.world.check(model)
         _check_offsets(model, parts)
+        if to_store:
+            # Before gains and plans, which may take long.
+            check_memory(model, graph.agents, settings)
         drive = parts.drive.prepare(model, graph)
         # What is complete stays the same object, so that what is known of it is found again.
         parts = parts if drive is parts.drive else parts.replace(drive=drive)

@@ -15,7 +15,7 @@ from echelon.core.types import Array
 from echelon.engine.drive import Stepper, Stopped
 from echelon.engine.grid import Grid
 from echelon.engine.parts import Parts
-from echelon.engine.prepare import Prepared, check_given, check_memory, prepare
+from echelon.engine.prepare import Prepared, prepare
 from echelon.engine.record import Record, Recorder, Stretch, join
 from echelon.engine.result import Result
 from echelon.engine.settings import Settings
@@ -92,10 +92,7 @@ def simulate(
             interrupted by Ctrl-C is no error: the result says so and holds what was computed.
     """
     began = time.perf_counter()
-    check_given(parts, settings)
-    # Before gains and plans, which may take long.
-    check_memory(parts.model, parts.graph.agents, settings)
-    prepared = prepare(parts, settings)
+    prepared = prepare(parts, settings, to_store=True)
     with precision("float64"):
         # Plans and solvers are made in float64, in whatever precision the run then is.
         stepper = prepared.parts.drive.stepper(prepared.problem)
