@@ -381,3 +381,22 @@ def test_an_edge_is_of_agents_that_there_are(edges, agents, said):
     with pytest.raises(errors.GraphError) as caught:
         Graph(edges, agents=agents)
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("agents", [3.0, 2.5, "4", None, [3]])
+@pytest.mark.parametrize(
+    "make",
+    [
+        Graph.path,
+        Graph.ring,
+        Graph.star,
+        Graph.complete,
+        lambda n: Graph.grid(n, 2),
+        lambda n: Graph.grid(2, n),
+        lambda n: Graph.geometric(n, 2.0),
+        lambda n: Graph([(0, 1)], agents=2.5 if n is None else n),
+    ],
+)
+def test_a_number_of_agents_is_whole(make, agents):
+    with pytest.raises(errors.GraphError, match="^the number of agents is .*whole number.*4.$"):
+        make(agents)

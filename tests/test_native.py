@@ -1,5 +1,6 @@
 """Native steps against JAX's: states, inputs, sums and moments, for all that a run may have."""
 
+import threading
 import time
 from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from echelon import kernels
 from echelon.engine import crew, native, order, room, turns
 from echelon.engine.drive import numbers
 from echelon.engine.prepare import prepare
+from echelon.kernels import moving
 
 QUADROTOR = ech.models.Quadrotor()
 CIRCLE = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5))
@@ -261,6 +263,49 @@ def test_numbers_are_where_they_were_put_whoever_stands_where(bits, agents, rows
         for first in range(len(blocks)):
             kernels.move(part, stand, found, False, first, first + 1)
         np.testing.assert_array_equal(found, wanted)
+
+
+def test_native_code_is_given_arrays_of_its_own_layout_alone():
+    blocks = kernels.aligned((2, 3, native.LANES[64]), np.float64)
+    stand, wanted = np.arange(2 * native.LANES[64]), np.ones((2 * native.LANES[64], 3))
+    for name, changed in {
+        "rows": {"rows": blocks.transpose(0, 2, 1)},
+        "agents": {"agents": stand.astype(np.int32)},
+        "values": {"values": np.asfortranarray(wanted)},
+        "count": {"values": wanted[:, :2].copy()},
+        "last": {"last": 3},
+    }.items():
+        told = {"rows": blocks, "agents": stand, "values": wanted, "first": 0, "last": 2} | changed
+        with pytest.raises(ValueError, match=f"`{name}` does not fit"):
+            kernels.move(**told, inward=True)
+    with pytest.raises(ValueError, match="`values` does not fit"):
+        kernels.move(blocks, stand, wanted.astype(int), True, 0, 2)
+    assert not blocks.any()
+
+
+def test_the_code_that_moves_numbers_is_made_once_for_all_threads(monkeypatch):
+    made, begin = list[int](), threading.Barrier(4)
+
+    class Slow:
+        def __init__(self, *_):
+            made.append(1)
+            time.sleep(0.05)
+
+        def call(self, _):
+            pass
+
+    monkeypatch.setattr(moving, "Code", Slow)
+    moving._mover.cache_clear()
+    blocks, stand = kernels.aligned((1, 1, 8), np.float64), np.arange(8)
+
+    def move(_):
+        begin.wait()
+        kernels.move(blocks, stand, np.ones((8, 1)), True, 0, 1)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(move, range(4)))
+    moving._mover.cache_clear()
+    assert len(made) == 1
 
 
 def test_memory_is_taken_again_when_nobody_holds_any_of_it():

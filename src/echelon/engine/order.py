@@ -66,8 +66,6 @@ def nearby(loop: Loop) -> Array:
     ends = np.concatenate([j, i])[order]
     links = sp.csr_array((np.ones(len(ends)), ends, starts), shape=(agents, agents))
     order = _from_an_end(links)
-    if len(order) < agents:
-        order = csgraph.reverse_cuthill_mckee(sp.csr_matrix(links), symmetric_mode=True)
     rank = np.empty(agents, np.int32)
     rank[order] = own
     better = np.abs(rank[i] - rank[j]).sum(dtype=int) < np.abs(i - j).sum(dtype=int)

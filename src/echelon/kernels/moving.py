@@ -2,6 +2,7 @@
 
 from functools import cache
 from pathlib import Path
+from threading import Lock
 
 import jax
 import numpy as np
@@ -10,6 +11,8 @@ from echelon.kernels.frame import loop
 from echelon.kernels.native import Code
 from echelon.kernels.vector_ir import Writer
 
+_ONE = Lock()
+"""Threads ask for the same code at once, and a cache alone would make it for each."""
 _SLOTS = ("blocks", "agents", "values", "way", "size", "count", "first", "last")
 
 
@@ -86,10 +89,33 @@ def move(
         inward: whether they go into the blocks.
         first: of the blocks that are meant.
         last: the one after these.
+
+    Raises:
+        ValueError: an array is laid out in another way, or its numbers are others.
     """
+    _check_layout(rows, agents, values, first, last)
     (_, count, lanes), bits = rows.shape, 8 * rows.itemsize
     way = _ways(bits).index((8 * values.itemsize, inward))
     places = [array.ctypes.data for array in (rows, agents, values)]
     size = rows.strides[0] // rows.itemsize
     slots = np.array([*places, way, size, count, first, last], np.int64)
-    _mover(bits, lanes).call(slots)
+    with _ONE:
+        code = _mover(bits, lanes)
+    code.call(slots)
+
+
+def _check_layout(
+    rows: np.ndarray, agents: np.ndarray, values: np.ndarray, first: int, last: int
+) -> None:
+    """Check what native code, which is given addresses alone, takes for granted."""
+    (blocks, count, lanes), size = rows.shape, rows.itemsize
+    right = {
+        "rows": rows.dtype.kind == "f" and rows.strides[1:] == (lanes * size, size),
+        "agents": agents.dtype == np.int64 and agents.flags.c_contiguous,
+        "values": values.dtype.kind == "f" and values.flags.c_contiguous,
+        "count": values.shape[1:] == (count,),
+        "last": 0 <= first <= last <= blocks and last * lanes <= len(agents),
+    }
+    for name, holds in right.items():
+        if not holds:
+            raise ValueError(f"`{name}` does not fit what is moved.")

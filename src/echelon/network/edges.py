@@ -1,5 +1,6 @@
 """Reading and checking the edges and leaders that a graph is made from."""
 
+import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -135,8 +136,20 @@ def check_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
     return chosen
 
 
+def check_whole(*counts: int) -> None:
+    """Check that numbers of agents are whole."""
+    for agents in counts:
+        try:
+            operator.index(agents)
+        except TypeError:
+            raise GraphError(
+                f"the number of agents is {agents!r}, and must be a whole number such as 4."
+            ) from None
+
+
 def check_size(agents: int, least: int, kind: str, edges: float = 0.0) -> None:
     """Check that a kind of graph has enough agents, and no more than fit; nor its edges."""
+    check_whole(agents)
     if agents < least:
         raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
     excess = excess_agents(agents) or excess_edges(edges)
