@@ -136,25 +136,34 @@ def check_leaders(leaders: Iterable[int], agents: int) -> tuple[int, ...]:
     return chosen
 
 
-def check_whole(*counts: int) -> None:
-    """Check that numbers of agents are whole."""
-    for agents in counts:
-        try:
-            operator.index(agents)
-        except TypeError:
-            raise GraphError(
-                f"the number of agents is {agents!r}, and must be a whole number such as 4."
-            ) from None
+def count_grid(rows: int, columns: int) -> int:
+    """Return the number of agents of a grid, after checking it."""
+    for side in (rows, columns):
+        _check_whole(side)
+    check_size(rows * columns, 2, "grid")
+    return rows * columns
 
 
-def check_size(agents: int, least: int, kind: str, edges: float = 0.0) -> None:
-    """Check that a kind of graph has enough agents, and no more than fit; nor its edges."""
-    check_whole(agents)
+def check_size(agents: int, least: int, kind: str, edges: int = 0, share: float = 0) -> None:
+    """Check that a kind of graph has enough agents, and no more than fit; nor its edges.
+
+    These are counted, or are about a share of all pairs.
+    """
+    _check_whole(agents)
     if agents < least:
         raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
-    excess = excess_agents(agents) or excess_edges(edges)
+    excess = excess_agents(agents) or excess_edges(edges + share * (agents * (agents - 1) // 2))
     if excess is not None:
         raise GraphError(f"the graph is too large: {excess}.")
+
+
+def _check_whole(agents: int) -> None:
+    try:
+        operator.index(agents)
+    except TypeError:
+        raise GraphError(
+            f"the number of agents is {agents!r}, and must be a whole number such as 4."
+        ) from None
 
 
 def name_agents(agents: np.ndarray) -> str:

@@ -17,8 +17,8 @@ from echelon.network.edges import (
     check_edges,
     check_leaders,
     check_size,
-    check_whole,
     count_agents,
+    count_grid,
     give_weights,
     links,
     split_weights,
@@ -187,19 +187,17 @@ class Graph:
     @classmethod
     def complete(cls, agents: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return the graph with every edge."""
-        check_whole(agents)
-        check_size(agents, 2, "complete", agents * (agents - 1) // 2)
+        check_size(agents, 2, "complete", share=1)
         return cls(np.stack(np.triu_indices(agents, 1), axis=1), leaders, agents)
 
     @classmethod
     def grid(cls, rows: int, columns: int, leaders: Iterable[int] = (0,)) -> "Graph":
         """Return rows x columns agents, numbered row by row, linked to the nearest four."""
-        check_whole(rows, columns)
-        check_size(rows * columns, 2, "grid")
-        number = np.arange(rows * columns).reshape(rows, columns)
+        agents = count_grid(rows, columns)
+        number = np.arange(agents).reshape(rows, columns)
         across = links(number[:, :-1].ravel(), number[:, 1:].ravel())
         down = links(number[:-1].ravel(), number[1:].ravel())
-        return cls(np.concatenate([across, down]), leaders, rows * columns)
+        return cls(np.concatenate([across, down]), leaders, agents)
 
     @classmethod
     def geometric(
@@ -210,10 +208,9 @@ class Graph:
         Raises:
             GraphError: the radius is too small for the points to be connected.
         """
-        check_whole(agents)
         # An agent's neighbours are those in its disc, as far as that lies in the square.
         share = min(1.0, np.pi * float(radius) * float(radius))
-        check_size(agents, 2, "geometric", share * agents * (agents - 1) / 2)
+        check_size(agents, 2, "geometric", share=share)
         points = np.random.default_rng(seed).uniform(size=(agents, 2))
         with advising(points, radius):
             return cls(pairs_within(points, radius), leaders, agents)
