@@ -63,6 +63,19 @@ def place_of(what: str, *values: Any) -> Path | None:
     return Path(os.environ[FOLDER]) / f"{made.hexdigest()}-made-cache"
 
 
+def is_ours(value: Any) -> bool:
+    """Tell whether a tree of values is of echelon's own classes, and of such as never change.
+
+    What others define may be defined anew, or read what changes, as long as a process runs.
+    """
+    try:
+        for _ in _told(value):
+            pass
+    except _Foreign:
+        return False
+    return True
+
+
 def read(file: Path) -> bytes | None:
     """Return what a file keeps; None where it is not there, or not whole."""
     try:
