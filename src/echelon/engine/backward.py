@@ -175,6 +175,13 @@ class Backward:
         self.own.turn(loop)
         self.stepper.turn(loop)
 
+    @property
+    def size(self) -> int:
+        """Bytes of the arrays that are held from one run to the next."""
+        found, blocks = self.stepper.found, (self.stepper.blocks, *self.stepper.mirrors)
+        room = (self.felt, *self.mirrors, self.fed, self.totals, self.table, self._room)
+        return sum(array.nbytes for array in jax.tree.leaves((found, blocks, room, self.reach)))
+
     # ---- forwards ----
 
     def run(self) -> Sums | None:
@@ -188,6 +195,7 @@ class Backward:
             made = self._advance(now, first)
             now, sums = made.now, made.sums if sums is None else sums.plus(made.sums)
             if any_beyond(now.states, BITS):
+                self.moments.clear()
                 return None
         return sums
 
@@ -218,6 +226,7 @@ class Backward:
                 self._advance(self.moments[first // self.stretch], first)
             self._back(first, min(self.steps, first + self.stretch))
         found = self._ended()
+        self.moments.clear()
         if self.tape.nbytes > _LIGHT:
             self._room = None
             self.stepper.record(None, 0)
