@@ -86,7 +86,8 @@ def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
         ahead=False,
         backward=True,
     )
-    return _Pair(*(compiled(rows, way, KERNELS.codes) for way in (forward, backward)), felt)
+    onward, back = (compiled(rows, way, KERNELS.codes) for way in (forward, backward))
+    return _Pair(onward, back, felt)
 
 
 def _onto_tape(body: Body, way: Pulled) -> Body:
