@@ -44,8 +44,8 @@ _EPILOG = (
     "4 an optional part is not installed; 5 verified as far as it could be checked; 70 a fault of "
     "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept; "
     "141 done, and the reader of the output left before its end. "
-    "ECHELON_CACHE names the folder where compiled code and what is found out of parts, proofs too, "
-    "are kept between runs; `off` keeps none."
+    "ECHELON_CACHE names the folder where compiled code, and what is proved and found of bundled "
+    "parts, is kept between runs; `off` keeps none."
 )
 
 app = typer.Typer(
