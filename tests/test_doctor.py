@@ -37,7 +37,9 @@ def test_every_listed_model_is_tried(monkeypatch):
 
 
 def test_a_broken_model_fails_the_check_of_models(monkeypatch):
-    monkeypatch.setattr(SingleIntegrator, "drift", lambda self, x: x[:1])
+    # Another class: of a model that was checked before it is known what was found.
+    broken = type("SingleIntegrator", (SingleIntegrator,), {"drift": lambda self, x: x[:1]})
+    monkeypatch.setattr(sys.modules["echelon.models"], "SingleIntegrator", broken)
     found = verdict("_models")
     assert not found.holds
     assert found.found == "`drift` of `SingleIntegrator` has shape (1,), and must have shape (2,)."

@@ -118,7 +118,7 @@ def test_an_array_that_is_changed_in_place_is_noticed():
 
 def test_a_model_that_cannot_be_hashed_is_computed_anew(counted):
     count, models = counted
-    for k, value in enumerate([{"a": 1.0}, np.array([1.0, None], object)]):
+    for k, value in enumerate([{1.0}, np.array([1.0, None], object)]):
         model = Tank(value)
         assert (count(model), count(model)) == (2 * k + 1, 2 * k + 2)
 
