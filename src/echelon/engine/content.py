@@ -18,24 +18,33 @@ from echelon.network.formation import Formation
 def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable:
     """Return all that a run rests on but the followers' gain; None where that cannot be told.
 
-    By its bits: what somebody changes in place is another run. What a user's classes and functions
-    read, nobody can tell.
+    By its bits: what somebody changes in place is another run.
     """
     if not isinstance(parts, Parts):
         return None
-    drive = parts.drive
-    if isinstance(drive, Laws) and drive.gain is not None:
-        law: Any = eqx.tree_at(lambda law: law.gain, drive.follower, None)
-        parts = parts.replace(drive=drive.with_follower(law))
-    acting = parts.model, parts.drive, parts.initial, parts.start_error, parts.world
-    if not is_ours((acting, settings, wrt)):
-        return None
     try:
-        key = identify((acting, parts.graph, parts.formation.offsets, settings, wrt))
+        key = identify((_acting(parts), parts.graph, parts.formation.offsets, settings, wrt))
         hash(key)
     except TypeError:
         return None
     return key
+
+
+def lasts(parts: Parts, settings: Settings) -> bool:
+    """Tell whether the same content is the same run; what a user's classes read, nobody can tell.
+
+    It is the same for all of one content, which says the classes too.
+    """
+    return is_ours((_acting(parts), settings))
+
+
+def _acting(parts: Parts) -> Any:
+    """Return the parts that have code, without the followers' gain."""
+    drive = parts.drive
+    if isinstance(drive, Laws) and drive.gain is not None:
+        law: Any = eqx.tree_at(lambda law: law.gain, drive.follower, None)
+        drive = drive.with_follower(law)
+    return parts.model, drive, parts.initial, parts.start_error, parts.world
 
 
 def copied(tree: Any) -> Any:

@@ -16,7 +16,7 @@ from echelon.core.numerics import precision
 from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.backward import Backward, Wants
-from echelon.engine.content import content_of, copied
+from echelon.engine.content import content_of, copied, lasts
 from echelon.engine.drive import Drive, Problem
 from echelon.engine.laws import Laws, choose_engine
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
@@ -111,7 +111,8 @@ def _taken(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> "_Ready":
     key = content_of(parts, settings, wrt)
     ready = _ready.pop(key, None) if key is not None else None
     if ready is None or not ready.turn(parts):
-        ready = _Ready(parts, settings, wrt, key)
+        lasting = key is not None and lasts(parts, settings)
+        ready = _Ready(parts, settings, wrt, key if lasting else None)
     return ready
 
 
