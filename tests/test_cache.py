@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from echelon.cli import cache
+from echelon.cli import app, cache
 from echelon.cli.cache import cache_folder, keep_compiled_code
+from echelon.core import store
 
 
 @pytest.fixture(autouse=True)
@@ -114,6 +115,38 @@ def test_what_the_user_told_jax_stands(tmp_path):
 def test_the_folder_is_the_users_alone(tmp_path):
     keep_compiled_code({"ECHELON_CACHE": str(tmp_path / "c")})
     assert (tmp_path / "c" / "compiled").stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("change", [lambda at: at.chmod(0o770), lambda at: at.chmod(0o702)])
+def test_a_folder_that_others_may_write_is_left_alone(tmp_path, change):
+    folder = tmp_path / "compiled"
+    folder.mkdir()
+    change(folder)
+    environment = {"ECHELON_CACHE": str(tmp_path)}
+    assert keep_compiled_code(environment) is None and len(environment) == 1
+    folder.chmod(0o755)
+    assert keep_compiled_code(environment) == folder
+
+
+def test_a_folder_of_someone_else_is_left_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    assert keep_compiled_code({"ECHELON_CACHE": str(tmp_path)}) is None
+
+
+def test_the_store_is_open_for_one_command_and_no_other_process(tmp_path, monkeypatch, echelon):
+    monkeypatch.setenv("ECHELON_CACHE", str(tmp_path))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    seen = []
+
+    def command():
+        seen.append(store.is_open())
+        raise SystemExit
+
+    monkeypatch.setattr(app, "app", command)
+    echelon()
+    assert seen == [True] and not store.is_open()
+    assert str(tmp_path / "compiled") in os.environ["JAX_COMPILATION_CACHE_DIR"]
+    assert not any("ECHELON" in name for name in os.environ if name != "ECHELON_CACHE")
 
 
 def test_what_was_written_first_goes_first(tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from echelon.core.errors import MissingExtraError
 from echelon.plots import moving, video
 from echelon.plots.camera import camera_for
 from echelon.plots.space import space_of
+from echelon.results.labelled import Labelled
 from echelon.results.recording import FORMAT, read_recording
 
 
@@ -35,6 +36,15 @@ def run(file):
 
 
 # ---- numbers ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("variables", "attributes"),
+    [({"a": ("x", [True, False])}, {}), ({}, {"a": ["one", "two"]}), ({}, {"a": True})],
+)
+def test_only_what_a_file_holds_as_it_is_is_written_without_xarray(variables, attributes):
+    with pytest.raises(AssertionError, match="`a` is of"):
+        Labelled(variables, {}, attributes).netcdf()
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "npz", "mat"])

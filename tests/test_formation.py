@@ -374,3 +374,9 @@ def test_drawn_neighbours_are_one_metre_apart_unless_said_otherwise(shape):
             places = places[1:]  # the leader stands in the middle
         gaps = np.linalg.norm(places[:, None] - places, axis=-1)[~np.eye(len(places), dtype=bool)]
         assert gaps.min() == pytest.approx(wanted)
+
+
+def test_formations_of_the_same_offsets_are_equal_and_hash_alike():
+    one, same, other = (Formation([[0.0, 0.0], [x, 1.0]]) for x in (0.0, -0.0, 2.0))
+    assert one == same and hash(one) == hash(same) and len({one, same, other}) == 2
+    assert one != other != one.offsets.tolist()

@@ -199,6 +199,69 @@ def test_what_is_changed_in_place_or_refused_is_seen_by_the_next_gradient():
         ech.gradient(parts, settings, squares, ("initial",))
 
 
+RATE = 1.0
+
+
+class Waning(ech.models.SingleIntegrator):
+    """Reads a number of its module."""
+
+    def drift(self, x):
+        return -RATE * x
+
+
+def test_a_run_of_a_user_s_class_is_made_anew(monkeypatch):
+    monkeypatch.setattr(gradients, "_ready", {})
+    parts = integrators(0.5).replace(model=Waning(1))
+    settings = ech.Settings(0.2, 0.1, integrator="euler", engine="native")
+
+    def value():
+        return ech.gradient(parts, settings, squares, ("initial",)).value
+
+    assert value() == pytest.approx(0.7**2 * (1.0 + 0.85**2))
+    monkeypatch.setitem(globals(), "RATE", 5.0)
+    assert value() == pytest.approx(0.7**2 * (1.0 + 0.45**2))
+    assert not gradients._ready
+
+
+def test_offsets_written_to_are_another_formation_and_equal_ones_the_same(monkeypatch):
+    monkeypatch.setattr(gradients, "_ready", {})
+    parts, settings = integrators(0.5), ech.Settings(0.2, 0.1, integrator="euler", engine="jax")
+
+    def value(offsets):
+        given = parts.replace(formation=offsets)
+        return ech.gradient(given, settings, squares, ("coupling",)).value
+
+    goals = ech.Formation(np.array([[0.0], [0.0]]))
+    first = value(goals)
+    assert value(ech.Formation(np.zeros((2, 1)))) == first and len(gradients._ready) == 1
+    goals.offsets.setflags(write=True)
+    goals.offsets[1] = 0.7
+    # Of a follower on its goal nothing is left to sum.
+    assert value(goals) == 0.0 < first == value(ech.Formation(np.zeros((2, 1))))
+    assert len(gradients._ready) == 2
+
+
+def test_what_is_kept_has_a_bound_in_bytes_and_holds_no_moments(monkeypatch):
+    monkeypatch.setattr(gradients, "_ready", {})
+    settings = ech.Settings(0.2, 0.1, engine="native")
+
+    def differentiate(start):
+        ech.gradient(integrators(0.5, start=start), settings, squares, ("coupling",))
+
+    differentiate(0.7)
+    (ready,) = gradients._ready.values()
+    assert not any(way.moments for way in ready._native._ways.values())
+    way = next(iter(ready._native._ways.values()))
+    assert ready.size > way.tape.nbytes + way.felt.nbytes
+    monkeypatch.setattr(gradients, "_ROOM", 2 * ready.size)
+    for start in (0.8, 0.9, 0.6):
+        differentiate(start)
+    assert 1 <= len(gradients._ready) <= 2
+    monkeypatch.setattr(gradients, "_ROOM", 10)
+    differentiate(0.7)
+    assert not gradients._ready
+
+
 class Stretched(ech.models.SingleIntegrator):
     """Sees differences twice as large as they are."""
 

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from concurrent import futures
 from concurrent.futures import ThreadPoolExecutor
 
@@ -14,8 +15,11 @@ from hypothesis import strategies as st
 
 import echelon as ech
 from echelon import kernels
-from echelon.engine import crew, native, order, room, turns
+from echelon.engine import code as kernel_code
+from echelon.engine import crew, native, order, own, room, turns
 from echelon.engine.drive import numbers
+from echelon.engine.loop import assemble
+from echelon.engine.own import Own
 from echelon.engine.prepare import prepare
 from echelon.kernels import moving
 
@@ -464,3 +468,110 @@ def test_where_agents_stand_changes_no_bit(monkeypatch):
 
     # On a line each stands beside the next, but for the leader's block.
     assert apart(moved) < 3.0 < 10.0 < apart(plain)
+
+
+RATE = -1.0
+
+
+class Decaying(ech.models.SingleIntegrator):
+    """Reads a number of its module."""
+
+    def drift(self, x):
+        return RATE * x
+
+
+class Tabled(ech.models.SingleIntegrator):
+    """Reads the first row of a table."""
+
+    table: np.ndarray
+
+    def __init__(self, table):
+        super().__init__(1)
+        self.table = table
+
+    def drift(self, x):
+        return x * self.table[0].sum()
+
+
+class Driven(ech.models.SingleIntegrator):
+    """Holds a function."""
+
+    rate: Callable
+
+    def __init__(self, rate):
+        super().__init__(1)
+        self.rate = rate
+
+    def drift(self, x):
+        return self.rate(x)
+
+
+def led(model):
+    """Return a leader that its drift alone moves from 1, and a follower."""
+    rest = ech.laws.TrimInput()
+    return ech.Parts(
+        model,
+        LINE,
+        ech.Formation(np.zeros((2, 1))),
+        ech.Laws(rest, rest),
+        initial=np.ones((2, 1)),
+    )
+
+
+LINE = ech.Graph.path(2)
+BRIEF = ech.Settings(0.3, 0.1, integrator="euler", engine="native")
+
+
+def test_what_a_user_s_class_reads_is_read_anew_for_each_run(monkeypatch):
+    def ended():
+        return ech.simulate(led(Decaying(1)), BRIEF).states[-1].ravel()
+
+    assert ended() == pytest.approx(0.9**3)
+    monkeypatch.setitem(globals(), "RATE", 5.0)
+    assert ended() == pytest.approx(1.5**3)
+    monkeypatch.setattr(Decaying, "drift", lambda self, x: 0.0 * x)
+    assert ended() == pytest.approx(1.0)
+
+
+def test_matrices_of_the_same_bits_and_other_shapes_are_other_models():
+    for shape, total in (((2, 3), 3.0), ((3, 2), 1.0)):
+        model = Tabled(np.arange(6.0).reshape(shape))
+        found = ech.simulate(led(model), BRIEF).states[-1].ravel()
+        assert found == pytest.approx((1.0 + 0.1 * total) ** 3)
+
+
+def own_of(model):
+    prepared = prepare(led(model), BRIEF)
+    drive = prepared.parts.drive
+    return Own([assemble(prepared.problem, drive.leader, drive.follower)])
+
+
+def test_a_program_is_known_by_shapes_and_types_and_not_where_nobody_knows_what_is_read(
+    monkeypatch,
+):
+    assert own_of(ech.models.SingleIntegrator(1)).signature is not None
+    assert own_of(Decaying(1)).signature is None
+    held = own_of(Driven(jnp.sin))
+    assert held.signature is None and not held.covers(held.loop)
+    # As of a class that may be trusted.
+    monkeypatch.setattr(own, "is_ours", lambda loop: True)
+    assert own_of(Driven(jnp.sin)).signature is None
+    numbers = [np.arange(6.0).reshape(2, 3), np.arange(6.0).reshape(3, 2), np.arange(6.0).view(int)]
+    signatures = [own_of(Tabled(each)).signature for each in numbers]
+    assert len({*signatures, own_of(Tabled(numbers[0].copy())).signature}) == 3
+
+
+def test_a_user_s_class_is_traced_anew_and_shares_machine_code(monkeypatch):
+    made = list[str]()
+
+    def code(text, folder):
+        made.append(text)
+        return kernels.Code(text, folder)
+
+    monkeypatch.setattr(kernel_code, "KERNELS", kernel_code.Kernels())
+    monkeypatch.setattr(kernel_code, "Code", code)
+    of = kernel_code.KERNELS.of
+    one, other = (of(own_of(Decaying(1)), 64, False) for _ in range(2))
+    assert one is not other and one.code is other.code and len(made) == 1
+    plain = [of(own_of(ech.models.SingleIntegrator(1)), 64, False) for _ in range(2)]
+    assert plain[0] is plain[1]

@@ -2,7 +2,10 @@
 
 import dataclasses
 import inspect
+import os
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from typing import Any
 
@@ -23,12 +26,18 @@ from echelon.scenario.own import own_class
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    """A folder where all is kept, as the command line names it, and nothing known before."""
-    monkeypatch.setenv(store.FOLDER, str(tmp_path))
+def folder(tmp_path):
+    """A folder where all is kept, as the command line opens it, and nothing known before."""
+    forget()
+    with store.opened(tmp_path):
+        yield tmp_path
+    forget()
+
+
+def forget():
+    """Let all be looked at again, as in another process."""
     store._ground.cache_clear()
-    yield tmp_path
-    store._ground.cache_clear()
+    store._loaded.cache_clear()
 
 
 class Own(VanDerPol):
@@ -90,13 +99,40 @@ def test_a_program_within_a_trace_is_a_part_of_it(slope, folder):
     assert list(folder.iterdir()) == []
 
 
-def test_code_that_calls_other_code_is_not_kept(folder, monkeypatch):
+def test_code_that_calls_other_code_is_left_to_jax(folder, monkeypatch):
+    traced = []
+
     def solved(a):
+        traced.append(a)
         return jnp.linalg.lstsq(a, a[0])[0]
 
     monkeypatch.setattr(solved, "__module__", "echelon.models.linearization")
-    assert Program(solved)(np.eye(2)).shape == (2,)
-    assert list(folder.iterdir()) == []
+    # JAX compiles what it traces itself, under a name that it finds again.
+    assert Program(solved)(np.eye(2)).shape == (2,) and len(traced) == 2
+    assert [store.read(entry) for entry in folder.iterdir()] == [b""]
+    for _ in range(2):
+        assert Program(solved)(np.eye(2)).shape == (2,)
+    # Nor is it traced to know of it once that is kept.
+    assert len(traced) == 2
+
+
+def test_what_another_thread_compiles_leaves_the_settings_of_jax(slope):
+    before = jax.config.values[program._LEAST]
+    scales = np.linspace(1.0, 2.0, 6).tolist()
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda scale: slope()(VanDerPol(), np.ones(2), scale), scales))
+    assert jax.config.values[program._LEAST] == before
+
+
+def test_a_program_is_compiled_for_what_is_set(monkeypatch):
+    def zeros(n):
+        return jnp.zeros(()) + n.sum()
+
+    monkeypatch.setattr(zeros, "__module__", "echelon.models.linearization")
+    made, n = Program(zeros), np.arange(3, dtype=np.int32)
+    for name in ("float32", "float64", "float32"):
+        with precision(name):
+            assert made(n).dtype == name
 
 
 def test_what_is_found_depends_on_every_bit_and_class():
@@ -131,10 +167,20 @@ def test_other_sources_settings_and_versions_find_nothing(monkeypatch):
     ):
         with monkeypatch.context() as at:
             change(at)
-            store._ground.cache_clear()
+            forget()
             assert place(1) not in (None, before)
-    store._ground.cache_clear()
+    forget()
     assert place(1) == before
+
+
+def test_what_is_set_counts_when_it_is_set_and_where():
+    places = [place(1)]
+    for name in ("float32", "float64"):
+        with precision(name):
+            places.append(place(1))
+            with jax.default_matmul_precision("bfloat16"):
+                places.append(place(1))
+    assert None not in places and len(set(places[1:])) == 4 and place(1) == places[0]
 
 
 def test_sources_are_told_by_all_that_stands_in_them(tmp_path, monkeypatch):
@@ -143,10 +189,10 @@ def test_sources_are_told_by_all_that_stands_in_them(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "__file__", str(home / "core" / "store.py"))
     monkeypatch.setattr(store, "_BEGAN", float("inf"))
     told = []
-    for name, text in (("a", "1"), ("a", "2"), ("b", "2"), ("core/a", "")):
+    for name, text in (("core/store", ""), ("a", "1"), ("a", "2"), ("b", "2"), ("core/a", "")):
         (home / f"{name}.py").write_text(text)
         told.append(store._sources())
-    assert None not in told and len(set(told)) == 4
+    assert None not in told and len(set(told)) == 5
 
 
 def test_nothing_is_kept_where_a_source_changed_since_the_process_began(folder, monkeypatch):
@@ -155,8 +201,66 @@ def test_nothing_is_kept_where_a_source_changed_since_the_process_began(folder, 
     # What was loaded after the change is no part of what was told before it.
     assert stored(lambda: 3, "what", 1) == 3 and place(1) == before
     assert list(folder.iterdir()) == []
-    store._ground.cache_clear()
+    forget()
     assert place(1) is None
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """Sources that were there before the process began."""
+    home = tmp_path / "home"
+    (home / "core").mkdir(parents=True)
+    for name in ("core/store.py", "late.py"):
+        (home / name).write_text("old")
+    monkeypatch.setattr(store, "__file__", str(home / "core" / "store.py"))
+    monkeypatch.setattr(store, "_BEGAN", (home / "late.py").stat().st_ctime + 0.01)
+    time.sleep(0.03)
+    forget()
+    return home
+
+
+def taken_back(home):
+    """A source that had another text for a while, and has its date again."""
+    before = (home / "late.py").stat().st_mtime
+    for text in ("new", "old"):
+        (home / "late.py").write_text(text)
+    os.utime(home / "late.py", (before, before))
+
+
+def replaced(home):
+    """Another version in the folder's place, all of it with old dates."""
+    os.rename(home / "late.py", home.parent / "late.py")
+
+
+@pytest.mark.parametrize("change", [taken_back, replaced])
+def test_a_source_that_changes_before_it_is_loaded_keeps_nothing(home, change):
+    file = place(1)
+    assert file is not None
+    store.keep(file, b"true")
+    change(home)
+    store.keep(file, b"false")
+    assert store.read(file) == b"true"
+
+
+def test_nothing_is_kept_where_python_runs_no_sources(home):
+    (home / "core" / "store.py").unlink()
+    assert place(1) is None
+
+
+def test_what_a_killed_process_leaves_goes_with_the_oldest(folder, monkeypatch):
+    def killed(beside, _):
+        begun.append(beside)
+        raise KeyboardInterrupt
+
+    begun, file = [], place(1)
+    with monkeypatch.context() as at:
+        at.setattr(os, "replace", killed)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                store.keep(file, b"made")
+    # Each by a name of its own, since two threads may write one file.
+    assert len(set(begun)) == 2 and all(name.endswith("-cache") for name in begun)
+    assert list(folder.iterdir()) == []
 
 
 class Still(eqx.Module):
@@ -196,9 +300,10 @@ def test_nothing_is_kept_once_a_users_file_is_loaded(tmp_path, monkeypatch):
     assert place(1) is None and not store.is_open()
 
 
-def test_the_library_keeps_nothing(monkeypatch):
-    monkeypatch.delenv(store.FOLDER)
-    assert place(1) is None
+def test_the_library_keeps_nothing(folder):
+    with store.opened(None):
+        assert place(1) is None and not store.is_open()
+    assert place(1) is not None
 
 
 def test_what_comes_back_is_equal_and_read_only(monkeypatch):

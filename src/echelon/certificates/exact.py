@@ -5,7 +5,6 @@ times a power of two. Elimination without fractions (Bareiss) keeps it so, and t
 pivots, which are the leading minors, are facts, not measurements.
 """
 
-import time
 from fractions import Fraction
 from typing import NamedTuple, TypeAlias
 
@@ -36,14 +35,13 @@ class ContractionProof(NamedTuple):
 
     `holds` is exact. `proved` counts the matrices shown definite: P, then the vertices in turn, up
     to the first that fails, whose number is `failed` (-1 for P, None where all hold).
-    `smallest_pivot` is that of P and of all -M_k together, `seconds` the time it took.
+    `smallest_pivot` is that of P and of all -M_k together.
     """
 
     holds: bool
     proved: int
     failed: int | None
     smallest_pivot: float
-    seconds: float
 
 
 class _Scaled(NamedTuple):
@@ -161,7 +159,6 @@ def prove_contraction(
         GainError: shapes do not fit, a number is not finite, `error` or `rho` is negative, or P is
             not symmetric.
     """
-    start = time.perf_counter()
     _check_shapes(vertices, error, B, P)
     metric, slack = _symmetrize(P, "P"), _scale(error, "error")
     weight, speed = _scale(rho, "rho"), _scale(rate, "rate")
@@ -179,8 +176,7 @@ def prove_contraction(
             failed = number
             break
         proved += 1
-    seconds = time.perf_counter() - start
-    return ContractionProof(failed is None, proved, failed, smallest, seconds)
+    return ContractionProof(failed is None, proved, failed, smallest)
 
 
 def _constant_part(

@@ -35,6 +35,7 @@ from echelon.cli.tune import tune
 from echelon.cli.verify import verify
 from echelon.cli.video import video
 from echelon.cli.view import view
+from echelon.core import store
 from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
@@ -43,7 +44,8 @@ _EPILOG = (
     "4 an optional part is not installed; 5 verified as far as it could be checked; 70 a fault of "
     "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept; "
     "141 done, and the reader of the output left before its end. "
-    "ECHELON_CACHE names the folder where compiled code is kept between runs; `off` keeps none."
+    "ECHELON_CACHE names the folder where compiled code, and what is proved and found of bundled "
+    "parts, is kept between runs; `off` keeps none."
 )
 
 app = typer.Typer(
@@ -59,8 +61,8 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
-    keep_compiled_code(os.environ)
-    with outlive_readers(), STOP.listen():
+    folder = keep_compiled_code(os.environ)
+    with store.opened(folder), outlive_readers(), STOP.listen():
         try:
             _call()
         except EchelonError as error:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import pickle
 from collections.abc import Callable, Hashable
 from typing import Any, ParamSpec, TypeVar, final
@@ -17,6 +18,8 @@ _R = TypeVar("_R")
 
 _MOST = 256
 """Answers remembered of each function: a sweep over parameters must not fill the memory."""
+_LARGE = 4096
+"""Bytes of an array of which a digest is remembered."""
 
 
 def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -90,5 +93,10 @@ def identify(value: Any) -> Any:
         array = np.asarray(value)
         # Those of objects would be addresses, which say nothing of what stands there.
         if not array.dtype.hasobject:
-            return type(value), array.dtype.str, array.shape, array.tobytes()
+            return type(value), array.dtype.str, array.shape, bits_of(array)
     return type(value), value
+
+
+def bits_of(array: np.ndarray) -> bytes:
+    """Return the bits of an array; of a large one, such as a graph's, a digest that is held."""
+    return array.tobytes() if array.nbytes < _LARGE else hashlib.sha256(array.tobytes()).digest()

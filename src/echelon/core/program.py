@@ -4,12 +4,12 @@ import contextlib
 import functools
 import os
 import pickle
+import threading
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar, final
+from typing import Any, Final, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
 import jax
-import numpy as np
 from jax.core import Tracer
 
 from echelon.core import store
@@ -17,6 +17,9 @@ from echelon.core import store
 _R = TypeVar("_R")
 _LEAST, _NEVER = "jax_persistent_cache_min_compile_time_secs", 1e9
 """Of compiling, s, from which on JAX keeps what it compiles."""
+_COMPILING: Final = threading.Lock()
+_OTHER: Final = b""
+"""Is kept where a program is left to JAX."""
 
 
 class _Place(NamedTuple):
@@ -42,7 +45,11 @@ class _Call(NamedTuple):
     def key(self) -> Hashable:
         """Return what is equal for calls of one program."""
         kinds = tuple(map(type, self.leaves))
-        return self.tree, self.leaves, kinds, tuple(map(_form, self.arrays))
+        return self.tree, self.leaves, kinds, self.forms(), store.settings()
+
+    def forms(self) -> tuple[Hashable, ...]:
+        """Return the shapes and types of the arrays."""
+        return tuple(map(_form, self.arrays))
 
     def arguments(self, arrays: Sequence[Any]) -> Any:
         """Return the arguments with other arrays in the places of theirs."""
@@ -77,23 +84,22 @@ class Program(Generic[_R]):
         return _filled(made.tree, made.run(*call.arrays))
 
     def _make(self, call: _Call) -> _Compiled | None:
-        """Return what is kept for a call, or compile and keep it; None for a stranger's classes."""
+        """Return what is kept for a call, or compile and keep it; None where JAX is to do it."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
-        # Places stand for what is traced; other arrays are known by their numbers. Of no arrays too
-        # the precision matters.
-        forms, whole = tuple(map(_form, call.arrays)), jax.tree.unflatten(call.tree, call.leaves)
-        file = store.place_of(name, _form(np.zeros(0)), forms, whole)
+        # Places stand for what is traced; other arrays are known by their numbers.
+        file = store.place_of(name, call.forms(), jax.tree.unflatten(call.tree, call.leaves))
         if file is None:
             return None
         stored = store.read(file)
         if stored is not None:
             # What cannot be read is made again.
             with contextlib.suppress(Exception):
-                return _load(stored, len(call.arrays))
-        made = _compile(self._function, call)
-        # What cannot be written down is not kept.
+                return None if stored == _OTHER else _load(stored, len(call.arrays))
+        made, packed = _compile(self._function, call), _OTHER
+        # What cannot be written down is for JAX to keep from the next process on.
         with contextlib.suppress(Exception):
-            store.keep(file, _packed(made))
+            packed = _OTHER if made is None else _packed(made)
+        store.keep(file, packed)
         return made
 
 
@@ -130,8 +136,8 @@ def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
 # ---- compiled code -------------------------------------------------------------------------------
 
 
-def _compile(function: Callable[..., Any], call: _Call) -> _Compiled:
-    """Return a function compiled for a call."""
+def _compile(function: Callable[..., Any], call: _Call) -> _Compiled | None:
+    """Return a function compiled for a call; None where it calls what is not JAX's, as LAPACK."""
     trees = list[Any]()
 
     def flat(*arrays: jax.Array) -> list[Any]:
@@ -146,12 +152,17 @@ def _compile(function: Callable[..., Any], call: _Call) -> _Compiled:
     # What JAX has read from its own disk cache cannot be written down again: it lacks its code.
     # Under a name of its own it is not found there, nor is it kept there as well.
     flat.__name__ = f"{function.__name__}_{os.urandom(8).hex()}"
-    lowered, least = jax.jit(flat, keep_unused=True).lower(*call.arrays), jax.config.values[_LEAST]
-    jax.config.update(_LEAST, _NEVER)
-    try:
-        compiled = lowered.compile()
-    finally:
-        jax.config.update(_LEAST, least)
+    lowered = jax.jit(flat, keep_unused=True).lower(*call.arrays)
+    if "custom_call" in lowered.as_text():
+        return None
+    # The setting is that of all threads.
+    with _COMPILING:
+        least = jax.config.values[_LEAST]
+        jax.config.update(_LEAST, _NEVER)
+        try:
+            compiled = lowered.compile()
+        finally:
+            jax.config.update(_LEAST, least)
     return _Compiled(compiled, trees[-1])
 
 

@@ -1,9 +1,9 @@
 """What took long to make, kept on disk between processes of the command line.
 
 What is kept is found by all that it was made from: echelon's own source, the versions below it, the
-machine, and the values that it was made for. Where one of them is of a class that is not echelon's,
-nothing is kept, since nobody knows what such a class reads. So nothing is found that these sources
-would not make.
+machine, what is set, and the values that it was made for. Where one of them is of a class that is
+not echelon's, nothing is kept, since nobody knows what such a class reads. So nothing is found that
+these sources would not make.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import hashlib
 import os
 import platform
 import sys
+import tempfile
 import threading
 import time
 import zlib
@@ -22,11 +23,11 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, Final
 
-FOLDER: Final = "ECHELON_KEPT"
-"""Of the environment: where all is kept. The command line sets it; the library keeps nothing."""
 _SETTINGS, _IDLE = ("xla_", "jax_"), ("cache", "log")
 """What the names of settings begin with that may change what JAX makes, and hold if they do not."""
-_BEGAN = time.time()
+_BEGAN = time.time() - 1.0
+"""When this process began, s, or before: a file's clock is coarser, and some were loaded first."""
+_folder: Path | None = None
 _closed = threading.Event()
 
 
@@ -34,9 +35,23 @@ class _Foreign(Exception):
     """A value of a class that is not echelon's."""
 
 
+@contextlib.contextmanager
+def opened(folder: Path | None) -> Iterator[None]:
+    """Keep all in a folder, or nothing, while the context lasts and in this process alone.
+
+    The command line opens one: who imports the library may change what its classes do.
+    """
+    global _folder
+    before, _folder = _folder, folder
+    try:
+        yield
+    finally:
+        _folder = before
+
+
 def is_open() -> bool:
     """Tell whether anything is kept in this process."""
-    return not _closed.is_set() and FOLDER in os.environ
+    return not _closed.is_set() and _folder is not None
 
 
 def close() -> None:
@@ -51,16 +66,39 @@ def place_of(what: str, *values: Any) -> Path | None:
         what: is made, by whom.
         values: trees of numbers, arrays, words and echelon's own classes.
     """
-    ground = _ground() if is_open() else None
-    if ground is None:
+    folder, ground = _folder, _ground() if is_open() else None
+    if folder is None or ground is None:
         return None
     made = hashlib.sha256(ground)
     try:
-        for part in _told((what, values)):
+        for part in _told((what, settings(), values)):
             made.update(b"%d:" % len(part) + part)
     except _Foreign:
         return None
-    return Path(os.environ[FOLDER]) / f"{made.hexdigest()}-made-cache"
+    return folder / f"{made.hexdigest()}-made-cache"
+
+
+def settings() -> tuple[str, ...]:
+    """Return what is set, in this thread, that may change what JAX makes."""
+    # Here, since the command line opens the store before it needs JAX.
+    import jax
+
+    # Of some, JAX knows but the value that all threads have.
+    of_all = jax.config.values
+    return tuple(f"{name}={getattr(jax.config, name, of_all[name])}" for name in _switches())
+
+
+def is_ours(value: Any) -> bool:
+    """Tell whether a tree of values is of echelon's own classes, and of such as never change.
+
+    What others define may be defined anew, or read what changes, as long as a process runs.
+    """
+    try:
+        for _ in _told(value):
+            pass
+    except _Foreign:
+        return False
+    return True
 
 
 def read(file: Path) -> bytes | None:
@@ -70,24 +108,33 @@ def read(file: Path) -> bytes | None:
     except OSError:
         return None
     # What is half-written or damaged would end the process and not only the run.
-    if hashlib.sha256(stored[32:]).digest() != stored[:32]:
-        return None
-    return zlib.decompress(stored[32:])
+    if hashlib.sha256(stored[32:]).digest() == stored[:32]:
+        with contextlib.suppress(zlib.error):
+            return zlib.decompress(stored[32:])
+    return None
 
 
 def keep(file: Path, made: bytes) -> None:
-    """Write what was made to a file, beside it first; a folder without room keeps nothing."""
-    # A file that is loaded late may have changed since the others were told.
-    if _changed():
-        return
-    beside, packed = file.with_name(f"{file.name}.{os.getpid()}"), zlib.compress(made, 1)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(hashlib.sha256(packed).digest() + packed)
-        beside.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            beside.unlink()
+    """Write what was made by echelon's sources to a file of `place_of`."""
+    # A source that is loaded late may have changed since all were told.
+    if _sources() == _loaded():
+        write(file, made)
+
+
+def write(file: Path, made: bytes) -> None:
+    """Write a file that `read` reads, beside it first; a folder without room keeps nothing."""
+    packed = zlib.compress(made, 1)
+    with contextlib.suppress(OSError):
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # By a name that goes with the oldest, should this process be killed before it has another.
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix="-cache", delete=False) as beside:
+            try:
+                beside.write(hashlib.sha256(packed).digest() + packed)
+                beside.close()
+                os.replace(beside.name, file)
+            except BaseException:
+                Path(beside.name).unlink(missing_ok=True)
+                raise
 
 
 # ---- what it was made from -----------------------------------------------------------------------
@@ -95,21 +142,21 @@ def keep(file: Path, made: bytes) -> None:
 
 @functools.cache
 def _ground() -> bytes | None:
-    """Return what all depends on: sources, versions, settings and the machine."""
-    # Here, since the command line reads a name of this file before it needs any of them.
+    """Return what all depends on for as long as a process lasts: sources, versions, machine."""
+    # Here, since the command line opens the store before it needs any of them.
     import equinox
     import jax
     import jaxlib
     import numpy as np
     import scipy
 
-    sources = _sources()
+    sources = _loaded()
     if sources is None or jax.local_device_count() > 1 or jax.default_backend() != "cpu":
         return None
     below = (np, scipy, jax, jaxlib, equinox)
     told = [*(module.__version__ for module in below), sys.version, _processor()]
-    settings = [*os.environ.items(), *jax.config.values.items()]
-    told += sorted(f"{key}={value}" for key, value in settings if _sets(key.lower()))
+    # JAX reads them once.
+    told += sorted(f"{key}={value}" for key, value in os.environ.items() if _sets(key.lower()))
     return hashlib.sha256(sources + "\0".join(told).encode()).digest()
 
 
@@ -117,21 +164,36 @@ def _sets(name: str) -> bool:
     return name.startswith(_SETTINGS) and not any(word in name for word in _IDLE)
 
 
+@functools.cache
+def _switches() -> tuple[str, ...]:
+    import jax
+
+    return tuple(filter(_sets, sorted(jax.config.values)))
+
+
+@functools.cache
+def _loaded() -> bytes | None:
+    """Return the sources as they were at the first look."""
+    return _sources()
+
+
 def _sources() -> bytes | None:
-    """Return what echelon's own files hold, in short; None where they are not what was loaded."""
+    """Return what echelon's own files hold, in short; None where they may not be what was loaded.
+
+    So it is where one changed while this process ran, and where Python runs what was made of them.
+    """
     home, told = Path(__file__).parents[1], hashlib.sha256()
-    if _changed():
+    try:
+        files = [(file, file.stat(), file.read_bytes()) for file in sorted(home.rglob("*.py"))]
+    except OSError:
         return None
-    for file in sorted(home.rglob("*.py")):
-        content = file.read_bytes()
+    # A file that was put there with an old date changed when it was put there.
+    late = any(max(status.st_mtime, status.st_ctime) >= _BEGAN for _, status, _ in files)
+    if late or Path(__file__) not in (file for file, *_ in files):
+        return None
+    for file, _, content in files:
         told.update(f"{file.relative_to(home)}\0{len(content)}\0".encode() + content)
     return told.digest()
-
-
-def _changed() -> bool:
-    """Tell whether a source changed while this process ran, which may have loaded it before."""
-    files = Path(__file__).parents[1].rglob("*.py")
-    return any(file.stat().st_mtime >= _BEGAN for file in files)
 
 
 def _processor() -> str:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.engine.code import LANES, Kernel, compiled, follows, plan_of
+from echelon.engine.code import KERNELS, LANES, Kernel, add_to, compiled, follows, plan_of
 from echelon.engine.loop import Loop, Moment, begin, signals
 from echelon.engine.native import STEPS, NativeStepper, any_beyond
 from echelon.engine.own import Own
@@ -31,8 +31,6 @@ _TAPE = 256 * 2**20
 """Bytes of a tape, unless steps are so many that it takes the root of what all would."""
 _LIGHT = 32 * 2**20
 """Bytes of a tape that is kept for the next run, since they take a while to be had."""
-_KEPT = 8
-"""Pairs of kernels that are kept for other runs."""
 
 
 class Wants(NamedTuple):
@@ -58,11 +56,12 @@ def _pair(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
     wind, signature = own.loop.motion.wind, own.signature
     # The signature is of all but the wind's numbers, which have rows where there is one.
     key = (signature, wind is None, wind is None or wind.noise is None, lines, wants)
-    if signature is None or key not in _pairs:
-        while len(_pairs) >= _KEPT:
-            _pairs.pop(next(iter(_pairs)))
-        _pairs[key] = _made(own, lines, wants)
-    return _pairs[key]
+    found = None if signature is None else _pairs.get(key)
+    if found is None:
+        found = _made(own, lines, wants)
+        if signature is not None:
+            add_to(_pairs, key, found)
+    return found
 
 
 def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
@@ -87,7 +86,8 @@ def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
         ahead=False,
         backward=True,
     )
-    return _Pair(compiled(rows, forward, {}), compiled(rows, backward, {}), felt)
+    onward, back = (compiled(rows, way, KERNELS.codes) for way in (forward, backward))
+    return _Pair(onward, back, felt)
 
 
 def _onto_tape(body: Body, way: Pulled) -> Body:
@@ -176,6 +176,13 @@ class Backward:
         self.own.turn(loop)
         self.stepper.turn(loop)
 
+    @property
+    def size(self) -> int:
+        """Bytes of the arrays that are held from one run to the next."""
+        found, blocks = self.stepper.found, (self.stepper.blocks, *self.stepper.mirrors)
+        room = (self.felt, *self.mirrors, self.fed, self.totals, self.table, self._room)
+        return sum(array.nbytes for array in jax.tree.leaves((found, blocks, room, self.reach)))
+
     # ---- forwards ----
 
     def run(self) -> Sums | None:
@@ -189,6 +196,7 @@ class Backward:
             made = self._advance(now, first)
             now, sums = made.now, made.sums if sums is None else sums.plus(made.sums)
             if any_beyond(now.states, BITS):
+                self.moments.clear()
                 return None
         return sums
 
@@ -219,6 +227,7 @@ class Backward:
                 self._advance(self.moments[first // self.stretch], first)
             self._back(first, min(self.steps, first + self.stretch))
         found = self._ended()
+        self.moments.clear()
         if self.tape.nbytes > _LIGHT:
             self._room = None
             self.stepper.record(None, 0)

@@ -1,9 +1,8 @@
 """The code that steps loops, made once for those that are alike but for their numbers."""
 
-from collections.abc import Callable, Hashable, MutableMapping
+from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import NamedTuple, TypeAlias, final
-from weakref import WeakValueDictionary
+from typing import Any, NamedTuple, TypeAlias, final
 
 import jax
 import numpy as np
@@ -17,7 +16,7 @@ from echelon.kernels import Code, Plan, program, shared, winds
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
 _KEPT = 8
-"""Kernels that are kept for other runs."""
+"""Kernels, and codes, that are kept for other runs."""
 
 
 def follows(loop: Loop) -> bool:
@@ -69,7 +68,15 @@ def plan_of(
     return plan._replace(width=plan.width + winds(plan), ahead=ahead)
 
 
-def compiled(rows: Rows, plan: Plan, codes: MutableMapping[str, Code]) -> Kernel:
+def add_to(kept: dict[Any, Any], key: Hashable, made: Any) -> None:
+    """Keep what was made among what is kept for other runs; the oldest goes."""
+    # A sweep over models has one after the other.
+    for old in list(kept)[: 1 - _KEPT]:
+        kept.pop(old, None)
+    kept[key] = made
+
+
+def compiled(rows: Rows, plan: Plan, codes: dict[str, Code]) -> Kernel:
     """Return the code of a plan, and with it what is known of it.
 
     `codes` are those that were made, by their texts: other graphs are other numbers in the same.
@@ -77,8 +84,8 @@ def compiled(rows: Rows, plan: Plan, codes: MutableMapping[str, Code]) -> Kernel
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     text = program(plan)
-    code = codes.get(text) or Code(text, Path(cache) if cache else None)
-    codes[text] = code
+    code = codes.pop(text, None) or Code(text, Path(cache) if cache else None)
+    add_to(codes, text, code)
     return Kernel(code, rows, plan, len(shared(plan)))
 
 
@@ -88,12 +95,19 @@ Make: TypeAlias = Callable[[Own, int, bool, bool, bool], Kernel]
 
 @final
 class Kernels:
-    """Those that were made, so that loops alike but for their own numbers share one."""
+    """Those that were made, so that loops alike but for their own numbers share one.
+
+    Of loops whose trace may be another one the next time, such as of a user's classes, only machine
+    code is shared, by its text.
+
+    Attributes:
+        codes: those by their texts.
+    """
 
     def __init__(self) -> None:
         """Begin with none."""
+        self.codes: dict[str, Code] = {}
         self._made: dict[Hashable, Kernel] = {}
-        self._codes: MutableMapping[str, Code] = WeakValueDictionary()
 
     def of(
         self, own: Own, bits: int, together: bool, lines: bool = False, weighted: bool = False
@@ -109,12 +123,11 @@ class Kernels:
         key = (signature, wind, bits, LANES[bits], together, lines, weighted)
         found = None if signature is None else self._made.get(key)
         if found is None:
-            # The oldest goes: a sweep over models has one after the other.
-            for old in list(self._made)[: 1 - _KEPT]:
-                self._made.pop(old, None)
             rows = Rows.of(own.loop, own.count)
             plan = plan_of(own, rows, bits, together, lines, weighted, False)
-            found = self._made[key] = compiled(rows, plan, self._codes)
+            found = compiled(rows, plan, self.codes)
+            if signature is not None:
+                add_to(self._made, key, found)
         return found
 
 

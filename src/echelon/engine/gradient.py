@@ -16,6 +16,7 @@ from echelon.core.numerics import precision
 from echelon.core.program import program
 from echelon.core.types import Array
 from echelon.engine.backward import Backward, Wants
+from echelon.engine.content import content_of, copied, lasts
 from echelon.engine.drive import Drive, Problem
 from echelon.engine.laws import Laws, choose_engine
 from echelon.engine.loop import Loop, Moment, assemble, begin, control, step
@@ -65,7 +66,9 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     Args:
         parts: agents, graph, formation, laws, starts and world.
         settings: horizon, step and the like.
-        cost: of the sums over the run's steps, such as `lambda sums: sums.errors[0].sum()`.
+        cost: of the sums over the run's steps, such as `lambda sums: sums.errors[0].sum()`. As by
+            `jax.jit` a function is traced once: what else it reads, of its closure or its module,
+            stays as it was then, and another value wants another function.
         wrt: of `VARIABLES`.
 
     Raises:
@@ -98,45 +101,30 @@ class Run(NamedTuple):
 # ---- what is ready to be run again ---------------------------------------------------------------
 
 
-_READY, _LARGE = 4, 100_000
-"""Runs that are kept for other calls, and the states of one beside which that saves nothing."""
+_READY, _ROOM = 4, 128 * 2**20
+"""Runs that are kept for other calls, and the bytes of all of them together."""
 _ready: dict[Hashable, "_Ready"] = {}
 
 
 def _taken(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> "_Ready":
     """Return a run for a caller's own use, made ready unless it was before."""
-    key = _content(parts, settings, wrt)
+    key = content_of(parts, settings, wrt)
     ready = _ready.pop(key, None) if key is not None else None
     if ready is None or not ready.turn(parts):
-        ready = _Ready(parts, settings, wrt, key)
+        lasting = key is not None and lasts(parts, settings)
+        ready = _Ready(parts, settings, wrt, key if lasting else None)
     return ready
 
 
 def _give(ready: "_Ready") -> None:
     """Keep a run for the next caller."""
-    if ready.key is not None and ready.run.states.size < _LARGE:
-        _ready[ready.key] = ready
-        for key in list(_ready)[:-_READY]:
+    if ready.key is None:
+        return
+    _ready[ready.key], held = ready, 0
+    for k, (key, each) in enumerate(reversed(list(_ready.items()))):
+        held += each.size
+        if k >= _READY or held > _ROOM:
             _ready.pop(key, None)
-
-
-def _content(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable:
-    """Return all that a run rests on but the followers' gain; None where that cannot be told.
-
-    By its bits: what somebody changes in place is another run.
-    """
-    if not isinstance(parts, Parts):
-        return None
-    drive = parts.drive
-    if isinstance(drive, Laws) and drive.gain is not None:
-        law: Any = eqx.tree_at(lambda law: law.gain, drive.follower, None)
-        parts = parts.replace(drive=drive.with_follower(law))
-    try:
-        key = identify((parts, settings, wrt))
-        hash(key)
-    except TypeError:
-        return None
-    return key
 
 
 @final
@@ -146,13 +134,12 @@ class _Ready:
     def __init__(
         self, parts: Parts, settings: Settings, wrt: tuple[str, ...], key: Hashable
     ) -> None:
-        self.key, self.wrt, self.prepared = key, wrt, prepare(parts, settings)
-        drive, problem = self.prepared.parts.drive, self.prepared.problem
-        values = _values(problem, drive, wrt)
-        assert isinstance(drive, Laws)
-        loop = assemble(problem, drive.leader, drive.follower)
-        reference = sample_reference(self.prepared, 0, settings.steps)
-        self.run = Run(loop, values, problem.states, reference)
+        self.key, self.wrt, prepared = key, wrt, prepare(parts, settings)
+        self.problem, self.drive = copied((prepared.problem, prepared.parts.drive))
+        values = _values(self.problem, self.drive, wrt)
+        loop = assemble(self.problem, self.drive.leader, self.drive.follower)
+        reference = sample_reference(prepared, 0, settings.steps)
+        self.run = Run(loop, values, self.problem.states, reference)
         self.gain, self._native = identify(parts.drive.gain), None
 
     def turn(self, parts: Parts) -> bool:
@@ -163,11 +150,10 @@ class _Ready:
         gain = identify(parts.drive.gain)
         if gain == self.gain:
             return True
-        problem, known, given = self.prepared.problem, self.prepared.parts.drive, parts.drive
-        assert isinstance(known, Laws) and isinstance(given, Laws)
+        problem, leader, given = self.problem, self.drive.leader, copied(parts.drive)
         follower = given.follower.prepared(problem.model, problem.graph)
-        drive = Laws(known.leader, follower.following(known.leader, problem.model))
-        loop = assemble(problem, known.leader, drive.follower)
+        drive = Laws(leader, follower.following(leader, problem.model))
+        loop = assemble(problem, drive.leader, drive.follower)
         if not alike(loop, self.run.loop):
             return False
         drive.accept(problem)
@@ -180,8 +166,15 @@ class _Ready:
     def natively(self, cost: Cost) -> Gradient:
         """Return the gradient of a cost by native code."""
         if self._native is None:
-            self._native = Native(self.run, self.prepared.problem.settings.steps)
+            self._native = Native(self.run, self.problem.settings.steps)
         return self._native.gradient(cost)
+
+    @property
+    def size(self) -> int:
+        """Bytes of what is held from one call to the next."""
+        arrays = jax.tree.leaves((self.run, self.problem.graph.edges, self.problem.graph.weights))
+        held = sum(np.asarray(array).nbytes for array in arrays)
+        return held + (0 if self._native is None else self._native.size)
 
 
 # ---- by native code ------------------------------------------------------------------------------
@@ -217,6 +210,11 @@ class Native:
             if isinstance(way, Backward):
                 way.turn(run.loop)
         return True
+
+    @property
+    def size(self) -> int:
+        """Bytes of what is held from one cost to the next."""
+        return sum(way.size for way in self._ways.values() if isinstance(way, Backward))
 
     def gradient(self, cost: Cost) -> Gradient:
         """Return the gradient of a cost.

@@ -4,7 +4,6 @@ Or between one formation now and later, where somebody turns its knobs.
 """
 
 import dataclasses
-import hashlib
 import operator
 from collections.abc import Hashable, Sequence
 from typing import Any, final
@@ -13,11 +12,10 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from echelon.core.kept import bits_of
+from echelon.core.store import is_ours
 from echelon.core.types import Array
 from echelon.engine.loop import Loop
-
-_LARGE = 4096
-"""Bytes of an array of which a digest is remembered."""
 
 
 def _apart(loop: Loop) -> list[Any]:
@@ -88,7 +86,8 @@ class Own:
     def covers(self, loop: Loop) -> bool:
         """Tell whether a loop is like the first but for these numbers."""
         leaves, tree = jax.tree.flatten(bare(loop))
-        same = _forms(leaves, tree) == _forms(self._flat, self._tree)
+        forms = _forms(leaves, tree)
+        same = forms == _forms(self._flat, self._tree) and _are_numbers(forms)
         return same and self._fixed(leaves) == self._constant
 
     def turn(self, loop: Loop) -> None:
@@ -98,8 +97,14 @@ class Own:
 
     @property
     def signature(self) -> Hashable:
-        """What decides the program, the same for other values; None where it cannot be told."""
-        key = (self._tree, *self._constant, *(mask.tobytes() for mask in self._masks))
+        """What decides the program, the same for other values; None where it cannot be told.
+
+        As of a stranger's class, whose methods may be others when they are traced again.
+        """
+        forms = _forms(self._flat, self._tree)
+        if not (_are_numbers(forms) and is_ours(self.loop)):
+            return None
+        key = forms, *self._constant, *(mask.tobytes() for mask in self._masks)
         try:
             hash(key)
         except TypeError:
@@ -109,7 +114,7 @@ class Own:
     def _fixed(self, leaves: Sequence[Any]) -> list[bytes]:
         """Return what says the leaves without the numbers that differ."""
         return [
-            _said(np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf))
+            bits_of(np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf))
             for leaf, mask in zip(leaves, self._masks, strict=True)
         ]
 
@@ -134,11 +139,6 @@ class Own:
         return eqx.tree_at(_apart, new, _apart(self.loop), is_leaf=lambda x: x is None)
 
 
-def _said(array: Array) -> bytes:
-    """Return the bits of an array; of a large one, such as a graph's, a digest that is kept."""
-    return array.tobytes() if array.nbytes < _LARGE else hashlib.sha256(array.tobytes()).digest()
-
-
 def alike(loop: Loop, other: Loop) -> bool:
     """Tell whether two loops are alike but for what stands in their leaves."""
     return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
@@ -146,7 +146,12 @@ def alike(loop: Loop, other: Loop) -> bool:
 
 def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
     arrays = [np.asarray(leaf) for leaf in leaves]
-    return tree, [(array.dtype, array.shape) for array in arrays]
+    return tree, *((array.dtype, array.shape) for array in arrays)
+
+
+def _are_numbers(forms: tuple[Any, ...]) -> bool:
+    """Tell whether the bits of leaves say what stands there; those of functions are addresses."""
+    return not any(kind.hasobject for kind, _ in forms[1:])
 
 
 def _differing(leaves: Sequence[Any]) -> Array:

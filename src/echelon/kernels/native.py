@@ -1,9 +1,7 @@
 """Code for this machine from text for LLVM, kept between processes, and called by address."""
 
-import contextlib
 import ctypes
 import hashlib
-import os
 import platform
 from functools import cache
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
+from echelon.core import store
 from echelon.core.errors import MissingExtraError
 from echelon.core.trace import in_short
 from echelon.kernels.entries import Unsupported
@@ -85,11 +84,11 @@ class Code:
             reloc="pic" if _LINKED else "default",
         )
         stored = _stored(text, binding, cache_folder)
-        made = None if stored is None else _read(stored)
+        made = None if stored is None else store.read(stored)
         if made is None:
             made = self._compile(binding, text)
             if stored is not None:
-                _keep(stored, made)
+                store.write(stored, made)
         self._jit = binding.create_lljit_compiler(self._machine, use_jit_link=_LINKED)
         name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
         builder = binding.JITLibraryBuilder().add_object_img(made).export_symbol("run")
@@ -122,28 +121,6 @@ def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
     parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
     parts += [platform.system(), platform.machine()]
     return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
-
-
-def _read(file: Path) -> bytes | None:
-    """Return machine code from a file; None where it is not there, or not whole."""
-    try:
-        stored = file.read_bytes()
-    except OSError:
-        return None
-    # A half-written or damaged object would end the process and not only the run.
-    return stored[32:] if hashlib.sha256(stored[32:]).digest() == stored[:32] else None
-
-
-def _keep(file: Path, made: bytes) -> None:
-    """Write machine code to a file, beside it first; a folder without room keeps nothing."""
-    beside = file.with_name(f"{file.name}.{os.getpid()}")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_bytes(hashlib.sha256(made).digest() + made)
-        beside.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            beside.unlink()
 
 
 def aligned(shape: tuple[int, ...], dtype: np.dtype[Any] | type) -> np.ndarray:

@@ -43,6 +43,15 @@ class Formation:
             )
         self.offsets.setflags(write=False)
 
+    def __eq__(self, other: object) -> bool:
+        """Tell whether two formations have the same offsets."""
+        return isinstance(other, Formation) and np.array_equal(self.offsets, other.offsets)
+
+    def __hash__(self) -> int:
+        """Hash what `__eq__` compares."""
+        # Where -0.0 is 0.0, which it equals.
+        return hash((self.offsets.shape, (self.offsets + 0.0).tobytes()))
+
     @classmethod
     def from_offsets(
         cls, model: ControlAffine, graph: Graph, offsets: Mapping[int, Sequence[float]]

@@ -47,7 +47,8 @@ class Labelled(NamedTuple):
             # Labels that no variable names are named by the whole.
             rest = {"coordinates": " ".join(sorted(labels))} if labels else {}
             for name, value in {**self.attributes, **rest}.items():
-                written.attrs[name] = value if isinstance(value, str) else np.atleast_1d(value)
+                known = value if isinstance(value, str) else _known(name, np.atleast_1d(value))
+                written.attrs[name] = known
         return file.getvalue()
 
     def _labels(self, dimensions: tuple[str, ...] | None = None) -> list[str]:
@@ -79,12 +80,18 @@ def _write(
             file.dimensions[dimension] = size
     # Of text no file knows the length beforehand, and what is NaN in a float is missing.
     text = values.dtype.kind in "UO"
-    kind: Any = _text() if text else values.dtype
+    kind: Any = _text() if text else _known(name, values).dtype
     missing = values.dtype.type(np.nan) if values.dtype.kind == "f" else None
     made = file.create_variable(name, dimensions, kind, fillvalue=missing)
     made[...] = values.astype(object) if text else values
     for key, value in attributes.items():
         made.attrs[key] = value
+
+
+def _known(name: str, values: Array) -> Array:
+    """Return numbers of a kind that stands in a file as it is."""
+    assert values.dtype.kind in "iuf", f"`{name}` is of {values.dtype}, which `xarray` turns first"
+    return values
 
 
 def _text() -> Any:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core import numerics
+from echelon.core import numerics, store
 from echelon.core.errors import ModelError
 from echelon.core.provenance import versions
 from echelon.engine.crew import processors
@@ -62,7 +62,8 @@ def checks() -> Iterator[Check]:
         _closed_loop,
     )
     for test in tests:
-        with numerics.precision("float64"):
+        # What an earlier command found says nothing of this machine as it is now.
+        with numerics.precision("float64"), store.opened(None):
             check = test()
         yield check
 
