@@ -24,6 +24,9 @@ _OPEN = {"add", "sub", "mul", "neg"}
 _LARGEST = 1e30
 """Of a plain number that is put together, and of its inverse: single precision holds 1e38."""
 
+_MOST = 64
+"""Of what a sum is opened for, so that long sums take time and memory by their length alone."""
+
 
 class Term(NamedTuple):
     """A plain number times factors, which stand in order.
@@ -85,8 +88,9 @@ class _Sums:
             made = _sum_of(node, terms)
         if len(terms) == 1 and node.op != "neg":
             terms = [terms[0]._replace(sign=1.0, written=made, inside=None)]
-        self.terms[node] = terms
-        self.shared[node] = {c for term in terms for c in self._multiples(term)}
+        common = set[Common]().union(*map(self._multiples, terms))
+        if len(common) <= _MOST:
+            self.terms[node], self.shared[node] = terms, common
         return made
 
     def _product(self, node: Node) -> tuple[list[Term], bool]:
@@ -141,7 +145,10 @@ class _Sums:
         """Return what a term, or one of those inside, is a multiple of."""
         if term.inside is not None:
             return self.shared[term.inside]
-        return {c for one in (term, _bare(term)) for c in _multiples(one)}
+        found = set(_multiples(term))
+        if any(factor.op == "mul" for factor in term.factors):
+            found.update(_multiples(_bare(term)))
+        return found
 
 
 def _multiples(term: Term) -> list[Common]:
