@@ -1,6 +1,7 @@
 """Native code against JAX and against long doubles: functions, loops, choices, what is refused."""
 
 import itertools
+import random
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from lanes import lowered, run, text_of
 from scipy.special import erf
 
 from echelon.core.numerics import precision, rk4
-from echelon.kernels import Graph, Unsupported, native, needed
+from echelon.kernels import Graph, Unsupported, native, needed, shortened
+from echelon.kernels.scalar import OPERATIONS
 from echelon.models import Quadrotor
 
 rng = np.random.default_rng(7)
@@ -422,6 +424,41 @@ def test_what_products_have_in_common_is_multiplied_once():
     assert products(lambda v: v[0] * 0.5 * v[1] + v[2] * 0.5 * v[1] + v[3] * v[1], 4) == 2
     both = lowered(lambda v: jnp.stack([v[2] * (3.0 * v[0]), v[3] * (3.0 * v[0])]), 4)
     assert sum(node.op == "mul" for node in needed(both)) == 3
+
+
+def numbers_of(results, row):
+    """Return what results are of small whole numbers, where no order of sums rounds."""
+    found = {}
+    for node in needed(results):
+        if node.op == "leaf":
+            found[node] = row[node.value[1]]
+        else:
+            args = [found[a] for a in node.args]
+            found[node] = OPERATIONS[node.op](*args) if args else node.value
+    return [found[node] for node in results]
+
+
+def test_sums_of_whole_numbers_stay_the_same_with_no_more_products():
+    drawn, fewer = random.Random(2), 0
+    for _ in range(400):
+        graph = Graph()
+        pool = [graph.leaf("row", k, uniform=k == 0) for k in range(4)]
+        for _ in range(16):
+            op = drawn.choice(["add", "add", "sub", "sub", "mul", "mul", "mul", "neg"])
+            plain = graph.constant(drawn.choice([0.5, 2.0, -2.0, 3.0]))
+            args = [drawn.choice([plain, *pool[-6:]]) for _ in range(1 if op == "neg" else 2)]
+            pool.append(graph.make(op, *args))
+        short, row = shortened(pool[-2:]), [3.0, -5.0, 2.0, 7.0]
+        exact = numbers_of(pool[-2:], row)
+        if max(map(abs, exact)) < 2.0**40:
+            assert numbers_of([short[node] for node in pool[-2:]], row) == exact
+        before, after = (
+            sum(node.op == "mul" and not node.uniform for node in needed(results))
+            for results in (pool[-2:], short.values())
+        )
+        assert after <= before
+        fewer += after < before
+    assert fewer > 10
 
 
 @pytest.mark.parametrize(
