@@ -25,7 +25,8 @@ def lowered(function, count, bits=64):
     x = np.empty(count, object)
     x[:] = [graph.leaf("row", k) for k in range(count)]
     found = [node for part in lower(function, graph, [x]) for node in nodes(graph, part)]
-    found = [shortened(found)[node] for node in found]
+    short = shortened(found)
+    found = [short[node] for node in found]
     return [graph.make("select", n, 1.0, 0.0) if n.truth else n for n in found]
 
 

@@ -1,6 +1,7 @@
 """Native code against JAX and against long doubles: functions, loops, choices, what is refused."""
 
 import itertools
+import random
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from lanes import lowered, run, text_of
 from scipy.special import erf
 
 from echelon.core.numerics import precision, rk4
-from echelon.kernels import Graph, Unsupported, native, needed
+from echelon.kernels import Graph, Unsupported, native, needed, shortened
+from echelon.kernels.scalar import OPERATIONS
 from echelon.models import Quadrotor
 
 rng = np.random.default_rng(7)
@@ -398,6 +400,15 @@ def test_nothing_is_told_twice_and_what_is_plain_is_folded():
     assert (x * 0.0).value == 0.0 and (graph.constant(2.0) * 3.0).value == 6.0
 
 
+def test_a_long_chain_and_shared_numbers_are_known_not_to_be_below_0():
+    x = total = Graph().leaf("row", 0)
+    assert not x.at_least_0
+    total = x.graph.make("abs", x)
+    for k in range(1200):
+        total = total + total * total if k < 40 else total + 2.0
+    assert total.at_least_0 and not (total - 1.0).at_least_0
+
+
 def products(function, count):
     return sum(node.op == "mul" for node in needed(lowered(function, count)))
 
@@ -415,6 +426,41 @@ def test_what_products_have_in_common_is_multiplied_once():
     assert sum(node.op == "mul" for node in needed(both)) == 3
 
 
+def numbers_of(results, row):
+    """Return what results are of small whole numbers, where no order of sums rounds."""
+    found = {}
+    for node in needed(results):
+        if node.op == "leaf":
+            found[node] = row[node.value[1]]
+        else:
+            args = [found[a] for a in node.args]
+            found[node] = OPERATIONS[node.op](*args) if args else node.value
+    return [found[node] for node in results]
+
+
+def test_sums_of_whole_numbers_stay_the_same_with_no_more_products():
+    drawn, fewer = random.Random(2), 0
+    for _ in range(400):
+        graph = Graph()
+        pool = [graph.leaf("row", k, uniform=k == 0) for k in range(4)]
+        for _ in range(16):
+            op = drawn.choice(["add", "add", "sub", "sub", "mul", "mul", "mul", "neg"])
+            plain = graph.constant(drawn.choice([0.5, 2.0, -2.0, 3.0]))
+            args = [drawn.choice([plain, *pool[-6:]]) for _ in range(1 if op == "neg" else 2)]
+            pool.append(graph.make(op, *args))
+        short, row = shortened(pool[-2:]), [3.0, -5.0, 2.0, 7.0]
+        exact = numbers_of(pool[-2:], row)
+        if max(map(abs, exact)) < 2.0**40:
+            assert numbers_of([short[node] for node in pool[-2:]], row) == exact
+        before, after = (
+            sum(node.op == "mul" and not node.uniform for node in needed(results))
+            for results in (pool[-2:], short.values())
+        )
+        assert after <= before
+        fewer += after < before
+    assert fewer > 10
+
+
 @pytest.mark.parametrize(
     "function",
     [
@@ -428,6 +474,40 @@ def test_what_rounding_is_meant_to_do_is_left_to_it(function):
     columns = np.random.default_rng(5).normal(size=(2, 64)) * 1e-7
     [found] = run(function, columns)
     np.testing.assert_allclose(found, by_jax(function, columns)[0], rtol=0, atol=4e-22)
+
+
+@pytest.mark.parametrize(
+    ("function", "values"),
+    [
+        (lambda v: v[0] * v[1] * v[2] + (v[3] - v[4]), [1e-4, 1e-4, 1.0, 1e5, 1e5]),
+        (lambda v: v[0] * v[1] * v[2] + (v[3] - v[4]), [1.0, 1.0, 0.3, 1e15, 1e15]),
+        (lambda v: 0.5 * v[0] * v[1] + (1.0 - v[2]), [1e-6, 1e-6, 1.0]),
+        (lambda v: 0.1 * v[3] * v[4] + (v[0] - (v[1] + v[2])), [1.0, 1e20, -1e20, 1.0, 1.0]),
+        # A difference beside what does have something in common, and beneath it.
+        (lambda v: (v[0] * v[1] + (v[2] - v[3])) + v[4] * v[1], [0.1, 0.3, 1e15, 1e15, 0.2]),
+        (lambda v: 0.5 * v[0] + (0.5 * v[1] - 0.5 * v[2]), [1e-12, 1.0, 1.0]),
+        (lambda v: v[0] * 0.5 - (v[1] * 0.5 - v[2] * 0.5), [1e-12, 1.0, 1.0]),
+    ],
+)
+def test_parentheses_hold_where_nothing_is_in_common(function, values):
+    columns = np.tile(np.array(values)[:, None], 8)
+    np.testing.assert_allclose(run(function, columns), by_jax(function, columns), rtol=1e-14)
+
+
+def test_what_is_no_number_stays_none_where_terms_are_the_same():
+    columns = np.tile([[np.inf], [1.0]], 8)
+    assert np.isnan(run(lambda v: (2.0 * v[0]) * v[1] - v[0] * (2.0 * v[1]), columns)).all()
+
+
+@pytest.mark.parametrize(("large", "bits"), [(1e200, 64), (1e25, 32)])
+def test_products_are_made_as_written_where_nothing_is_in_common(large, bits):
+    def function(v):
+        return (v[0] * v[2]) * v[1] + v[3]
+
+    dtype = np.float64 if bits == 64 else np.float32
+    for values in ([large, large, 1.0 / large, 1.0], [1.0 / large, 1.0 / large, large, 0.0]):
+        columns = np.tile(np.array(values, dtype)[:, None], 64)
+        np.testing.assert_allclose(run(function, columns, bits), columns[:1], rtol=1e-6)
 
 
 def test_numbers_too_large_to_be_put_together_are_multiplied_as_written():

@@ -22,7 +22,7 @@ from echelon.kernels.polynomials import (
     polynomial,
     sine_series,
 )
-from echelon.kernels.scalar import Node, is_at_least_0
+from echelon.kernels.scalar import Node
 
 
 def _reduce(x: Node, k: Node, period: Fraction) -> Node:
@@ -212,7 +212,7 @@ def logistic(x: Node) -> Node:
 def atan2(y: Node, x: Node) -> Node:
     """Return the angle of the point (x, y)."""
     whole = _angle(y, x)
-    if not is_at_least_0(x):
+    if not x.at_least_0:
         return whole
     # What lies ahead mostly does so by less than tan(pi/8): then the ratio is taken as it is.
     t = y / x

@@ -2,9 +2,14 @@
 
 What users write as matrices and as stages of an integrator has the same factors many times. Here a
 sum is seen as terms, each a plain number times factors: terms of the same factors become one, and
-what several terms have in common is multiplied once. What is known first is multiplied first, so
-that stages of an integrator share it. Results may differ by rounding from what was written; what is
-marked as `kept`, the inside of elementary functions, stays as it is.
+what several terms have in common is multiplied once; there, what is known first is multiplied
+first, so that stages of an integrator share it. A sum within a sum is opened only where the two
+have something in common. Everything else is computed as it is written, and so is what is marked as
+`kept`, the inside of elementary functions.
+
+Where something was taken out, results differ by the rounding of the terms, and numbers may become
+too large or too small in other places: x a - x b is none (NaN) at x = 10 and a = b = 1e308 as it is
+written, and 0 as x (a - b). What is no number for another reason stays none.
 """
 
 import math
@@ -19,12 +24,30 @@ _OPEN = {"add", "sub", "mul", "neg"}
 _LARGEST = 1e30
 """Of a plain number that is put together, and of its inverse: single precision holds 1e38."""
 
+_MOST = 64
+"""Of what a sum is opened for, so that long sums take time and memory by their length alone."""
+
 
 class Term(NamedTuple):
-    """A plain number times factors, which stand in order."""
+    """A plain number times factors, which stand in order.
+
+    Attributes:
+        share: the plain number.
+        factors: what it is multiplied by.
+        sign: of the term, where `written` is there.
+        written: what it is without its sign, made as it was written.
+        inside: the sum, before anything was made of it, that the only factor is.
+    """
 
     share: float
     factors: tuple[Node, ...]
+    sign: float = 1.0
+    written: Node | None = None
+    inside: Node | None = None
+
+    def times(self, sign: float) -> "Term":
+        """Return the term or what takes it off."""
+        return self._replace(share=sign * self.share, sign=sign * self.sign)
 
 
 Common: TypeAlias = Node | float
@@ -40,14 +63,14 @@ def shortened(results: Sequence[Node]) -> Mapping[Node, Node]:
 
 @final
 class _Sums:
-    """What nodes become, one after the other: the terms of each, as they are and shortened."""
+    """What nodes become, one after the other; their terms, and what these are multiples of."""
 
     def __init__(self, results: Sequence[Node]) -> None:
         nodes = needed(results)
         self.users = Counter(a for node in nodes for a in node.args)
         self.users.update(results)
         self.made = dict[Node, Node]()
-        self.terms, self.short = dict[Node, list[Term]](), dict[Node, list[Term]]()
+        self.terms, self.shared = dict[Node, list[Term]](), dict[Node, set[Common]]()
         for node in nodes:
             self.made[node] = self._become(node)
 
@@ -58,42 +81,81 @@ class _Sums:
         if node.op not in _OPEN or node.kept or node.uniform:
             made.kept |= node.kept
             return made
-        self.terms[node] = self.short[node] = terms = self._of(node)
+        terms, fewer = self._product(node) if node.op == "mul" else self._sum(node)
         if not all(map(_is_sound, terms)):
             return made
-        self.short[node] = short = _fewer(terms)
-        simpler = len(short) < len(terms) or any(map(_is_long, short))
-        return _sum_of(node, short) if simpler else made
+        if fewer:
+            made = _sum_of(node, terms)
+        if len(terms) == 1 and node.op != "neg":
+            terms = [terms[0]._replace(sign=1.0, written=made, inside=None)]
+        common = set[Common]().union(*map(self._multiples, terms))
+        if len(common) <= _MOST:
+            self.terms[node], self.shared[node] = terms, common
+        return made
 
-    def _of(self, node: Node) -> list[Term]:
-        """Return the terms of a node."""
-        if node.op == "mul":
-            return [self._product(node)]
-        signs = {"add": (1.0, 1.0), "sub": (1.0, -1.0), "neg": (-1.0,)}[node.op]
-        return [
-            Term(sign * share, factors)
-            for a, sign in zip(node.args, signs, strict=True)
-            for share, factors in self._operand(a)
-        ]
-
-    def _operand(self, node: Node) -> list[Term]:
-        if self._is_open(node):
-            return self.terms[node]
-        return [Term(node.value, ()) if node.op == "constant" else Term(1.0, (self.made[node],))]
-
-    def _is_open(self, node: Node) -> bool:
-        """Tell whether nothing else reads the terms of a node, so that it need not be there."""
-        return node in self.terms and self.users[node] == 1
-
-    def _product(self, node: Node) -> Term:
-        share, factors = 1.0, list[Node]()
+    def _product(self, node: Node) -> tuple[list[Term], bool]:
+        """Return a product as a term, and whether it has fewer products than were written."""
+        share, factors, numbers = 1.0, list[Node](), 0
         for a in node.args:
             # A sum is a factor, but where no more than a product is left of it.
-            parts = self.short[a] if self._is_open(a) else self._operand(a)
-            [part] = parts if len(parts) == 1 else [Term(1.0, (self.made[a],))]
+            part = self._operand(a)
+            numbers += abs(part.share) != 1.0
             share *= part.share
             factors += part.factors
-        return Term(share, _in_order(factors))
+        term = Term(share, _in_order(factors))
+        return [term], numbers > 1
+
+    def _sum(self, node: Node) -> tuple[list[Term], bool]:
+        """Return the terms of a sum, and whether they are fewer than were written."""
+        signs = {"add": (1.0, 1.0), "sub": (1.0, -1.0), "neg": (-1.0,)}[node.op]
+        sides = [self._operand(a).times(sign) for a, sign in zip(node.args, signs, strict=True)]
+        if len(sides) == 1:
+            return sides, False
+        common = set[Common].intersection(*map(self._multiples, sides))
+        # A sum stands first: what is added to it then is added to all of it.
+        written = sorted(sides, key=lambda term: term.inside is None)
+        if not common:
+            return written, False
+        opened = [part for side in written for part in self._opened(side, common)]
+        found = _fewer(opened)
+        return (found, True) if len(found) < len(opened) else (written, False)
+
+    def _operand(self, node: Node) -> Term:
+        if node.op == "constant":
+            return Term(node.value, ())
+        whole, made = Term(1.0, (self.made[node],)), self.made[node]
+        # Nothing else may read the terms of a node that need not be there.
+        if node not in self.terms or self.users[node] > 1:
+            return whole._replace(written=made)
+        terms = self.terms[node]
+        return terms[0] if len(terms) == 1 else whole._replace(written=made, inside=node)
+
+    def _opened(self, term: Term, common: set[Common]) -> list[Term]:
+        """Return the terms of a sum down to where none of it is a multiple of something."""
+        found, todo = list[Term](), [term]
+        while todo:
+            term = todo.pop()
+            if term.inside is None or not self.shared[term.inside] & common:
+                found.append(term)
+            else:
+                todo += [part.times(term.sign) for part in reversed(self.terms[term.inside])]
+        return found
+
+    def _multiples(self, term: Term) -> set[Common]:
+        """Return what a term, or one of those inside, is a multiple of."""
+        if term.inside is not None:
+            return self.shared[term.inside]
+        found = set(_multiples(term))
+        if any(factor.op == "mul" for factor in term.factors):
+            found.update(_multiples(_bare(term)))
+        return found
+
+
+def _multiples(term: Term) -> list[Common]:
+    """Return what may be taken out of a term."""
+    # r + r s by one product would round r itself.
+    found: list[Common] = [*dict.fromkeys(term.factors)] if len(term.factors) > 1 else []
+    return [*found, abs(term.share)] if term.factors and abs(term.share) != 1.0 else found
 
 
 def _in_order(factors: Iterable[Node]) -> tuple[Node, ...]:
@@ -104,19 +166,17 @@ def _is_sound(term: Term) -> bool:
     return term.share == 0.0 or 1.0 / _LARGEST <= abs(term.share) <= _LARGEST
 
 
-def _is_long(term: Term) -> bool:
-    """Tell whether the order of its products may matter."""
-    return len(term.factors) + (abs(term.share) != 1.0) > 2
-
-
 # ---- fewer terms ---------------------------------------------------------------------------------
 
 
 def _fewer(terms: Sequence[Term]) -> list[Term]:
-    """Return fewer terms that make the same sum."""
+    """Return fewer terms that make the same sum, or as many where there are none."""
     found, bare = _merged(terms), list(map(_bare, terms))
     if all(map(_is_sound, bare)):
         found = min(found, _merged(bare), key=len)
+    if any(term.share == 0.0 and term.factors for term in found):
+        # Of infinite factors the difference is no number, which 0 would hide.
+        return list(terms)
     while (common := _most_common(found)) is not None:
         found = _taken_out(found, common)
     return found
@@ -131,7 +191,7 @@ def _bare(term: Term) -> Term:
             share *= plain[0].value
             [factor] = (a for a in factor.args if a not in plain)
         factors.append(factor)
-    return Term(share, _in_order(factors))
+    return term._replace(share=share, factors=_in_order(factors))
 
 
 def _merged(terms: Sequence[Term]) -> list[Term]:
@@ -141,26 +201,21 @@ def _merged(terms: Sequence[Term]) -> list[Term]:
     """
     found = list[Term]()
     places = dict[tuple[Node, ...], int]()
-    for share, factors in terms:
+    for term in terms:
+        share, factors = term.share, term.factors
         place = places.setdefault(factors, len(found)) if len(factors) > 1 else len(found)
         if place == len(found):
-            found.append(Term(share, factors))
+            found.append(term)
         else:
             found[place] = Term(found[place].share + share, factors)
-    return [term for term in found if term.share or len(term.factors) < 2]
+    return found
 
 
 def _most_common(terms: Sequence[Term]) -> Common | None:
     """Return what most terms are multiples of, if there are several."""
-    counts = Counter[Common]()
-    for share, factors in terms:
-        # r + r s by one product would round r itself.
-        if len(factors) > 1:
-            counts.update(set(factors))
-        if factors and abs(share) != 1.0:
-            counts[abs(share)] += 1
+    counts = Counter(common for term in terms for common in _multiples(term))
     # The first of them, by the order of nodes, so that text is the same each time.
-    order = {f: k for k, f in enumerate(f for share, fs in terms for f in (*fs, abs(share)))}
+    order = {f: k for k, f in enumerate(f for t in terms for f in (*t.factors, abs(t.share)))}
     found = max(counts, key=lambda c: (counts[c], -order[c]), default=None)
     return found if found is not None and counts[found] > 1 else None
 
@@ -185,7 +240,7 @@ def _taken_out(terms: Sequence[Term], common: Common) -> list[Term]:
 
 def _without(term: Term, common: Common) -> Term | None:
     """Return a term without something that it is a multiple of; None where it is not."""
-    share, factors = term
+    share, factors = term.share, term.factors
     if not isinstance(common, Node):
         there = factors and abs(share) == common
         return Term(math.copysign(1.0, share), factors) if there else None
@@ -199,13 +254,26 @@ def _without(term: Term, common: Common) -> Term | None:
 
 
 def _sum_of(like: Node, terms: Sequence[Term]) -> Node:
-    """Return a sum as a node of the same graph as another."""
-    total = like.graph.constant(0.0)
-    # What is taken off comes after what it is taken off from.
-    first = next((k for k, term in enumerate(terms) if term.share > 0.0), 0)
-    for term in (*terms[first:], *terms[:first]):
-        product = like.graph.constant(abs(term.share))
-        for factor in term.factors:
-            product = product * factor
-        total = total - product if term.share < 0.0 else total + product
-    return total
+    """Return a sum, in the order of its terms, as a node of the same graph as another."""
+    total, sign = like.graph.constant(0.0), 0.0
+    for term in terms:
+        its, product = _size_of(like, term)
+        sign = sign or its
+        if its == sign:
+            total = total + product
+        elif sign < 0.0:
+            # (-a - b) + c as c - (a + b), which is the same to the bit.
+            total, sign = product - total, 1.0
+        else:
+            total = total - product
+    return -total if sign < 0.0 else total
+
+
+def _size_of(like: Node, term: Term) -> tuple[float, Node]:
+    """Return the sign of a term and the rest of it, as written where nothing was taken out."""
+    if term.written is not None:
+        return term.sign, term.written
+    product = like.graph.constant(abs(term.share))
+    for factor in term.factors:
+        product = product * factor
+    return math.copysign(1.0, term.share), product

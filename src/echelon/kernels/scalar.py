@@ -80,10 +80,11 @@ class Node:
         value: the number of a constant, the name of a leaf.
         uniform: whether it is the same for all agents.
         truth: whether it is true or false, and no number.
+        at_least_0: whether it is known not to be below 0; it may be none, or -0.
         kept: whether it is computed as it is written, and not in another order of its sums.
     """
 
-    __slots__ = ("args", "graph", "kept", "number", "op", "truth", "uniform", "value")
+    __slots__ = ("args", "at_least_0", "graph", "kept", "number", "op", "truth", "uniform", "value")
     __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
 
     def __init__(
@@ -94,6 +95,7 @@ class Node:
         self.truth = op in TRUTHS or op == "constant" and isinstance(value, bool)
         if op == "select":
             self.truth = args[1].truth
+        self.at_least_0 = _is_at_least_0(op, args, value)
         self.kept = False
         graph.nodes.append(self)
 
@@ -123,6 +125,15 @@ class Node:
 
     def __neg__(self) -> "Node":
         return self.graph.make("neg", self)
+
+
+def _is_at_least_0(op: str, args: tuple[Node, ...], value: Any) -> bool:
+    if op == "constant":
+        return not math.isnan(value) and value >= 0.0
+    known = [a.at_least_0 for a in args]
+    if op in ("add", "mul", "div", "min"):
+        return all(known) or op == "mul" and args[0] is args[1]
+    return op in ("sqrt", "abs", "pow2") or op == "max" and any(known)
 
 
 @final
@@ -280,26 +291,9 @@ def _either(a: Node, b: Node) -> Node | None:
     return a if a is b else None
 
 
-def _is_square(node: Node) -> bool:
-    """Tell whether a number is a sum of squares, so that it is not below 0."""
-    if node.op == "add":
-        return all(_is_square(a) for a in node.args)
-    return node.op == "mul" and node.args[0] is node.args[1]
-
-
-def is_at_least_0(node: Node) -> bool:
-    """Tell whether a number is known not to be below 0; it may be none, or -0."""
-    a = node.args
-    if node.op == "constant":
-        return node.value >= 0.0
-    if node.op in ("add", "mul", "div", "min"):
-        return all(map(is_at_least_0, a)) or node.op == "mul" and a[0] is a[1]
-    return node.op in ("sqrt", "abs", "pow2") or node.op == "max" and any(map(is_at_least_0, a))
-
-
 def _at_most(a: Node, b: Node) -> Node | None:
-    """Return a comparison without the root of a sum of squares: the largest that has it decides."""
-    if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not _is_square(a.args[0]):
+    """Return a comparison without the root of a number: the largest that has it decides."""
+    if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not a.args[0].at_least_0:
         return None
     kind = np.float64 if a.graph.bits == 64 else np.float32
     wanted = kind(b.value)
