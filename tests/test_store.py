@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import os
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
@@ -26,9 +27,11 @@ from echelon.scenario.own import own_class
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
     """A folder where all is kept, as the command line opens it, and nothing known before."""
     forget()
+    # Other tests of this process may have loaded a user's file.
+    monkeypatch.setattr(store, "_closed", threading.Event())
     with store.opened(tmp_path):
         yield tmp_path
     forget()
