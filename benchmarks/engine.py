@@ -105,8 +105,6 @@ def measure_ring(
 ) -> Row:
     """Return the rates of a ring beside the yardstick's."""
     side = made.steppers(flock(ech.Graph.ring(agents), model), bits)
-    # Of one core, as the yardstick's: threads that wait for each other take time of theirs.
-    side.native.crew = Crew(side.native.places, None, 1)
     # As many as a run takes between two looks at it.
     steps = side.native.longest
     name = "a newcomer's model" if model is not None else f"ring of {agents:,}"

@@ -28,11 +28,12 @@ def measured(agents: int, yardstick: Path) -> dict[str, float]:
     import echelon as ech
 
     c, found = made.Yardstick(yardstick), dict[str, float]()
-    steps = max(20, min(9_000, 1_000_000 // agents))
     fewer = max(2, min(2_000, 100_000 // agents))
     for bits in (32, 64):
         side = made.steppers(made.flock(ech.Graph.ring(agents)), bits)
         kernel = c.ring(agents, bits)
+        # As many as a run takes between two looks at it, and for which there is a reference.
+        steps = min(9_000, side.native.longest)
         ways = {
             "native": partial(made.rate, side.native, agents, [steps], side.reference, bits),
             "C": partial(c.rate, kernel, agents, steps),

@@ -99,7 +99,8 @@ def steppers(parts: ech.Parts, bits: int) -> Side:
     with precision("float64"):
         loop = assemble(problem, drive.leader, drive.follower)
         by_jax = JaxStepper(loop, problem.states)
-        native = NativeStepper([loop], problem.states, bits, by_jax)
+        # On one core, as a yardstick: threads that wait for each other take time of theirs.
+        native = NativeStepper([loop], problem.states, bits, by_jax, threads=1)
         found = drive.reference_states(prepared.parts.model, DT * jnp.arange(10_001))
         reference = None if found is None else np.asarray(found)
     return Side(native, by_jax, reference)
