@@ -23,14 +23,14 @@ import numpy as np
 import scipy.linalg
 
 import echelon as ech
+from echelon.agents.models.chains import chains_of, flatten
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.engine.loop import assemble, begin, control, step
-from echelon.engine.prepare import prepare
+from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.guarantees.stopping.tube import tube_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
-from echelon.models.chains import chains_of, flatten
-from echelon.promises.stopping import stopping_of
-from echelon.promises.tube import tube_of
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.step.loop import assemble, begin, control, step
 
 AGENTS, DT, SPAN, BATCH, AGAIN = 5, 0.0005, 0.7, 50, 6
 ALL = [(i, j) for i in range(AGENTS) for j in range(1, AGENTS) if i != j]

@@ -23,8 +23,8 @@ import planted_faults
 
 import echelon as ech
 from echelon.core.provenance import versions
-from echelon.results.metrics import formation_errors
-from echelon.studies.speedup import time_constant
+from echelon.experiments.results.metrics import formation_errors
+from echelon.experiments.studies.speedup import time_constant
 
 HERE = Path(__file__).resolve().parent
 PAGE = HERE.parent / "docs" / "certificates.md"

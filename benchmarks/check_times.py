@@ -14,10 +14,15 @@ from collections.abc import Callable
 import numpy as np
 
 import echelon as ech
-from echelon.certificates.bounds import invariant_ellipsoid, peak_gain
-from echelon.certificates.margins import ClosedLoop, delay_margin, gain_margin, string_gain
+from echelon.agents.models.linearization import linearize
 from echelon.core.numerics import precision
-from echelon.models.linearization import linearize
+from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
+from echelon.synthesis.certificates.margins import (
+    ClosedLoop,
+    delay_margin,
+    gain_margin,
+    string_gain,
+)
 
 GRAPH = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)])
 

@@ -10,9 +10,9 @@ import optimization
 from pages import write_part
 
 import echelon as ech
-from echelon.reports.comparison import verdict
-from echelon.reports.printed import PRINTED
-from echelon.studies.compare import Row
+from echelon.experiments.studies.compare import Row
+from echelon.output.reports.comparison_report import verdict
+from echelon.output.reports.printed import PRINTED
 
 CONDITIONS = {
     "as in the paper: no wind, no error of mass": [],

@@ -34,10 +34,10 @@ except ImportError:
 from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
-from echelon.engine.code import Kernels
-from echelon.engine.crew import Crew
-from echelon.engine.many import Fleet
-from echelon.kernels import Code, program
+from echelon.simulation.codegen import Code, program
+from echelon.simulation.engine.batch import Fleet
+from echelon.simulation.native.kernel_cache import Kernels
+from echelon.simulation.native.threads import Crew
 
 Row: TypeAlias = dict[str, float]
 _TURNS = 4
@@ -219,7 +219,7 @@ def scattered(agents: int) -> np.ndarray:
 
 def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     """Return the rate of a large geometric graph, what it takes to build, and two threads."""
-    from echelon.engine.places import Swarm
+    from echelon.simulation.native.blocks import Swarm
 
     edges = scattered(_MILLION)
     agents, begin = int(edges.max()) + 1, time.process_time()

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 import echelon as ech
-from echelon.archive.open import open_run
-from echelon.live.server import live, serve_live
-from echelon.plots.video import save_video
-from echelon.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.viewer.replay import replay_page
-from echelon.viewer.serve import serving
+from echelon.apps.live.server import live, serve_live
+from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
+from echelon.output.archive.open_folder import open_run
+from echelon.output.plots.video import save_video
+from echelon.output.viewer.replay import replay_page
+from echelon.output.viewer.serve import serving
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -166,7 +166,7 @@ _SCRUB = """(seconds) => new Promise((done) => {
 
 def stored(agents: int, folder: Path) -> Path:
     """Return the folder of a run of a minute, or of 20 s of the flock."""
-    from echelon.archive.run import save_run
+    from echelon.output.archive.run_folder import save_run
 
     seconds = 60 if agents <= 4 else 20
     own = scenario(agents)

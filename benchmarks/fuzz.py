@@ -232,7 +232,7 @@ def scenario(rng: random.Random) -> Any:
 
 def as_yaml(data: Any) -> bytes:
     """Return plain data as YAML."""
-    from echelon.scenario.yaml import dump_yaml
+    from echelon.experiments.scenario.yaml import dump_yaml
 
     return dump_yaml(data).encode("utf-8", "surrogatepass")
 
@@ -256,7 +256,7 @@ def setting(rng: random.Random, data: Any) -> str:
         value = -1
     if path[-1] == "dt" and not large(value) and isinstance(value, int | float):
         value = max(value, 1e-3) if value > 0 else value
-    from echelon.scenario.yaml import inline_yaml
+    from echelon.experiments.scenario.yaml import inline_yaml
 
     broken = ["{", "[1, 2", "*a", "", "3 # three"]
     text = rng.choice(broken) if rng.random() < 0.2 else inline_yaml(value)
@@ -395,7 +395,7 @@ KINDS: dict[str, Callable[..., Case]] = {
 
 def call(arguments: list[str]) -> int:
     """Run the command line in this process, and return its exit code."""
-    from echelon.cli.app import main
+    from echelon.apps.cli.app import main
 
     sys.argv = ["echelon", *arguments]
     try:
@@ -549,11 +549,10 @@ def preload() -> None:
     """Import what the commands import, once for all processes, and compute nothing."""
     import jax
 
-    import echelon.certificates.lmi
-    import echelon.cli.app
-    import echelon.results.dataset
-    import echelon.studies.design
-    import echelon.verifier.verify  # noqa: F401
+    import echelon.apps.cli.app
+    import echelon.experiments.results.dataset
+    import echelon.experiments.studies.design
+    import echelon.guarantees.verifier.verify  # noqa: F401
 
     del jax
 

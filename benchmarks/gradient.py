@@ -18,12 +18,12 @@ from engine import flock
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.engine.gradient import Native, Run, by_jax
-from echelon.engine.loop import assemble
-from echelon.engine.native import NativeStepper
-from echelon.engine.prepare import prepare
-from echelon.engine.simulate import sample_reference
-from echelon.engine.sums import Sums
+from echelon.simulation.engine.gradient import Native, Run, by_jax
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.engine.simulate import sample_reference
+from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.meter import Sums
 
 _DT, _STEPS, _TURNS = 0.005, 200, 5
 _AT_MOST = {"native to forwards": 10.0, "native to JAX": 0.2}

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import echelon as ech
+from echelon.agents.references.flatness import reference_targets
 from echelon.core.errors import PlanError
-from echelon.optimal.horizon import Course, Horizon
-from echelon.references.flatness import reference_targets
+from echelon.simulation.optimal.horizon import Course, Horizon
 
 MODEL = ech.models.Quadrotor.crazyflie()
 STEPS, DT = 50, 0.02

@@ -11,10 +11,10 @@ import casadi as ca
 import numpy as np
 
 import echelon as ech
-from echelon.optimal.formation_plan import plan_tracking
-from echelon.optimal.objectives import Grid, TrackingOptions, coarse, grid, tracking
-from echelon.optimal.problem import OptimalControl
-from echelon.references.flatness import Targets, reference_targets, shifted_targets
+from echelon.agents.references.flatness import Targets, reference_targets, shifted_targets
+from echelon.simulation.optimal.formation_plan import plan_tracking
+from echelon.simulation.optimal.objectives import Grid, TrackingOptions, coarse, grid, tracking
+from echelon.simulation.optimal.problem import OptimalControl
 
 MODEL, LOOP = ech.models.Quadrotor.crazyflie(), ech.references.Lemniscate()
 TREE = ech.Graph.from_edges([(0, 1), (1, 2), (1, 3)], leaders=[0])

@@ -9,9 +9,9 @@ import argparse
 import numpy as np
 
 import echelon as ech
-from echelon.certificates.margins import ClosedLoop, string_gain
-from echelon.models.linearization import linearize
-from echelon.results.metrics import formation_errors
+from echelon.agents.models.linearization import linearize
+from echelon.experiments.results.metrics import formation_errors
+from echelon.synthesis.certificates.margins import ClosedLoop, string_gain
 
 MODEL = ech.models.Quadrotor()
 LAWS = [("relay", None), ("parent", 1.0), ("parent", 2.5), ("parent", 10.0)]

@@ -556,7 +556,7 @@ def method_changed(told: Told, random: Random) -> bool:
 def parameter_changed(told: Told, random: Random, size: float) -> bool:
     """Name other parameters than those that A and B were made with."""
     parameters = told["model"]["parameters"]
-    if not told["model"]["class"].startswith("echelon.models."):
+    if not told["model"]["class"].startswith("echelon.agents.models."):
         return False
     used = ("damping", "mass", "gravity", "drag")
     name = next((key for key in used if key in parameters), None)

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from echelon.plots import style as draw
+from echelon.output.plots import style as draw
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,7 +12,7 @@ from pages import write_part
 
 import echelon as ech
 from echelon.core.provenance import versions
-from echelon.results.metrics import formation_errors
+from echelon.experiments.results.metrics import formation_errors
 
 OFFSETS = {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0), 3: (1.0, -0.8, 0.0)}
 

@@ -14,13 +14,13 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from echelon.engine.code import LANES
-from echelon.engine.native import NativeStepper
-from echelon.engine.scalars import body_of
-from echelon.engine.turns import step_by_step
-from echelon.kernels import SLOTS, Body, Code, Node, Plan, aligned, program, shared
-from echelon.kernels.scalar import needed
-from echelon.kernels.usual import rewritten, whole
+from echelon.simulation.codegen import SLOTS, Body, Code, Node, Plan, aligned, program, shared
+from echelon.simulation.codegen.fast_path import rewritten, whole
+from echelon.simulation.codegen.scalar import needed
+from echelon.simulation.native.agent_step import body_of
+from echelon.simulation.native.kernel_cache import LANES
+from echelon.simulation.native.schedule import step_by_step
+from echelon.simulation.native.stepper import NativeStepper
 
 Run: TypeAlias = Callable[[np.ndarray, int], None]
 """Takes some steps of agents in rows (blocks, rows, lanes)."""

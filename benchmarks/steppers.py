@@ -15,11 +15,11 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.engine.by_jax import JaxStepper
-from echelon.engine.drive import Stepper
-from echelon.engine.loop import Loop, assemble
-from echelon.engine.native import NativeStepper
-from echelon.engine.prepare import prepare
+from echelon.simulation.engine.jax_stepper import JaxStepper
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.step.drive import Stepper
+from echelon.simulation.step.loop import Loop, assemble
 
 DT = 0.005
 FORMATIONS, STEPS = 2_560, 300

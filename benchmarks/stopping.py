@@ -15,12 +15,12 @@ import numpy as np
 import echelon as ech
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.engine.initial import Starts
-from echelon.engine.many import Fleet
-from echelon.engine.prepare import prepare
-from echelon.promises.motors import motors_bear
-from echelon.promises.stopping import stopping_of
-from echelon.results.metrics import formation_errors, metrics
+from echelon.experiments.results.metrics import formation_errors, metrics
+from echelon.guarantees.stopping.motor_load import motors_bear
+from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.simulation.engine.batch import Fleet
+from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.prepare import prepare
 
 GENTLE = (
     "follower.roots=[2, 2.5, 3]",

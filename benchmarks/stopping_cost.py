@@ -11,8 +11,8 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.engine.prepare import prepare
-from echelon.engine.simulate import sample_reference
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.engine.simulate import sample_reference
 
 MODEL = ech.models.Quadrotor()
 

@@ -14,13 +14,13 @@ from typing import Any
 from PIL import Image
 
 import echelon as ech
-from echelon.plots import files
-from echelon.plots.comparison import comparison_figures
-from echelon.plots.sweep import sweep_figures
-from echelon.plots.video import save_video
-from echelon.results.dataset import dataset
-from echelon.results.recording import recording
-from echelon.studies.compare import compare
+from echelon.experiments.results.dataset import dataset
+from echelon.experiments.results.recording import recording
+from echelon.experiments.studies.compare import compare
+from echelon.output.plots import figure_files
+from echelon.output.plots.comparison_figures import comparison_figures
+from echelon.output.plots.sweep_figures import sweep_figures
+from echelon.output.plots.video import save_video
 
 DOCS = Path(__file__).resolve().parent
 TITLED = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
@@ -119,7 +119,7 @@ def draw_laws(out: Path, quick: bool) -> None:
 
 def save(figures: dict[str, Any], out: Path) -> None:
     """Write figures as PNG of 128 colours, which is a third of the size."""
-    for path in files.save(figures, out, kinds=("png",), dpi=120):
+    for path in figure_files.save(figures, out, kinds=("png",), dpi=120):
         with Image.open(path) as picture:
             small = picture.convert("RGB").quantize(128, dither=Image.Dither.NONE)
         small.save(path, optimize=True)

@@ -12,11 +12,11 @@ sys.path.insert(0, str(HERE.parent / "tests"))
 from browser import chromium, opened, until  # noqa: E402 - of the tests
 
 import echelon as ech  # noqa: E402
-from echelon.live.server import live, serve_live  # noqa: E402
-from echelon.results.dataset import dataset  # noqa: E402
-from echelon.results.recording import recording  # noqa: E402
-from echelon.viewer.replay import replay_page  # noqa: E402
-from echelon.viewer.serve import serving  # noqa: E402
+from echelon.apps.live.server import live, serve_live  # noqa: E402
+from echelon.experiments.results.dataset import dataset  # noqa: E402
+from echelon.experiments.results.recording import recording  # noqa: E402
+from echelon.output.viewer.replay import replay_page  # noqa: E402
+from echelon.output.viewer.serve import serving  # noqa: E402
 
 SHORT = ("simulation.horizon=20", "simulation.store_every=4")
 

@@ -57,7 +57,7 @@ def here(tmp_path, monkeypatch):
 @pytest.fixture
 def echelon(here, monkeypatch, capsys):
     """Run the command line in this process: exit code, standard output, standard error."""
-    from echelon.cli.app import main
+    from echelon.apps.cli.app import main
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["echelon", *map(str, arguments)])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from echelon.kernels import (
+from echelon.simulation.codegen import (
     SLOTS,
     Body,
     Code,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from echelon.results.recording import Bounds, Modes, Recording, Tracking
+from echelon.experiments.results.recording import Bounds, Modes, Recording, Tracking
 
 PROMISE = {
     "promised": True,

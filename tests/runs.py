@@ -6,7 +6,7 @@ import numpy as np
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.engine.sums import Meter, on_host
+from echelon.simulation.step.meter import Meter, on_host
 
 OWN_PENDULUM = """
 import jax.numpy as jnp

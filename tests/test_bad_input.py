@@ -8,21 +8,7 @@ import numpy as np
 import pytest
 from runs import simulate
 
-from echelon.core.errors import (
-    EchelonError,
-    FormationError,
-    GainError,
-    GraphError,
-    LawError,
-    ModelError,
-    ReferenceError,
-    ScenarioError,
-    SimulationError,
-)
-from echelon.gains import Feedback, FixedGain, InnerLoop, Method, Riccati, RobustLQR
-from echelon.gains.gain import synthesize
-from echelon.laws import Agreement, Consensus, Tracking, TrimInput
-from echelon.models import (
+from echelon.agents.models import (
     DoubleIntegrator,
     Linear,
     Pendulum,
@@ -34,9 +20,9 @@ from echelon.models import (
     UnicyclePoint,
     VanDerPol,
 )
-from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.references import (
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.references import (
     Circle,
     FigureEight,
     Hover,
@@ -45,9 +31,23 @@ from echelon.references import (
     Reference,
     Waypoints,
 )
-from echelon.scenario.build import build
-from echelon.scenario.build import run as run_scenario
-from echelon.world.disturbance import Disturbance
+from echelon.agents.world.disturbance import Disturbance
+from echelon.core.errors import (
+    EchelonError,
+    FormationError,
+    GainError,
+    GraphError,
+    LawError,
+    ModelError,
+    ReferenceError,
+    ScenarioError,
+    SimulationError,
+)
+from echelon.experiments.scenario.build import build
+from echelon.experiments.scenario.build import run as run_scenario
+from echelon.laws import Agreement, Consensus, Tracking, TrimInput
+from echelon.synthesis.gains import Feedback, FixedGain, InnerLoop, Method, Riccati, RobustLQR
+from echelon.synthesis.gains.gain import synthesize
 
 NAN, INF = float("nan"), float("inf")
 QUAD, CART, ONE = Quadrotor(), DoubleIntegrator(1), SingleIntegrator(1)

@@ -18,9 +18,9 @@ import matplotlib
 import pytest
 
 import echelon as ech
-from echelon.cli.app import main
-from echelon.reports.printed import PRINTED
-from echelon.scenario.registry import METHODS
+from echelon.apps.cli.app import main
+from echelon.experiments.scenario.registry import METHODS
+from echelon.output.reports.printed import PRINTED
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from echelon.core.errors import EchelonError
-from echelon.scenario.scenario import load_scenario
+from echelon.experiments.scenario.scenario import load_scenario
 
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "fuzz.py"
 

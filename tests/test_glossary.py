@@ -8,13 +8,13 @@ import pytest
 from runs import made_up
 
 import echelon as ech
-from echelon.cli import tables
+from echelon.apps.cli import tables
+from echelon.core.statement import Hypothesis, Line
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
-from echelon.promises.statement import Hypothesis, Line
-from echelon.reports import comparison, run
-from echelon.scenario.keys import keys_page
-from echelon.scenario.scenario import json_schema
-from echelon.studies.compare import Comparison
+from echelon.experiments.scenario.keys import keys_page
+from echelon.experiments.scenario.scenario import json_schema
+from echelon.experiments.studies.compare import Comparison
+from echelon.output.reports import comparison_report, run_report
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TEXT = (DOCS / "glossary.md").read_text("utf-8")
@@ -51,21 +51,23 @@ def test_every_column_of_a_design_is_explained():
 def test_every_column_of_a_report_is_explained(model):
     graph = ech.Graph.path(3)
     result = made_up(np.zeros((4, 3, len(model.state_names))), model, graph)
-    names = heads(run._table(result, ech.metrics(result), printed=False))
+    names = heads(run_report._table(result, ech.metrics(result), printed=False))
     assert set(names) <= set(ENTRIES), set(names) - set(ENTRIES)
     assert len(names) == 6
 
 
 def test_every_column_of_a_comparison_is_explained():
     compared = Comparison("x", (), 10.0, 2.0, ())
-    names = {*heads(comparison._errors_table(compared, False))}
-    names |= {*heads(comparison._costs_table(compared))}
+    names = {*heads(comparison_report._errors_table(compared, False))}
+    names |= {*heads(comparison_report._costs_table(compared))}
     assert names <= set(ENTRIES), names - set(ENTRIES)
 
 
 def test_the_page_of_keys_is_what_the_schema_makes():
     told = (DOCS / "scenario.md").read_text("utf-8")
-    assert told == keys_page(), "write `python -m echelon.scenario.keys` to docs/scenario.md"
+    assert told == keys_page(), (
+        "write `python -m echelon.experiments.scenario.keys` to docs/scenario.md"
+    )
 
 
 def numbers_of(what):

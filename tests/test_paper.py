@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 from oracles import laplacian, skew, spd
 from runs import simulate
 
-from echelon.core import numerics
-from echelon.core.errors import ModelError, Outcome
-from echelon.gains import FixedGain, Riccati
-from echelon.gains.gain import synthesize
-from echelon.laws import Agreement, Consensus, Tracking, TrimInput
-from echelon.models import (
+from echelon.agents.models import (
     DoubleIntegrator,
     Linear,
     PlanarQuadrotor,
@@ -21,10 +16,15 @@ from echelon.models import (
     Quadrotor,
     SingleIntegrator,
 )
-from echelon.models.linearization import linearize
-from echelon.network.formation import Formation
-from echelon.network.graph import Graph
-from echelon.references import Lemniscate, Line
+from echelon.agents.models.linearization import linearize
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.references import Lemniscate, Line
+from echelon.core import numerics
+from echelon.core.errors import ModelError, Outcome
+from echelon.laws import Agreement, Consensus, Tracking, TrimInput
+from echelon.synthesis.gains import FixedGain, Riccati
+from echelon.synthesis.gains.gain import synthesize
 
 seeds = st.integers(0, 10**6)
 TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import pytest
 
-from echelon.models import DoubleIntegrator
+from echelon.agents.models import DoubleIntegrator
 
 
 def test_a_state_of_another_shape_is_noticed():

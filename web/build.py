@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-PAGE = HERE.parent / "src" / "echelon" / "viewer" / "page"
+PAGE = HERE.parent / "src" / "echelon" / "output" / "viewer" / "page"
 BUNDLE, LICENSE = PAGE / "three.min.js", PAGE / "three.LICENSE.txt"
 _INPUTS = ("package.json", "package-lock.json", "three_parts.js")
 

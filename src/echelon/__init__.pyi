@@ -1,94 +1,94 @@
 # The public names of echelon and where they live; `__init__.py` loads each when it is first used.
 
 from . import (
-    certificates as certificates,
-)
-from . import (
-    gains as gains,
-)
-from . import (
     laws as laws,
 )
-from . import (
+from .agents import (
     models as models,
 )
-from . import (
+from .agents import (
     network as network,
 )
-from . import (
-    optimal as optimal,
-)
-from . import (
+from .agents import (
     references as references,
 )
-from .archive.open import open_run as open_run
-from .archive.run import (
-    load_run as load_run,
-)
-from .archive.run import (
-    save_run as save_run,
-)
+from .agents.models.model import ControlAffine as ControlAffine
+from .agents.network.formation import Formation as Formation
+from .agents.network.graph import Graph as Graph
+from .agents.references.reference import Reference as Reference
+from .agents.world.disturbance import Disturbance as Disturbance
+from .agents.world.world import World as World
 from .core import errors as errors
 from .core.errors import EchelonError as EchelonError
 from .core.errors import Outcome as Outcome
-from .engine.agent import Agent as Agent
-from .engine.agent import Message as Message
-from .engine.gradient import gradient as gradient
-from .engine.laws import Laws as Laws
-from .engine.parts import Parts as Parts
-from .engine.result import Result as Result
-from .engine.settings import Settings as Settings
-from .engine.simulate import simulate as simulate
-from .gains.file import load_gain as load_gain
-from .gains.file import save_gain as save_gain
-from .gains.gain import Gain as Gain
-from .gains.gain import Method as Method
-from .gains.gain import synthesize as synthesize
-from .laws.law import Law as Law
-from .models.model import ControlAffine as ControlAffine
-from .network.formation import Formation as Formation
-from .network.graph import Graph as Graph
-from .plots.run import figures as figures
-from .plots.run import save_figures as save_figures
-from .promises.promise import Promise as Promise
-from .promises.promise import promise as promise
-from .references.reference import Reference as Reference
-from .reports.comparison import comparison_report as comparison_report
-from .reports.run import report as report
-from .results.dataset import (
+from .experiments.results.dataset import (
     dataset as dataset,
 )
-from .results.dataset import (
+from .experiments.results.dataset import (
     save_dataset as save_dataset,
 )
-from .results.dataset import (
+from .experiments.results.dataset import (
     summary as summary,
 )
-from .results.lyapunov import lyapunov as lyapunov
-from .results.metrics import metrics as metrics
-from .scenario.build import build as build
-from .scenario.build import run as run
-from .scenario.scenario import (
+from .experiments.results.lyapunov import lyapunov as lyapunov
+from .experiments.results.metrics import metrics as metrics
+from .experiments.scenario.build import build as build
+from .experiments.scenario.build import run as run
+from .experiments.scenario.scenario import (
     Scenario as Scenario,
 )
-from .scenario.scenario import (
+from .experiments.scenario.scenario import (
     bundled_scenarios as bundled_scenarios,
 )
-from .scenario.scenario import (
+from .experiments.scenario.scenario import (
     load_scenario as load_scenario,
 )
-from .scenario.scenario import (
+from .experiments.scenario.scenario import (
     scenario_from_mapping as scenario_from_mapping,
 )
-from .studies.check import check as check
-from .studies.compare import compare as compare
-from .studies.design import design as design
-from .studies.finite_condition import finite_condition as finite_condition
-from .studies.speedup import speedup as speedup
-from .studies.tune import tune as tune
-from .verifier.verify import verify as verify
-from .world.disturbance import Disturbance as Disturbance
-from .world.world import World as World
+from .experiments.studies.check import check as check
+from .experiments.studies.compare import compare as compare
+from .experiments.studies.design import design as design
+from .experiments.studies.finite_condition import finite_condition as finite_condition
+from .experiments.studies.speedup import speedup as speedup
+from .experiments.studies.tune import tune as tune
+from .guarantees.promises.promise import Promise as Promise
+from .guarantees.promises.promise import promise as promise
+from .guarantees.verifier.verify import verify as verify
+from .laws.law import Law as Law
+from .output.archive.open_folder import open_run as open_run
+from .output.archive.run_folder import (
+    load_run as load_run,
+)
+from .output.archive.run_folder import (
+    save_run as save_run,
+)
+from .output.plots.run_figures import figures as figures
+from .output.plots.run_figures import save_figures as save_figures
+from .output.reports.comparison_report import comparison_report as comparison_report
+from .output.reports.run_report import report as report
+from .simulation import (
+    optimal as optimal,
+)
+from .simulation.engine.agent import Agent as Agent
+from .simulation.engine.agent import Message as Message
+from .simulation.engine.gradient import gradient as gradient
+from .simulation.engine.law_drive import Laws as Laws
+from .simulation.engine.parts import Parts as Parts
+from .simulation.engine.result import Result as Result
+from .simulation.engine.simulate import simulate as simulate
+from .simulation.step.settings import Settings as Settings
+from .synthesis import (
+    certificates as certificates,
+)
+from .synthesis import (
+    gains as gains,
+)
+from .synthesis.gains.gain import Gain as Gain
+from .synthesis.gains.gain import Method as Method
+from .synthesis.gains.gain import synthesize as synthesize
+from .synthesis.gains.gain_file import load_gain as load_gain
+from .synthesis.gains.gain_file import save_gain as save_gain
 
 __version__: str
-from .sweeps.sweep import sweep as sweep
+from .experiments.sweeps.sweep import sweep as sweep

@@ -1,6 +1,6 @@
 """`python -m echelon` is the command line."""
 
-from echelon.cli.app import main
+from echelon.apps.cli.app import main
 
 if __name__ == "__main__":
     main()

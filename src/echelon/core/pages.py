@@ -4,7 +4,7 @@ import importlib
 from typing import Any, Final
 
 # By name, since what a notebook shows is drawn high above where values are made.
-_PAGES: Final = {"result": "echelon.archive.notebook:result_page"}
+_PAGES: Final = {"result": "echelon.output.archive.notebook:result_page"}
 
 
 def page_of(kind: str, value: Any) -> str:

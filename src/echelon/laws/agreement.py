@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from echelon.agents.models.integrator import SingleIntegrator
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
 from echelon.core.errors import LawError
 from echelon.core.types import Array, Input
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.models.integrator import SingleIntegrator
-from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
 
 
 class Agreement(Law):

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from echelon.agents.models.heading import state_turn
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
 from echelon.core.errors import LawError, did_you_mean, listing
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, Word
-from echelon.gains.gain import Gain
-from echelon.gains.strings import string_growth
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
-from echelon.models.heading import state_turn
-from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
+from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.strings import string_growth
 
 _Word = TypeVar("_Word", bound=Word)
 

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
+from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.core.compiled import program
 from echelon.core.errors import LawError, ModelError, listing
-from echelon.core.program import program
 from echelon.core.types import Array, Input, State
 from echelon.laws.flat_loop import FlatLoop, Held
 from echelon.laws.law import Law, LocalView
-from echelon.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
-from echelon.models.model import ControlAffine, FlatBound
 
 Speed: TypeAlias = float | tuple[float, ...]
 

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.chains import Chains, flat_output, flatten
+from echelon.agents.models.model import ControlAffine
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.models.chains import Chains, flat_output, flatten
-from echelon.models.model import ControlAffine
 
 _WATCH = (16.0, 64.0)
 """Of the observer, 1/s and 1/s^2: both its modes at 8 1/s, twice as fast as a quick inner loop."""

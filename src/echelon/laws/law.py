@@ -11,14 +11,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
+from echelon.agents.models.heading import heading_index, rest_heading
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.agents.references.guide import Guide
 from echelon.core.errors import LawError
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward
-from echelon.gains.gain import Gain
-from echelon.models.heading import heading_index, rest_heading
-from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
-from echelon.references.guide import Guide
+from echelon.synthesis.gains.gain import Gain
 
 Memory: TypeAlias = Any
 

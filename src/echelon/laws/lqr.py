@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.agents.references.flatness import first_state, followed_states
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import check_kind_of, check_reference
+from echelon.core.compiled import program
 from echelon.core.errors import LawError
 from echelon.core.linear import symmetric_part
-from echelon.core.program import program
 from echelon.core.types import Array, Input, State
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
-from echelon.references.flatness import first_state, followed_states
-from echelon.references.guide import Guide
-from echelon.references.reference import check_kind_of, check_reference
 
 _SPAN = 0.02
 """Between two gains, s; A and B are taken in the middle, which errs by the square of it."""

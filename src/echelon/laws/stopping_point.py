@@ -13,8 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.agents.models.model import ControlAffine, FlatBound
+from echelon.agents.network.graph import Graph
+from echelon.agents.references.flatness import first_state, followed_states
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Reference, check_reference
 from echelon.core.errors import LawError, listing
-from echelon.core.kept import kept
+from echelon.core.memoize import kept
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
 from echelon.core.words import Feedforward, Hears
@@ -29,11 +34,6 @@ from echelon.laws.flat_law import (
 )
 from echelon.laws.flat_loop import Held
 from echelon.laws.law import Law, LocalView
-from echelon.models.model import ControlAffine, FlatBound
-from echelon.network.graph import Graph
-from echelon.references.flatness import first_state, followed_states
-from echelon.references.guide import Guide
-from echelon.references.reference import Reference, check_reference
 
 _INSTANT = 1e-9
 """s; a shorter period is none."""

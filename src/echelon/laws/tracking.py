@@ -7,17 +7,17 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.agents.network.spectrum import Spectrum
+from echelon.agents.references.flatness import first_state, follow_at, followed_states
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import check_kind_of, check_reference
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.types import Input, Scalar, State
-from echelon.gains.gain import Gain
-from echelon.gains.riccati import Riccati
 from echelon.laws.law import Law, LocalView, Memory, check_gain_fits
-from echelon.models.model import ControlAffine
-from echelon.network.graph import Graph
-from echelon.network.spectrum import Spectrum
-from echelon.references.flatness import first_state, follow_at, followed_states
-from echelon.references.guide import Guide
-from echelon.references.reference import check_kind_of, check_reference
+from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.riccati import Riccati
 
 
 class Tracking(Law):

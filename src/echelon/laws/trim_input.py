@@ -1,8 +1,8 @@
 """The law that does nothing: the trim input alone."""
 
+from echelon.agents.models.model import ControlAffine
 from echelon.core.types import Input
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.models.model import ControlAffine
 
 
 class TrimInput(Law):

@@ -1,0 +1,8 @@
+"""What there is: vehicles, who hears whom, the paths that leaders follow, and disturbances."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=["models", "network", "references", "world"],
+)

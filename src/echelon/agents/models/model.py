@@ -1,0 +1,363 @@
+"""The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x).
+
+It is the agent of the paper's Definition 1. A model of one's own is two methods and two tuples
+of names; everything else has a default that may be replaced by a class attribute, a property or a
+method of the same name.
+"""
+
+import abc
+import numbers
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Generic, NamedTuple, TypeAlias, TypeVar, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from echelon.agents.models.airframe import Airframe
+from echelon.agents.models.heading import Heading
+from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.types import Input, InputMap, Output, State
+
+Pair: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
+Rows: TypeAlias = tuple[tuple[float, ...], ...]
+_T = TypeVar("_T")
+_Inputs = TypeVar("_Inputs", jax.Array, np.ndarray)
+
+
+class _Default(Generic[_T]):
+    """A class attribute computed from the instance, until a subclass replaces it in any way."""
+
+    def __init__(self, make: Callable[[Any], _T]) -> None:
+        self.make = make
+
+    # Without `__set__` it gives way to a field of the instance, as a property would not.
+    def __get__(self, instance: object, owner: type) -> "_T | _Default[_T]":
+        """Return the value for an instance."""
+        return self if instance is None else self.make(instance)
+
+
+def default(make: Callable[[Any], _T]) -> _T:
+    """Return a default that depends on the instance; an attribute or a property may replace it."""
+    return cast(_T, _Default(make))
+
+
+def _repeat(value: float, names: tuple[str, ...]) -> tuple[float, ...]:
+    return (value,) * len(names)
+
+
+def diagonal(*entries: float) -> Rows:
+    """Return a diagonal matrix as nested tuples, the form of `input_scale`."""
+    return tuple(
+        tuple(e if i == j else 0.0 for j in range(len(entries))) for i, e in enumerate(entries)
+    )
+
+
+class Limits(NamedTuple):
+    """What actuators can deliver: low <= G u <= high, row by row.
+
+    Attributes:
+        matrix: G, (k, m).
+        low, high: (k,), infinite where there is no bound.
+    """
+
+    matrix: Rows
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+class FlatChains(NamedTuple):
+    """Which derivatives of its flat outputs a model's inputs reach first, and behind what.
+
+    Attributes:
+        degrees: of each flat output.
+        integrators: to be put before each input for that.
+    """
+
+    degrees: tuple[int, ...]
+    integrators: tuple[int, ...]
+
+
+class FlatBound(NamedTuple):
+    """A border of the flat coordinates: a derivative of flat outputs stays above a value.
+
+    Of one output it is the derivative itself, of several the length of their vector.
+
+    Attributes:
+        outputs: whose derivative it is.
+        derivative: its order.
+        above: what it stays above.
+        within: what else of the state that bounds, in words.
+    """
+
+    outputs: tuple[str, ...]
+    derivative: int
+    above: float
+    within: str
+
+
+class Flattened(NamedTuple):
+    """A state in flat coordinates.
+
+    Attributes:
+        values: (r, m), the flat outputs and their derivatives below the inputs', else zero.
+        invert: wanted highest derivatives (m,) -> the normalized inputs (m,) behind integrators.
+    """
+
+    values: jax.Array
+    invert: Callable[[jax.Array], Input]
+
+
+class ControlAffine(eqx.Module):
+    """One agent, xdot = f(x) + g(x) u with output y = h(x).
+
+    Shapes are those of one agent: x (n,), u (m,), f (n,), g (n, m), h (q,). The methods must be
+    pure and, in x, differentiable by JAX.
+    """
+
+    state_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the n states; every model must say them."""
+
+    input_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the m inputs; every model must say them."""
+
+    output_names: ClassVar[tuple[str, ...]] = default(lambda self: self.state_names)
+    """Names of the entries of h(x); to be replaced together with `output`."""
+
+    state_units: ClassVar[tuple[str, ...]] = default(lambda self: ("",) * len(self.state_names))
+    """SI units of the states, as text; empty where unknown."""
+
+    input_units: ClassVar[tuple[str, ...]] = default(lambda self: ("",) * len(self.input_names))
+    """SI units of the inputs, as text; empty where unknown."""
+
+    state_groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Named groups of states, such as `position` or `attitude`, for spreads and start errors."""
+
+    position: ClassVar[tuple[str, ...]] = ()
+    """Names of the coordinates that a picture shows, in metres; none for an abstract agent."""
+
+    trim: ClassVar[Pair] = default(
+        lambda self: (_repeat(0.0, self.state_names), _repeat(0.0, self.input_names))
+    )
+    """Equilibrium (x*, u*) about which gains are made; the origin unless replaced."""
+
+    input_scale: ClassVar[Rows] = default(lambda self: diagonal(*_repeat(1.0, self.input_names)))
+    """Matrix S (m, m) of the normalized input v in u = u* + S v; the identity unless replaced."""
+
+    weights: ClassVar[Pair] = default(
+        lambda self: (_repeat(1.0, self.state_names), _repeat(1.0, self.input_names))
+    )
+    """Diagonals of the default Riccati weights (Q, R), R on normalized inputs; all ones."""
+
+    damping: ClassVar[Rows | None] = None
+    """Feedback K (m, n) of an inner loop v = -K (x - x*) that leaves symmetric states alone."""
+
+    symmetry_weights: ClassVar[tuple[float, ...] | None] = None
+    """Weights of the symmetric states in the P that goes with `damping`, one each."""
+
+    symmetry_inputs: ClassVar[tuple[float, ...] | None] = None
+    """Weights R of the normalized inputs in the law above `damping`, one each; ones without."""
+
+    input_limits: ClassVar[Limits | None] = None
+    """The inputs that actuators deliver, low <= G u <= high; None where nothing limits them.
+
+    Where G is square and invertible, `limit` clips row by row unless it is replaced; else it must
+    be.
+    """
+
+    heading: ClassVar[Heading | None] = None
+    """How the agent turns, if it is the same in every heading; None where it is not, or has none.
+
+    Gains of such a model turn with the heading that the leader follows.
+    """
+
+    chart: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Open bounds of states outside which the equations do not hold, such as a pitch of 90 deg."""
+
+    flat_outputs: ClassVar[tuple[str, ...]] = ()
+    """Which of a reference's coordinates (x, y, z, yaw) the model can follow."""
+
+    flat_order: ClassVar[int] = 0
+    """How many time derivatives of the reference `flat` needs."""
+
+    flat_chains: ClassVar[FlatChains | None] = None
+    """The chains of integrators that feedback makes of the agent; found at samples where None."""
+
+    flat_bounds: ClassVar[tuple[FlatBound, ...] | None] = None
+    """Where the flat coordinates of `flat_chains` end: nowhere where there are none, by the model's
+    own word; None where it does not say."""
+
+    airframe: ClassVar[Airframe | None] = None
+    """The body that `thrust` and three torques move by four motors; None where it is none."""
+
+    @abc.abstractmethod
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+
+    @abc.abstractmethod
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x)."""
+
+    def output(self, x: State) -> Output:
+        """Return h(x); the whole state unless replaced."""
+        return x
+
+    def flat(self, derivatives: jnp.ndarray) -> tuple[State, Input]:
+        """Return the state and input (x, u) that produce a flat output.
+
+        Args:
+            derivatives: (flat_order + 1, len(flat_outputs)), the output and its time derivatives.
+
+        Raises:
+            ModelError: the model does not say how.
+        """
+        raise ModelError(
+            f"model `{type(self).__name__}` cannot track a reference since it defines no `flat`; "
+            "use the law `passive` for its leader, or add `flat_outputs`, `flat_order` and `flat`."
+        )
+
+    def flatten(self, x: State, e: jax.Array) -> Flattened | None:
+        """Return the flat coordinates of a state whose `flat_chains` hold e; None for none known.
+
+        What is not known is found by automatic differentiation.
+        """
+        return None
+
+    def switch_on(self, x: State, ahead: jax.Array) -> jax.Array | None:
+        """Return what integrators before inputs hold first at a state (n,); None leaves it open.
+
+        `ahead` (r, m) are the flat outputs of what the agent follows, and their derivatives.
+        """
+        return None
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y; to be replaced where a coordinate is an angle that winds."""
+        return x - y
+
+    def limit(self, u: Input) -> Input:
+        """Return the input that the actuators deliver for a requested u.
+
+        Each row of G u is clipped to its limits unless replaced. An input within the limits must be
+        returned unchanged, to the bit: that is how saturation is counted.
+        """
+        if self.input_limits is None:
+            return u
+        G, low, high = (jnp.asarray(part, u.dtype) for part in self.input_limits)
+        rows = G @ u
+        held = jnp.clip(rows, low, high)
+        back = jnp.asarray(np.linalg.inv(np.asarray(self.input_limits.matrix)), u.dtype)
+        # There and back would round, and count as saturation.
+        return jnp.where(jnp.all(rows == held), u, back @ held)
+
+    def velocity(self, x: State, u: Input) -> State:
+        """Return f(x) + g(x) u."""
+        return self.drift(x) + self.input_map(x) @ u
+
+    def normalized_drift(self, x: State) -> State:
+        """Return f(x) + g(x) u*, the drift about the trim."""
+        return self.velocity(x, jnp.asarray(self.trim[1], x.dtype))
+
+    def normalized_input_map(self, x: State) -> InputMap:
+        """Return g(x) S, the input map of the normalized input."""
+        return self.input_map(x) @ jnp.asarray(self.input_scale, x.dtype)
+
+    def physical(self, v: _Inputs, trim: bool = True) -> _Inputs:
+        """Return u = u* + S v of normalized inputs (..., m), NumPy's or JAX's, in their precision.
+
+        Without the trim it is S v, what an input is changed by.
+        """
+        xp = v.__array_namespace__()
+        # One input a row: (S v)' = v'S'.
+        u = v @ xp.asarray(self.input_scale, v.dtype).T
+        return u + _rest(self, u) if trim else u
+
+    def normalized(self, u: _Inputs) -> _Inputs:
+        """Return v = S^-1 (u - u*) of physical inputs (..., m), NumPy's or JAX's."""
+        xp = u.__array_namespace__()
+        # A constant wherever S is one, so that neither a step nor a solver's expression inverts it.
+        # By NumPy, since a program for it takes longer than the rest of a trace.
+        if any(isinstance(entry, Tracer) for entry in jax.tree.leaves(self.input_scale)):
+            inverse = xp.linalg.inv(xp.asarray(self.input_scale, u.dtype))
+        else:
+            inverse = xp.asarray(np.linalg.inv(np.asarray(self.input_scale, u.dtype)))
+        return (u - _rest(self, u)) @ inverse.T
+
+    def position_indices(self) -> tuple[int, ...]:
+        """Return the places of `position` in the state."""
+        return tuple(self.state_names.index(name) for name in self.position)
+
+    def states_called(self, name: str) -> tuple[int, ...]:
+        """Return the indices of the states meant by a state's or a group's name.
+
+        Raises:
+            ModelError: the model has neither a state nor a group of that name.
+        """
+        if name in self.state_groups:
+            return tuple(self.state_names.index(member) for member in self.state_groups[name])
+        if name in self.state_names:
+            return (self.state_names.index(name),)
+        allowed = [*self.state_groups, *self.state_names]
+        raise ModelError(
+            f"`{name}` is no state or group of `{type(self).__name__}`, "
+            f"which has {listing(allowed)}{did_you_mean(name, allowed)}."
+        )
+
+    def per_state(self, named: Mapping[str, float], otherwise: float = 0.0) -> np.ndarray:
+        """Return a number for each state, (n,), from numbers by state or group of states.
+
+        A state's own number wins over its group's. States that are not named have `otherwise`.
+
+        Raises:
+            ModelError: the model has neither a state nor a group of a name.
+        """
+        values = np.full(len(self.state_names), float(otherwise))
+        # Groups come first, whatever the order of the mapping, and states write over them.
+        for name in sorted(named, key=lambda name: name in self.state_names):
+            values[list(self.states_called(name))] = named[name]
+        return values
+
+
+def _rest(model: ControlAffine, u: _Inputs) -> _Inputs:
+    """Return u* in the shape (..., m) and precision of u."""
+    xp = u.__array_namespace__()
+    return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
+
+
+def wound(difference: State, *angles: int) -> State:
+    """Return a difference of states with the angles (rad) at these places the shorter way round."""
+    # Agents that differ by a whole turn agree. Without a turn to take off nothing changes, to the
+    # bit.
+    places = np.array(angles)
+    turns = jnp.round(difference[places] / (2.0 * jnp.pi))
+    return difference.at[places].add(-2.0 * jnp.pi * turns)
+
+
+def check_positive(owner: object, **values: float) -> None:
+    """Check that each named parameter is a finite positive number.
+
+    Raises:
+        ModelError: one is not.
+    """
+    # A chain of comparisons is false for NaN, which is refused with the rest.
+    for name, value in values.items():
+        if not (isinstance(value, numbers.Real) and 0.0 < value < float("inf")):
+            raise ModelError(
+                f"`{name}` of `{type(owner).__name__}` is {value}, "
+                "and must be a positive finite number."
+            )
+
+
+def check_not_negative(owner: object, **values: float) -> None:
+    """Check that each named parameter is a finite number of at least zero.
+
+    Raises:
+        ModelError: one is not.
+    """
+    for name, value in values.items():
+        if not (isinstance(value, numbers.Real) and 0.0 <= value < float("inf")):
+            raise ModelError(
+                f"`{name}` of `{type(owner).__name__}` is {value}, and must be finite "
+                "and not negative."
+            )

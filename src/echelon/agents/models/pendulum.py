@@ -1,0 +1,41 @@
+"""The damped pendulum, the smallest agent with a nonlinear drift and a stable equilibrium."""
+
+import jax.numpy as jnp
+
+from echelon.agents.models.model import (
+    ControlAffine,
+    FlatChains,
+    check_not_negative,
+    check_positive,
+)
+from echelon.core.types import InputMap, State
+
+
+class Pendulum(ControlAffine):
+    """angledot = rate, ratedot = -stiffness sin(angle) - damping rate + u.
+
+    `stiffness` is gravity over length, 1/s^2; `damping` is in 1/s; u is torque over inertia,
+    rad/s^2.
+    """
+
+    damping: float = 0.5
+    stiffness: float = 9.81
+
+    state_names = ("angle", "rate")
+    state_units = ("rad", "rad/s")
+    input_names = ("torque",)
+    input_units = ("rad/s^2",)
+    flat_chains, flat_bounds = FlatChains((2,), (0,)), ()
+
+    def __check_init__(self) -> None:
+        """Refuse a stiffness that is not positive or a negative damping."""
+        check_positive(self, stiffness=self.stiffness)
+        check_not_negative(self, damping=self.damping)
+
+    def drift(self, x: State) -> State:
+        """Return f(x)."""
+        return jnp.stack([x[1], -self.stiffness * jnp.sin(x[0]) - self.damping * x[1]])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g = (0; 1)."""
+        return jnp.array([[0.0], [1.0]], x.dtype)

@@ -1,0 +1,300 @@
+"""The 12-state quadrotor of the paper's example.
+
+It has the gravity and the thrust rotation that the paper's equations leave out.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.airframe import Airframe
+from echelon.agents.models.heading import Heading
+from echelon.agents.models.model import (
+    ControlAffine,
+    FlatBound,
+    FlatChains,
+    Flattened,
+    Limits,
+    Rows,
+    check_positive,
+    diagonal,
+    wound,
+)
+from echelon.agents.models.rigid_body import (
+    attitude_along,
+    body_axes,
+    body_rates,
+    check_inertia,
+    check_moments,
+    euler_rates,
+    free_spin,
+    thrust_axis,
+)
+from echelon.agents.models.rotors import attitude_priority, fits
+from echelon.core.errors import ModelError, did_you_mean, listing
+from echelon.core.types import Input, InputMap, Output, State
+
+_IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
+"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015); no other propellers' is published."""
+
+
+def _flown(mass: float, motor_thrust: float, torque_per_thrust: float) -> dict[str, Any]:
+    numbers = {"motor_thrust": motor_thrust, "torque_per_thrust": torque_per_thrust}
+    return {"mass": mass, "inertia": _IDENTIFIED, **numbers}
+
+
+# What a motor gives is what the firmware holds at any charge of the battery. Fresh it gives more:
+# 0.16 N by Foerster, whose numbers the paper takes.
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "crazyflie": _flown(0.028, 0.15975, 0.005964552),
+    "crazyflie-2.1+": _flown(0.029, 0.12, 0.006993),
+    "crazyflie-legacy": _flown(0.029, 0.12, 0.00735),
+    "crazyflie-thrust-kit": _flown(0.0325, 0.18, 0.00516),
+    "paper": {"mass": 0.028, "inertia": (6.4893e-6, 16.4562e-6, 29.5435e-6)},
+}
+"""Named parameter sets. `crazyflie` is the Crazyflie 2.1 that Foerster (2015) identified, with the
+calibration that its firmware had then, and `paper` the paper's Table I as printed. The others are
+of the firmware from 2025 on (Bitcraze, platform defaults of cf2), by its propellers: those of the
+2.1+, the older ones, and the thrust upgrade kit; their inertia is Foerster's."""
+
+
+def _with_rate(
+    curve: Callable[[jax.Array], jax.Array], s: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return curve(s) and its derivative."""
+    return jax.jvp(curve, (s,), (jnp.ones_like(s),))
+
+
+# Motors at (+-l, +-l): front-left, rear-left, rear-right, front-right as signs of (x, y); the spin
+# of each gives the sign of its yaw torque.
+_FRONT = (1.0, -1.0, -1.0, 1.0)
+_LEFT = (1.0, 1.0, -1.0, -1.0)
+_SPIN = (1.0, -1.0, 1.0, -1.0)
+
+
+class Quadrotor(ControlAffine):
+    """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles.
+
+    pdot = v, vdot = -g e3 + R(zeta) e3 T / m,
+    zetadot = W(zeta) omega, J omegadot = tau - omega x J omega
+    (paper, equation of the example).
+
+    States: position (m), velocity (m/s), attitude (rad), body rate (rad/s). Inputs: thrust T (N)
+    and body torques tau (N m). The normalized input is (T/m - g, J^-1 tau).
+
+    Raises:
+        ModelError: a parameter is not positive, or no rigid body has the inertia (unless
+            `allow_unphysical`).
+    """
+
+    mass: float = 0.028
+    inertia: tuple[float, float, float] = (16.571710e-6, 16.655602e-6, 29.261652e-6)
+    gravity: float = 9.81
+    # The motors stand 0.046 m from the hub, over sqrt 2 along each body axis; 0.639 N in all, a
+    # quarter each.
+    arm: float = 0.0325
+    motor_thrust: float = 0.15975
+    torque_per_thrust: float = 0.005964552
+    allow_unphysical: bool = eqx.field(default=False, static=True)
+
+    state_names = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
+    state_units = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
+    input_names = ("thrust", "torque_x", "torque_y", "torque_z")
+    input_units = ("N", "N m", "N m", "N m")
+    output_names = ("x", "y", "z", "yaw")
+    position = ("x", "y", "z")
+    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
+    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
+    flat_outputs = ("x", "y", "z", "yaw")
+    # The path's second derivative sets the attitude, whose second derivative is the torque.
+    flat_order = 4
+    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
+    state_groups = {
+        "position": ("x", "y", "z"),
+        "velocity": ("vx", "vy", "vz"),
+        "attitude": ("roll", "pitch", "yaw"),
+        "rate": ("p", "q", "r"),
+    }
+    # By simulation: weights of 1 make a rate of 0.008 1/s, and with 700 a line of 10 is lost.
+    symmetry_weights = (500.0, 500.0, 100.0)
+    # A tilt turns the thrust into the direction that weighs 500: with a weight of 1 for it the
+    # fastest mode goes from 143 1/s at hover to 706 1/s at 30 degrees.
+    symmetry_inputs = (4.0, 1.0, 1.0, 1.0)
+    # One over the square of what counts as much: 1 m, 2 m/s, 0.7 rad, 5 rad/s; 5 m/s^2, 20 rad/s^2.
+    weights = ((1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3, (1 / 25,) + (1 / 400,) * 3)
+
+    @classmethod
+    def named(cls, name: str, **changes: Any) -> "Quadrotor":
+        """Return the quadrotor of a named parameter set, one of `PARAMETERS`.
+
+        `changes` replace fields of the set.
+
+        Raises:
+            ModelError: there is no such set.
+        """
+        if str(name) not in PARAMETERS:
+            raise ModelError(
+                f"parameters `{name}` are unknown for `Quadrotor`, "
+                f"allowed are {listing(PARAMETERS)}{did_you_mean(name, PARAMETERS)}."
+            )
+        return cls(**{**PARAMETERS[name], **changes})
+
+    @classmethod
+    def crazyflie(cls) -> "Quadrotor":
+        """Return the Crazyflie 2.1 with the parameters identified by Foerster (2015)."""
+        return cls.named("crazyflie")
+
+    def __check_init__(self) -> None:
+        """Refuse parameters that no vehicle can have."""
+        names = ("mass", "gravity", "arm", "motor_thrust", "torque_per_thrust")
+        check_positive(self, **{name: getattr(self, name) for name in names})
+        check_moments(self, self.inertia)
+        if not self.allow_unphysical:
+            check_inertia(self.inertia)
+
+    @property
+    def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Hover at the origin: thrust m g, no torque."""
+        return (0.0,) * 12, (self.mass * self.gravity, 0.0, 0.0, 0.0)
+
+    @property
+    def damping(self) -> Rows:
+        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw; position is left out."""
+        # A tilt accelerates by g times itself, so 1.6/g rad per m/s damp at 1.6 1/s. Poles of the
+        # attitude: s^2 + 16 s + 60 = (s + 6) (s + 10); of the yaw: (s + 2)^2.
+        tilt, stiff, damp = 1.6 / self.gravity, 60.0, 16.0
+        K = np.zeros((4, 12))
+        K[0, 5] = 2.0
+        K[1, [4, 6, 9]] = -stiff * tilt, stiff, damp
+        K[2, [3, 7, 10]] = stiff * tilt, stiff, damp
+        K[3, [8, 11]] = 4.0, 4.0
+        return tuple(tuple(float(entry) for entry in row) for row in K)
+
+    @property
+    def input_scale(self) -> tuple[tuple[float, ...], ...]:
+        """S = diag(m, Ixx, Iyy, Izz)."""
+        return diagonal(self.mass, *self.inertia)
+
+    @property
+    def input_limits(self) -> Limits:
+        """Each motor gives between 0 and `motor_thrust`."""
+        # Thrust and torques mix the motors by orthogonal patterns of signs, with squares that sum
+        # to 4: the inverse is the transpose over 4.
+        rows = tuple(
+            (
+                0.25,
+                left / (4.0 * self.arm),
+                -front / (4.0 * self.arm),
+                spin / (4.0 * self.torque_per_thrust),
+            )
+            for left, front, spin in zip(_LEFT, _FRONT, _SPIN, strict=True)
+        )
+        return Limits(rows, (0.0,) * 4, (self.motor_thrust,) * 4)
+
+    @property
+    def airframe(self) -> Airframe:
+        """What its motors move."""
+        numbers = self.gravity, self.arm, self.torque_per_thrust, self.motor_thrust
+        return Airframe(self.mass, self.inertia, *numbers)
+
+    def drift(self, x: State) -> State:
+        """Return f(x): free fall, attitude kinematics and gyroscopic coupling."""
+        fall = jnp.array([0.0, 0.0, -self.gravity], x.dtype)
+        turning = euler_rates(x[6:9], x[9:12])
+        return jnp.concatenate([x[3:6], fall, turning, free_spin(self.inertia, x[9:12])])
+
+    def input_map(self, x: State) -> InputMap:
+        """Return g(x): thrust along the body z axis, torques on the body rates."""
+        nothing = jnp.zeros((3, 4), x.dtype)
+        lift = jnp.pad(thrust_axis(x[6:9])[:, None] / self.mass, ((0, 0), (0, 3)))
+        spin = jnp.pad(jnp.diag(1.0 / jnp.asarray(self.inertia, x.dtype)), ((0, 0), (1, 0)))
+        return jnp.concatenate([nothing, lift, nothing, spin])
+
+    def output(self, x: State) -> Output:
+        """Return position and yaw."""
+        return jnp.concatenate([x[:3], x[8:9]])
+
+    def difference(self, x: State, y: State) -> State:
+        """Return x - y with the angles the shorter way round."""
+        return wound(x - y, 6, 7, 8)
+
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
+        """Return the state and input that fly a path (x, y, z, yaw).
+
+        The path is given with its first four derivatives, (5, 4).
+        """
+        position, velocity, acceleration = derivatives[:3, :3]
+        up = jnp.array([0.0, 0.0, self.gravity], derivatives.dtype)
+        attitude = attitude_along(derivatives, self.gravity)
+
+        def rate(s: jax.Array) -> State:
+            return body_rates(*_with_rate(attitude, s))
+
+        now = jnp.zeros((), derivatives.dtype)
+        omega, omega_dot = _with_rate(rate, now)
+        # J omegadot = tau - omega x J omega, solved for tau.
+        torque = jnp.asarray(self.inertia, omega.dtype) * (
+            omega_dot - free_spin(self.inertia, omega)
+        )
+        thrust = self.mass * jnp.linalg.norm(acceleration + up)
+        return (
+            jnp.concatenate([position, velocity, attitude(now), omega]),
+            jnp.concatenate([thrust[None], torque]),
+        )
+
+    @property
+    def flat_bounds(self) -> tuple[FlatBound, ...]:
+        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
+        # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three can pass 0 unless it does.
+        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
+
+    def flatten(self, x: State, e: jax.Array) -> Flattened:
+        """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""
+        # With a = T/m, p^(2) = a R e3 - g e3, and R' = R [omega]x makes p^(3) = R (a q, -a p, a')
+        # and p^(4) = R (2 a' q + a q' + a p r, -2 a' p - a p' + a q r, a'' - a (p^2 + q^2)).
+        (p, q, r), a, rate = x[9:12], self.gravity + e[0], e[1]
+        axes, turning = body_axes(x[6:9]), euler_rates(x[6:9], x[9:12])
+        fall = jnp.array([0.0, 0.0, -self.gravity], x.dtype)
+        jerk = axes @ jnp.stack([a * q, -a * p, rate])
+        path = jnp.stack([x[:3], x[3:6], axes[:, 2] * a + fall, jerk])
+        heading = jnp.pad(jnp.stack([x[8], turning[2]]), (0, 2))
+
+        def invert(tops: jax.Array) -> Input:
+            snap = tops[:3] @ axes
+            (sr, sp), (cr, cp) = jnp.sin(x[6:8]), jnp.cos(x[6:8])
+            # One quotient for all, which take longest of what is done here.
+            both = 1.0 / (a * cr)
+            p_dot = q * r - (2.0 * rate * p + snap[1]) * (cr * both)
+            q_dot = (snap[0] - 2.0 * rate * q) * (cr * both) - p * r
+            # yaw' is (sin(roll) q + cos(roll) r) / cos(pitch), and tops[3] its rate.
+            known = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
+            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - known) * (a * both)])
+            spin = spin - free_spin(self.inertia, x[9:12])
+            return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
+
+        return Flattened(jnp.concatenate([path, heading[:, None]], axis=1), invert)
+
+    def limit(self, u: Input) -> Input:
+        """Return what four motors within [0, motor_thrust] deliver.
+
+        What does not fit gives way in this order: the collective, then yaw, then roll and pitch.
+        """
+        left, front, spin = (jnp.asarray(sign, u.dtype) for sign in (_LEFT, _FRONT, _SPIN))
+        # The same mixer as in `input_limits`, its part for yaw apart.
+        tilt = (u[1] * left - u[2] * front) / (4.0 * self.arm)
+        yaw = u[3] * spin / (4.0 * self.torque_per_thrust)
+        wanted = u[0] / 4.0 + tilt + yaw
+        f = attitude_priority(u[0] / 4.0, tilt, yaw, self.motor_thrust)
+        torque = [
+            self.arm * (left @ f),
+            -self.arm * (front @ f),
+            self.torque_per_thrust * (spin @ f),
+        ]
+        delivered = jnp.stack([jnp.sum(f), *torque])
+        # u itself where it fits, since mixing there and back would round and count as saturation.
+        return jnp.where(fits(wanted, self.motor_thrust), u, delivered)

@@ -1,0 +1,125 @@
+"""A rigid body in space: ZYX Euler angles zeta = (roll, pitch, yaw), body rates, and inertia.
+
+Body to world is Rz(yaw) Ry(pitch) Rx(roll).
+"""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from echelon.agents.models.model import check_positive
+from echelon.core.errors import ModelError
+from echelon.core.types import Scalar
+
+Vector: TypeAlias = Float[jax.Array, " 3"]
+
+
+def check_moments(owner: object, inertia: tuple[float, ...]) -> None:
+    """Check that an inertia is three positive moments.
+
+    Raises:
+        ModelError: it is not.
+    """
+    if not isinstance(inertia, (tuple, list)) or len(inertia) != 3:
+        raise ModelError(
+            f"`inertia` of `{type(owner).__name__}` is {inertia}, and must be three moments "
+            "(Ixx, Iyy, Izz) in kg m^2."
+        )
+    check_positive(owner, **{f"inertia[{k}]": moment for k, moment in enumerate(inertia)})
+
+
+def check_inertia(inertia: tuple[float, float, float]) -> None:
+    """Check that a rigid body can have these principal moments of inertia, kg m^2.
+
+    Raises:
+        ModelError: one exceeds the sum of the other two, by more than rounding.
+    """
+    # Ixx + Iyy - Izz = int 2 z^2 dm >= 0 for each axis, with equality for a flat plate: hence the
+    # slack.
+    total = sum(inertia)
+    for axis, moment in zip("xyz", inertia, strict=True):
+        if 2.0 * moment > total * (1.0 + 1e-12):
+            raise ModelError(
+                f"`inertia` is {tuple(inertia)} kg m^2, and no rigid body has that: "
+                f"I{axis}{axis} = {moment:.6g} exceeds the sum of the other two, "
+                f"{total - moment:.6g}; use the identified values `crazyflie`, "
+                "or set `allow_unphysical` to keep it."
+            )
+
+
+def free_spin(inertia: tuple[float, float, float], omega: Vector) -> Vector:
+    """Return -J^-1 (omega x J omega), the angular acceleration without torque."""
+    # Euler's equations: in principal axes J is diagonal, and each axis has one number of it.
+    J = jnp.asarray(inertia, omega.dtype)
+    before, after = jnp.roll(J, 1), jnp.roll(J, -1)
+    return (after - before) / J * jnp.roll(omega, -1) * jnp.roll(omega, 1)
+
+
+def thrust_axis(zeta: Vector) -> Vector:
+    """Return the body z axis in the world frame, R e3."""
+    # The third column of Rz(yaw) Ry(pitch) Rx(roll).
+    (sr, sp, sy), (cr, cp, cy) = jnp.sin(zeta), jnp.cos(zeta)
+    return jnp.stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
+
+
+def body_axes(zeta: Vector) -> Float[jax.Array, "3 3"]:
+    """Return R, whose columns are the body's axes in the world frame."""
+    (sr, sp, sy), (cr, cp, cy) = jnp.sin(zeta), jnp.cos(zeta)
+    ahead = jnp.stack([cp * cy, cp * sy, -sp])
+    left = jnp.stack([sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp])
+    return jnp.stack([ahead, left, thrust_axis(zeta)], axis=1)
+
+
+def euler_rates(zeta: Vector, omega: Vector) -> Vector:
+    """Return zetadot = W(zeta) omega (rad/s) from the body rate; singular at pitch +-90 deg."""
+    sr, cr = jnp.sin(zeta[0]), jnp.cos(zeta[0])
+    p, q, r = omega
+    # The yaw rate, of which sin(pitch) turns into roll.
+    turn = (sr * q + cr * r) / jnp.cos(zeta[1])
+    return jnp.stack([p + jnp.sin(zeta[1]) * turn, cr * q - sr * r, turn])
+
+
+def body_rates(zeta: Vector, zeta_dot: Vector) -> Vector:
+    """Return the body rate omega = W(zeta)^-1 zetadot, rad/s."""
+    (sr, sp), (cr, cp) = jnp.sin(zeta[:2]), jnp.cos(zeta[:2])
+    roll, pitch, yaw = zeta_dot
+    return jnp.stack([roll - sp * yaw, cr * pitch + sr * cp * yaw, cr * cp * yaw - sr * pitch])
+
+
+def tilt_towards(direction: Vector, yaw: Scalar) -> Vector:
+    """Return the angles zeta with the given yaw whose thrust axis points along `direction`.
+
+    The length of `direction` does not matter.
+    """
+    sy, cy = jnp.sin(yaw), jnp.cos(yaw)
+    # With the yaw undone R e3 is (cos roll sin pitch, -sin roll, cos roll cos pitch).
+    forward = cy * direction[0] + sy * direction[1]
+    left = cy * direction[1] - sy * direction[0]
+    # atan2 of the two legs keeps the derivative finite where an arcsine of a unit length would not.
+    roll = jnp.arctan2(-left, jnp.hypot(forward, direction[2]))
+    return jnp.stack([roll, jnp.arctan2(forward, direction[2]), yaw])
+
+
+def lift_along(path: jax.Array, gravity: float) -> Callable[[Scalar], Vector]:
+    """Return the thrust over mass (m/s^2), as a function of time from now, that flies a path.
+
+    The path (x, y, z, ...) is given with its first four derivatives, (5, k); what is returned is
+    right at 0 with its first two derivatives.
+    """
+    acceleration, jerk, snap = path[2:5, :3]
+    up = jnp.array([0.0, 0.0, gravity], path.dtype)
+    # Taylor's polynomial: the attitude is needed to its second derivative at 0, and no further.
+    return lambda s: acceleration + up + s * jerk + 0.5 * s**2 * snap
+
+
+def attitude_along(path: jax.Array, gravity: float) -> Callable[[Scalar], Vector]:
+    """Return the angles zeta, as a function of time from now, that fly a path (x, y, z, yaw).
+
+    The path is given with its first four derivatives, (5, 4); what is returned is right at 0 with
+    its first two derivatives.
+    """
+    lift, yaw = lift_along(path, gravity), path[:3, 3]
+    return lambda s: tilt_towards(lift(s), yaw[0] + s * yaw[1] + 0.5 * s**2 * yaw[2])

@@ -1,0 +1,297 @@
+"""The formation: each agent's goal offset xi_i from the leader.
+
+With it stands what the graph and the model make of the offsets: rigidity and symmetry.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import final
+
+import jax
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.core.compiled import program
+from echelon.core.errors import FormationError
+from echelon.core.numerics import precision
+from echelon.core.types import Array, States
+
+# For an analytic model one random state would do, almost surely; kinks need more.
+_SAMPLES = 32
+_TESTED = 64
+_SYMMETRY_TOLERANCE = 1e-9
+
+
+@final
+class Formation:
+    """Goal offsets xi (N, n), one row an agent; xi_i is agent i's goal state minus the leader's.
+
+    Attributes:
+        offsets: (N, n) float64.
+
+    Raises:
+        FormationError: the offsets are no finite matrix.
+    """
+
+    def __init__(self, offsets: Sequence[Sequence[float]] | Array) -> None:
+        """Keep the offsets, read-only."""
+        self.offsets = np.array(offsets, dtype=np.float64)
+        if self.offsets.ndim != 2 or not np.isfinite(self.offsets).all():
+            raise FormationError(
+                f"formation offsets must be a matrix of finite numbers (agents, states), "
+                f"and have shape {self.offsets.shape}."
+            )
+        self.offsets.setflags(write=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Tell whether two formations have the same offsets."""
+        return isinstance(other, Formation) and np.array_equal(self.offsets, other.offsets)
+
+    def __hash__(self) -> int:
+        """Hash what `__eq__` compares."""
+        # Where -0.0 is 0.0, which it equals.
+        return hash((self.offsets.shape, (self.offsets + 0.0).tobytes()))
+
+    @classmethod
+    def from_offsets(
+        cls, model: ControlAffine, graph: Graph, offsets: Mapping[int, Sequence[float]]
+    ) -> "Formation":
+        """Return the formation with the given offsets; an agent not named has none.
+
+        Args:
+            model: gives the states.
+            graph: gives the agents.
+            offsets: agent number -> offset, over the position coordinates (metres) or over all n
+                states.
+
+        Raises:
+            FormationError: an agent is unknown or an offset has a wrong length or a non-finite
+                number.
+        """
+        if not isinstance(offsets, Mapping):
+            raise FormationError(
+                f"the offsets are a `{type(offsets).__name__}`, and must be a mapping from agents "
+                "to offsets, such as {1: (1.0, 0.0)}; a whole matrix is `Formation(offsets)`."
+            )
+        full = np.zeros((graph.agents, len(model.state_names)))
+        for agent, offset in offsets.items():
+            if not isinstance(agent, (int, np.integer)) or not 0 <= agent < graph.agents:
+                raise FormationError(
+                    f"an offset is given for agent {agent}, "
+                    f"and agents are numbered from 0 to {graph.agents - 1}."
+                )
+            full[agent] = _whole_state(model, agent, offset)
+        return cls(full)
+
+    @classmethod
+    def triangle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
+        """Return a filled triangle with agent 0 at the tip.
+
+        Rows of 2, 3, ... agents stand behind it, towards minus the first axis.
+        """
+        # Row r begins with agent r (r + 1) / 2, solved for r.
+        rows = np.floor((np.sqrt(8.0 * np.arange(graph.agents) + 1.0) - 1.0) / 2.0)
+        place = np.arange(graph.agents) - rows * (rows + 1) / 2.0
+        # The height of an equilateral triangle, so that neighbours are one spacing apart.
+        plan = np.column_stack([-rows * np.sqrt(0.75), place - rows / 2.0])
+        return cls._place_plan(model, graph, plan, spacing)
+
+    @classmethod
+    def line(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
+        """Return agents one behind the other."""
+        number = np.arange(graph.agents)
+        plan = np.column_stack([-number, np.zeros_like(number)])
+        return cls._place_plan(model, graph, plan, spacing)
+
+    @classmethod
+    def wedge(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
+        """Return a V: agents alternate between two arms at 45 degrees behind agent 0."""
+        number = np.arange(graph.agents)
+        # One spacing along an arm at 45 degrees.
+        step = (number + 1) // 2 * np.sqrt(0.5)
+        side = np.where(number % 2 == 1, 1.0, -1.0)
+        return cls._place_plan(model, graph, np.column_stack([-step, side * step]), spacing)
+
+    @classmethod
+    def circle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
+        """Return agents 1, 2, ... on a circle around agent 0, `spacing` apart along its chords."""
+        ring = max(graph.agents - 1, 1)
+        angle = 2.0 * np.pi * np.arange(ring) / ring
+        # A chord is 2 r sin(pi / ring); of one or two agents it says nothing of use.
+        radius = 1.0 if ring < 3 else 0.5 / np.sin(np.pi / ring)
+        points = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        plan = np.vstack([np.zeros((1, 2)), points])[: graph.agents]
+        return cls._place_plan(model, graph, plan, spacing)
+
+    @classmethod
+    def grid(
+        cls, model: ControlAffine, graph: Graph, spacing: float = 1.0, columns: int | None = None
+    ) -> "Formation":
+        """Return rows of `columns` agents (near a square unless given), agent 0 at a corner."""
+        columns = int(np.ceil(np.sqrt(graph.agents))) if columns is None else columns
+        if columns < 1:
+            raise FormationError(f"`columns` of a grid is {columns}, and must be at least 1.")
+        # More columns than agents are one row, and may be more than an array's numbers can count.
+        number, columns = np.arange(graph.agents), min(columns, graph.agents)
+        plan = np.column_stack([-(number // columns), number % columns])
+        return cls._place_plan(model, graph, plan, spacing)
+
+    @classmethod
+    def _place_plan(
+        cls, model: ControlAffine, graph: Graph, plan: np.ndarray, spacing: float
+    ) -> "Formation":
+        """Place a plan (N, 2), in units of the spacing, on the first two position coordinates."""
+        if not 0.0 < spacing < float("inf"):
+            raise FormationError(
+                f"the spacing of a formation is {spacing}, and must be positive and finite."
+            )
+        axes = model.position_indices()
+        if not axes:
+            raise FormationError(
+                f"`{type(model).__name__}` has no position, "
+                "so a drawn formation has no meaning; give `offsets`."
+            )
+        # On a line the plan is projected; goals that then coincide are warned of before a run.
+        used = min(2, len(axes))
+        full = np.zeros((graph.agents, len(model.state_names)))
+        full[:, axes[:used]] = spacing * plan[:, :used]
+        return cls(full)
+
+    def displacement(self, i: int, j: int) -> Array:
+        """Return d_ij = xi_j - xi_i (paper, Definition 3)."""
+        return self.offsets[j] - self.offsets[i]
+
+    def distances(self, graph: Graph) -> Array:
+        """Return delta_ij = |d_ij| for each edge, (E,)."""
+        i, j = graph.edges.T
+        return np.linalg.norm(self.offsets[j] - self.offsets[i], axis=1)
+
+    def rigidity_matrix(self, model: ControlAffine, graph: Graph) -> Array:
+        """Return the rigidity matrix (E, N dim).
+
+        The row of edge (i, j) has (p_i - p_j)^T in block i and its negative in block j.
+        """
+        axes = model.position_indices()
+        if not axes:
+            raise FormationError(
+                f"`{type(model).__name__}` has no position, so rigidity has no meaning for it."
+            )
+        p = self.offsets[:, axes]
+        matrix = np.zeros((len(graph.edges), *p.shape))
+        for row, (i, j) in enumerate(graph.edges):
+            matrix[row, i], matrix[row, j] = p[i] - p[j], p[j] - p[i]
+        return matrix.reshape(len(graph.edges), -1)
+
+    def is_rigid(self, model: ControlAffine, graph: Graph) -> bool:
+        """Tell whether the edges' lengths fix the shape to first order (infinitesimal rigidity)."""
+        agents, dim = graph.agents, len(model.position)
+        # dim translations and dim (dim - 1) / 2 turns; agents fewer than axes can fix as many
+        # lengths as they have pairs.
+        motions = (
+            dim * (dim + 1) // 2 if agents >= dim else agents * dim - agents * (agents - 1) // 2
+        )
+        rank = np.linalg.matrix_rank(self.rigidity_matrix(model, graph))
+        return bool(rank == agents * dim - motions)
+
+    def coincident(self) -> tuple[tuple[int, int], ...]:
+        """Return pairs of agents (lowest number first) that have the same goal."""
+        first, group = _distinct(self.offsets)
+        others = np.flatnonzero(first[group] != np.arange(len(group)))
+        return tuple(zip(first[group[others]].tolist(), others.tolist(), strict=True))
+
+    def broken_symmetries(
+        self, model: ControlAffine, lower: Array | float = -0.5, upper: Array | float = 0.5
+    ) -> dict[int, str]:
+        """Return which agents' offsets change the dynamics, each with one reason; empty if none.
+
+        An offset d keeps the formation law exact only if f(x + d) = f(x) and g(x + d) = g(x). Both
+        are compared at random states, values and Jacobians, in float64. It is a sampled test, of at
+        most 64 distinct offsets spread over all of them.
+
+        Args:
+            model: whose f and g.
+            lower: from where on states are drawn, (n,) or for all, as deviations from the trim.
+            upper: up to where.
+        """
+        offsets = self.offsets - self.offsets[0] + 0.0  # which makes -0.0 the same as 0.0
+        first, group = _distinct(offsets)
+        tested = range(0, len(first), max(1, -(-len(first) // _TESTED)))
+        # In float32 rounding alone would exceed the tolerance.
+        with precision("float64"):
+            found = {
+                k: _describe_change(model, offsets[first[k]], lower, upper)
+                for k in tested
+                if offsets[first[k]].any()
+            }
+        reasons = {k: reason for k, reason in found.items() if reason}
+        agents = np.flatnonzero(np.isin(group, [*reasons])) if reasons else np.zeros(0, int)
+        return {agent: reasons[int(group[agent])] for agent in agents.tolist()}
+
+    def is_invariant(self, model: ControlAffine) -> bool:
+        """Tell whether every offset is a symmetry of the model, by the sampled test above."""
+        return not self.broken_symmetries(model)
+
+
+def _distinct(rows: Array) -> tuple[Array, Array]:
+    """Return the first of each kind of equal rows, in their order, and which kind each is of.
+
+    `numpy.unique` takes some seconds for a million.
+    """
+    varying = rows[:, np.ptp(rows, axis=0) > 0.0]
+    order = np.lexsort(varying.T[::-1]) if varying.size else np.arange(len(rows))
+    changed = (varying[order[1:]] != varying[order[:-1]]).any(axis=1)
+    kinds, group = np.concatenate([[0], np.cumsum(changed)]), np.empty(len(rows), int)
+    group[order] = kinds
+    return order[np.concatenate([[True], changed])], group
+
+
+def _whole_state(model: ControlAffine, agent: int, offset: Iterable[float]) -> np.ndarray:
+    """Return an offset over all states, from one over the position or over all states."""
+    values = np.atleast_1d(np.asarray(offset, dtype=np.float64))
+    axes, n = model.position_indices(), len(model.state_names)
+    if not np.isfinite(values).all():
+        raise FormationError(
+            f"the offset of agent {agent} is {values.tolist()}, and must be finite."
+        )
+    if values.shape == (n,):
+        return values
+    if axes and values.shape == (len(axes),):
+        full = np.zeros(n)
+        full[list(axes)] = values
+        return full
+    lengths = f"{len(axes)} (position) or {n} (all states)" if axes else f"{n} (all states)"
+    raise FormationError(
+        f"the offset of agent {agent} has {values.size} numbers, and must have {lengths}."
+    )
+
+
+def _describe_change(
+    model: ControlAffine, offset: np.ndarray, lower: Array | float, upper: Array | float
+) -> str | None:
+    """Return how f or g changes under x -> x + offset, or None where it does not."""
+    base = np.asarray(model.trim[0], float)
+    # Near the trim where nothing else is asked, so that no angle leaves its chart.
+    states = base + np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, len(base)))
+    both = np.concatenate([states, states + offset])
+    for name, (values, slopes) in _local(model, both).items():
+        here, there = np.split(np.asarray(values), 2)
+        # A change that happens to vanish at a state rarely vanishes with its slope.
+        turned = np.abs(np.diff(np.split(np.asarray(slopes), 2), axis=0))[0].max(axis=-1)
+        change = np.maximum(np.abs(there - here), turned)
+        # Each entry against its own size: an inertia makes some entries of g tens of thousands.
+        entries = change / np.maximum(1.0, np.abs(here).max(axis=0))
+        per_state = change.reshape(_SAMPLES, len(base), -1).max(axis=(0, 2))
+        if not entries.max() <= _SYMMETRY_TOLERANCE:
+            state = model.state_names[int(np.argmax(per_state))]
+            return f"it changes the {name} of `{state}` by up to {per_state.max():.3g}"
+    return None
+
+
+@program
+def _local(model: ControlAffine, states: States) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Return f and g at states (S, n), each with its Jacobian."""
+    parts = {"drift": model.drift, "input map": model.input_map}
+    return {
+        name: (jax.vmap(part)(states), jax.vmap(jax.jacfwd(part))(states))
+        for name, part in parts.items()
+    }

@@ -1,0 +1,110 @@
+"""When a graph changes: stretches of time, each with weights of its own for all edges."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from echelon.agents.network.edges import check_edges, count_agents, split_weights
+from echelon.core.errors import GraphError
+from echelon.core.types import Array
+
+Stretch: TypeAlias = tuple[float, Iterable[Sequence[float]]]
+"""From when on (s), and the edges from then on."""
+_ROUNDED = 1e-9
+"""Of a step: a switch so little before it is one at it."""
+
+
+class Schedule(NamedTuple):
+    """When which weights hold.
+
+    Attributes:
+        starts: (S,) s, ascending from 0: from when on each row of weights holds.
+        weights: (S, E), not negative: 0 where an edge is not there.
+        period: s, after which all begins again; None where the last row holds for ever.
+    """
+
+    starts: Array
+    weights: Array
+    period: float | None
+
+    @property
+    def last(self) -> Array:
+        """The rows that hold for ever, or again and again."""
+        return self.weights if self.period is not None else self.weights[-1:]
+
+    def row(self, t: float) -> int:
+        """Return which row holds at a time (s)."""
+        # Rounded before the period is taken off, or what is just short of its end would be last.
+        t = t + _ROUNDED if self.period is None else (t + _ROUNDED) % self.period
+        return int(np.searchsorted(self.starts, t, side="right")) - 1
+
+    def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
+        """Return from which steps on (K,) which rows (K,) hold, in steps of dt (s).
+
+        They are those of a horizon (s) from the first of its periods on.
+        """
+        rounds = 1 if self.period is None else int(np.floor(horizon / self.period)) + 1
+        begins = (first + np.arange(rounds)) * (self.period or 0.0)
+        times = (begins[:, None] + self.starts).reshape(-1)
+        steps = np.ceil(times / dt - _ROUNDED).astype(np.int64)
+        rows = np.tile(np.arange(len(self.starts)), rounds)
+        # Of two that fall on one step, the later one holds.
+        kept = np.append(np.diff(steps) > 0, True)
+        return steps[kept], rows[kept]
+
+    def spans(self) -> Iterator[str]:
+        """Yield from when to when each row holds, in words."""
+        ends = [*self.starts[1:].tolist(), self.period]
+        for start, end in zip(self.starts.tolist(), ends, strict=True):
+            yield f"from {start:g} s on" if end is None else f"from {start:g} to {end:g} s"
+
+
+class United(NamedTuple):
+    """All edges of some stretches: pairs (E, 2), the largest weight of each (E,), and when."""
+
+    pairs: Array
+    weights: Array
+    agents: int
+    schedule: Schedule
+
+
+def unite(
+    stretches: Sequence[Stretch], agents: int | None, period: float | None, directed: bool
+) -> United:
+    """Return the edges of all stretches, each once, and when they are there.
+
+    Raises:
+        GraphError: a stretch has a false edge, or the times do not ascend from 0.
+    """
+    starts = np.array([at for at, _ in stretches], float)
+    _check_times(starts, period)
+    read = [split_weights(edges) for _, edges in stretches]
+    agents = count_agents(np.concatenate([pairs for pairs, _ in read]), agents)
+    places: dict[tuple[int, int], int] = {}
+    checked = [check_edges(*each, agents, directed) for each in read]
+    for pairs, _ in checked:
+        for pair in pairs.tolist():
+            places.setdefault((pair[0], pair[1]), len(places))
+    rows = np.zeros((len(stretches), len(places)))
+    for row, (pairs, weights) in zip(rows, checked, strict=True):
+        row[[places[i, j] for i, j in pairs.tolist()]] = weights
+    rows.setflags(write=False)
+    starts.setflags(write=False)
+    pairs = np.array(list(places), np.int64).reshape(-1, 2)
+    return United(pairs, rows.max(axis=0), agents, Schedule(starts, rows, period))
+
+
+def _check_times(starts: Array, period: float | None) -> None:
+    fine = len(starts) and starts[0] == 0.0 and np.isfinite(starts).all()
+    if not fine or (np.diff(starts) <= 0.0).any():
+        shown = ", ".join(f"{at:g}" for at in starts[:8])
+        raise GraphError(
+            f"the graph switches at {shown or 'no time'} s, and times must ascend from 0, the "
+            "first."
+        )
+    if period is not None and not starts[-1] < period < np.inf:
+        raise GraphError(
+            f"`period` is {period:g} s, and must be longer than the last switch, at "
+            f"{starts[-1]:g} s."
+        )

@@ -1,0 +1,109 @@
+"""The states and inputs of a model that follow a reference."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import check_reference
+from echelon.core.compiled import program
+from echelon.core.errors import LawError, PlanError
+from echelon.core.numerics import precision
+from echelon.core.types import Array, State
+
+_FEW, _MANY = 512, 4096
+"""Up to so many times are followed by one program, some at once: compiling is what costs."""
+
+
+def follow_at(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> tuple[Any, Any]:
+    """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
+    if isinstance(times, Tracer) or len(times) > _MANY:
+        return _follow_all(model, reference, times)
+    count = len(times)
+    padded = np.pad(np.asarray(times), (0, -count % _FEW), mode="edge")
+    found = [_follow_all(model, reference, few) for few in np.split(padded, len(padded) // _FEW)]
+    x, u = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    return x, u
+
+
+def followed_states(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> jax.Array:
+    """Return the states (T, n) that follow a reference exactly at times (T,)."""
+    # As laws return them, and without a program of its own as `asarray` has.
+    return jax.device_put(follow_at(model, reference, times)[0])
+
+
+def first_state(model: ControlAffine, reference: Guide) -> State:
+    """Return the state (n,) that follows a reference at time zero."""
+    return jax.device_put(follow_at(model, reference, np.zeros(1))[0][0])
+
+
+@program
+def _follow_all(
+    model: ControlAffine, reference: Guide, times: Array | jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    return jax.vmap(lambda t: reference.follow(model, t))(times)
+
+
+class Targets(NamedTuple):
+    """What a plan follows at T times.
+
+    States (T, n) are a guess of the motion, outputs (T, q) are what counts, inputs (T, m) are
+    normalized.
+    """
+
+    states: Array
+    outputs: Array
+    inputs: Array
+
+
+def reference_targets(model: ControlAffine, reference: Guide | None, times: Array) -> Targets:
+    """Return what a leader follows: its reference by the model's flatness map, or its trim.
+
+    Raises:
+        PlanError: the model has no such map, or the reference is not finite.
+    """
+    # Without a reference a leader stays at rest, which its trim is.
+    if reference is None:
+        x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
+        return _targets(model, x, np.zeros((len(times), len(model.input_names))))
+    check_reference(reference)
+    try:
+        reference.fit(model)
+    except LawError as error:
+        raise PlanError(str(error)) from None
+    with precision("float64"):
+        x, u = follow_at(model, reference, times)
+    if not (np.isfinite(x).all() and np.isfinite(u).all()):
+        raise PlanError(
+            f"the reference `{type(reference).__name__}` cannot be followed by "
+            f"`{type(model).__name__}`: its flat state and input are not finite."
+        )
+    return _targets(model, x, model.normalized(u))
+
+
+def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Targets:
+    """Return the same targets an offset (n,) away."""
+    return _targets(model, targets.states + offset, targets.inputs)
+
+
+def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
+    """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
+
+    A sum of squared errors to several targets is that to their mean and a constant.
+    """
+    return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
+
+
+def _targets(model: ControlAffine, x: Array, v: Array) -> Targets:
+    with precision("float64"):
+        outputs = np.asarray(_outputs(model, jnp.asarray(x)))
+    return Targets(x, outputs, v)
+
+
+@program
+def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
+    return jax.vmap(model.output)(states)

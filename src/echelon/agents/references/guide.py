@@ -1,0 +1,41 @@
+"""What a leader follows: a state and an input of a model at each time."""
+
+import abc
+
+import equinox as eqx
+
+from echelon.agents.models.heading import heading_index
+from echelon.agents.models.model import ControlAffine
+from echelon.core.types import Input, Scalar, State
+
+
+class Guide(eqx.Module):
+    """What a leader follows, whether it is a path in space or one of states and inputs."""
+
+    @abc.abstractmethod
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return the state (n,) and the input (m,) that follow it exactly at time t (s)."""
+
+    def heading(self, model: ControlAffine, t: Scalar) -> Scalar:
+        """Return the heading (rad) at time t of a model that states one."""
+        return self.follow(model, t)[0][heading_index(model)]
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell whether that heading may be another than the trim's at some time."""
+        return True
+
+    @abc.abstractmethod
+    def check(self) -> None:
+        """Check what it returns.
+
+        Raises:
+            ReferenceError: it is malformed.
+        """
+
+    @abc.abstractmethod
+    def fit(self, model: ControlAffine) -> None:
+        """Check that a model can be led along it.
+
+        Raises:
+            LawError: it cannot, and why.
+        """

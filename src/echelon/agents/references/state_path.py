@@ -1,0 +1,123 @@
+"""A reference for any model: its states and inputs over time, as knots."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import final
+
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import numbers_of
+from echelon.core.errors import LawError, ReferenceError, listing
+from echelon.core.types import Array, Input, Scalar, State
+
+_Rows = Sequence[Sequence[float]]
+
+
+@final
+class StatePath(Guide):
+    """A path through states (K, n) with inputs (K, m) at times (K,), for a model that has no map.
+
+    Between knots the input is linear and each state a cubic, with the slopes f + g u at the knots
+    (Hermite's, as in direct collocation). So the path is as feasible as its knots are: how far
+    xdot is from f + g u between them is said by `echelon check`. Before the first time and after
+    the last the ends are held.
+
+    Args:
+        times: K >= 2 increasing times, s.
+        states: K states (n,), in the order of the model's `state_names` and in their units.
+        inputs: K inputs (m,), likewise.
+
+    Raises:
+        ReferenceError: the times do not increase, or states or inputs do not match them.
+    """
+
+    times: Array
+    states: Array
+    inputs: Array
+
+    def __init__(self, times: Sequence[float], states: _Rows, inputs: _Rows) -> None:
+        """Check the knots."""
+        self.times = numbers_of(times)
+        if self.times.ndim != 1 or len(self.times) < 2 or not (np.diff(self.times) > 0).all():
+            raise ReferenceError(
+                "`times` of `StatePath` must be at least 2 increasing finite times."
+            )
+        self.states, self.inputs = (
+            _rows(name, rows, len(self.times))
+            for name, rows in (("states", states), ("inputs", inputs))
+        )
+
+    @classmethod
+    def read(cls, file: str | Path, model: ControlAffine) -> "StatePath":
+        """Return the path in a CSV file, whose first line names `t`, the states and the inputs.
+
+        The columns may stand in any order.
+
+        Raises:
+            ReferenceError: the file cannot be read, or lacks a column or has one too many.
+        """
+        names = ("t", *model.state_names, *model.input_names)
+        try:
+            # The byte order mark that spreadsheets write is no part of the first name.
+            head, *rows = csv.reader(io.StringIO(Path(file).read_text("utf-8-sig")))
+            table = np.array([[float(cell) for cell in row] for row in rows if row])
+        except (OSError, ValueError) as error:
+            raise ReferenceError(
+                f"the path `{file}` is no line of names with lines of numbers below it: {error}."
+            ) from None
+        head = [name.strip() for name in head]
+        if sorted(head) != sorted(names):
+            raise ReferenceError(
+                f"the path `{file}` has the columns {listing(head)}, and "
+                f"`{type(model).__name__}` needs {listing(names)}."
+            )
+        if table.shape[1:] != (len(names),):
+            raise ReferenceError(f"the path `{file}` needs {len(names)} numbers on each line.")
+        columns = table[:, [head.index(name) for name in names]]
+        times, states, inputs = np.split(columns, [1, 1 + len(model.state_names)], axis=1)
+        return cls(times[:, 0], states, inputs)  # pyright: ignore[reportArgumentType]
+
+    def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return the state (n,) and the input (m,) at time t."""
+        knots, x, u = (
+            jnp.asarray(part, t.dtype) for part in (self.times, self.states, self.inputs)
+        )
+        held = jnp.clip(t, knots[0], knots[-1])
+        # At the last knot there is no piece to the right, so the one to its left holds.
+        k = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
+        span = knots[k + 1] - knots[k]
+        s = (held - knots[k]) / span
+        # The model's own difference, so that an angle may be given within one turn.
+        step = model.difference(x[k + 1], x[k])
+        first, last = (span * model.velocity(x[j], u[j]) for j in (k, k + 1))
+        state = x[k] + s * (1.0 - s) ** 2 * first + s**2 * (3.0 - 2.0 * s) * step
+        return state + s**2 * (s - 1.0) * last, (1.0 - s) * u[k] + s * u[k + 1]
+
+    def check(self) -> None:
+        """Do nothing: the knots were checked when it was made."""
+
+    def fit(self, model: ControlAffine) -> None:
+        """Check that it has the model's states and inputs."""
+        sizes = (("states", self.states), ("inputs", self.inputs))
+        wanted = (model.state_names, model.input_names)
+        for (what, rows), names in zip(sizes, wanted, strict=True):
+            if rows.shape[1] != len(names):
+                raise LawError(
+                    f"`StatePath` has {rows.shape[1]} {what}, and `{type(model).__name__}` has "
+                    f"{len(names)}: {listing(names)}."
+                )
+
+
+def _rows(name: str, rows: _Rows, count: int) -> Array:
+    array = numbers_of(rows)
+    if array.ndim != 2 or len(array) != count or not np.isfinite(array).all():
+        raise ReferenceError(
+            f"`{name}` of `StatePath` has shape {array.shape}, and must be {count} rows of finite "
+            "numbers, one for each time."
+        )
+    return array

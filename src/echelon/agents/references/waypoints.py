@@ -1,0 +1,94 @@
+"""A smooth path through timed points."""
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.heading import heading_of, rest_heading
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.references.reference import Reference, check_finite, in_space, numbers_of
+from echelon.core.errors import ReferenceError
+from echelon.core.types import Array, Scalar
+
+
+class Waypoints(Reference):
+    """The spline of degree 7 through `points` at `times`, at rest at both ends.
+
+    Before the first time and after the last the ends are held. Its derivatives are continuous up
+    to the sixth, so that a quadrotor can fly it (flatness needs four). The path starts and stops
+    with zero velocity, acceleration and jerk.
+
+    Args:
+        times: K >= 2 increasing times, s.
+        points: K points (x, y, z), m.
+        yaw: constant yaw, rad.
+
+    Raises:
+        ReferenceError: the times do not increase or the points do not match them.
+    """
+
+    knots: Array
+    coefficients: Array
+    yaw: float = eqx.field()
+
+    def __init__(
+        self, times: Sequence[float], points: Sequence[Sequence[float]], yaw: float = 0.0
+    ) -> None:
+        """Fit the spline."""
+        t, p = _read(times, points)
+        self.yaw = yaw
+        check_finite(self, yaw=(yaw, None))
+        self.knots, self.coefficients = _fit(t, p)
+
+    def __call__(self, t: Scalar) -> jax.Array:
+        """Return the point at time t."""
+        knots = jnp.asarray(self.knots, t.dtype)
+        held = jnp.clip(t, knots[0], knots[-1])
+        # At the last knot there is no piece to the right, so the one to its left holds.
+        piece = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
+        s = held - knots[piece]
+        value = jnp.zeros(3, t.dtype)
+        # Horner, in the time since the piece's own knot: powers of t would lose digits late in a
+        # flight.
+        for coefficient in jnp.asarray(self.coefficients, t.dtype)[:, piece]:
+            value = value * s + coefficient
+        return in_space(value, self.yaw)
+
+    def turns(self, model: ControlAffine) -> bool:
+        """Tell whether the constant yaw is another than the trim's; a spline is not enclosed."""
+        return heading_of(model).state != "yaw" or self.yaw != rest_heading(model)
+
+
+def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Array, Array]:
+    """Return times (K,) and points (K, 3), after checking both."""
+    t, p = numbers_of(times), numbers_of(points)
+    if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
+        shown = times.tolist() if isinstance(times, np.ndarray) else times
+        raise ReferenceError(
+            f"`times` of `Waypoints` is {shown}, and must be at least 2 increasing times."
+        )
+    if p.shape != (len(t), 3) or not np.isfinite(p).all():
+        # Rows of different lengths, or words, have no shape to tell of.
+        got = f"is {points}" if p.shape == (1,) else f"has shape {p.shape}"
+        raise ReferenceError(
+            f"`points` of `Waypoints` {got}, and must be {len(t)} finite points (x, y, z)."
+        )
+    return t, p
+
+
+def _fit(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the knots (K,) and the coefficients (8, K - 1, 3), highest power first."""
+    # Imported here: splines load slowly, and few references need them.
+    from scipy.interpolate import make_interp_spline
+
+    # A spline of degree 7 through K points has K + 6 coefficients: three conditions more at each
+    # end.
+    rest = [(order, np.zeros(3)) for order in (1, 2, 3)]
+    spline = make_interp_spline(times, points, k=7, bc_type=(rest, rest))
+    # Taylor's coefficients at each knot, which JAX evaluates without SciPy.
+    powers = [spline.derivative(k)(times[:-1]) / math.factorial(k) for k in range(7, 0, -1)]
+    return times, np.stack([*powers, points[:-1]])

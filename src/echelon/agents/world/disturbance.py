@@ -1,0 +1,182 @@
+"""Wind and noise: what acts on the agents although no law requested it.
+
+Draws are keyed by seed, time and agent, so a law, the number of agents, the frames that are stored
+and the precision change nothing of them.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.errors import ModelError, SimulationError, did_you_mean, listing
+from echelon.core.numerics import Field
+from echelon.core.types import Array, Input, State
+
+# Folded into the key, so that one seed draws wind and noise independently.
+_WIND, _NOISE = 0, 1
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Disturbance:
+    """xdot = f(x) + g(x) (u + S noise) + wind, with both held over a step as the input is.
+
+    Args:
+        constant: the lasting part of the wind, by state or group: what is added to the rate of each
+            state, in its unit per second, so m/s^2 for a velocity.
+        rms: root mean square of the random part of the wind, by state or group, for each state.
+        input_rms: root mean square of the noise, by input, in normalized inputs. It acts behind
+            the actuators, so no limit touches it.
+        hold: how long a draw lasts, s; rounded to whole steps, and at least one.
+        common: whether all agents feel one random wind; otherwise each has its own.
+        seed: of the draws; the run's own when left out.
+
+    Draws are normal, and independent from one hold to the next and from state to state. The
+    same seed gives the same draws at all rms, so a wind of twice the rms is twice the wind.
+
+    Raises:
+        SimulationError: a number is not finite, an rms is negative, or `hold` is not positive.
+    """
+
+    constant: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    rms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    input_rms: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    hold: float = 0.5
+    common: bool = False
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no wind can have."""
+        for what in ("constant", "rms", "input_rms"):
+            least = -math.inf if what == "constant" else 0.0
+            for name, value in getattr(self, what).items():
+                if not (math.isfinite(value) and value >= least):
+                    allowed = "finite" if what == "constant" else "finite and not negative"
+                    raise SimulationError(
+                        f"`{what}` of the disturbance is {value} for `{name}`, "
+                        f"and must be {allowed}."
+                    )
+        if not 0.0 < self.hold < math.inf:
+            raise SimulationError(
+                f"`hold` of the disturbance is {self.hold}, and must be a positive finite number "
+                "of seconds."
+            )
+        if self.seed is not None and (self.seed != int(self.seed) or self.seed < 0):
+            raise SimulationError(
+                f"`seed` of the disturbance is {self.seed}, and must be a whole number from 0 on."
+            )
+
+    def __str__(self) -> str:
+        """Return the disturbance in words."""
+        parts = [
+            f"{what} " + ", ".join(f"`{name}` {value:g}" for name, value in named.items())
+            for what, named in (
+                ("constant", self.constant),
+                ("rms", self.rms),
+                ("rms of the normalized input", self.input_rms),
+            )
+            if named
+        ]
+        if self.rms or self.input_rms:
+            whose = ", one for all agents" if self.common and self.rms else ""
+            parts.append(f"drawn every {self.hold:g} s{whose}")
+        return "; ".join(parts) or "none"
+
+    def prepared(self, plant: ControlAffine, dt: float, seed: int) -> "Wind":
+        """Return the disturbance as arrays for a plant, a step (s) and the seed of a run.
+
+        Raises:
+            ModelError: a name is no state, group or input of the plant.
+        """
+        seed = seed if self.seed is None else self.seed
+        rms = plant.per_state(self.rms)
+        # Column j is what noise of its rms on the normalized input j adds to the physical ones.
+        noise = plant.physical(np.diag(_by_input(plant, self.input_rms)), trim=False).T
+        return Wind(
+            constant=plant.per_state(self.constant),
+            # None and not zeros, so that a step without draws is compiled without them.
+            rms=rms if rms.any() else None,
+            noise=noise if noise.any() else None,
+            # The two halves of the seed, since a precision could cut it to its lower one.
+            key=np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32),
+            # Whole steps: a wind that changed within one would cost the integrator its order.
+            # A draw that outlasts any run need not be counted further.
+            window=np.asarray(max(1, round(min(self.hold / dt, 2**31 - 1))), np.int32),
+            common=self.common,
+        )
+
+
+@final
+class Wind(eqx.Module):
+    """A disturbance ready to be drawn; a part without a random share is None.
+
+    constant (n,), rms (n,), noise (m, m): S times the rms, key (2,), window: steps a draw lasts.
+    """
+
+    constant: Array
+    rms: Array | None
+    noise: Array | None
+    key: np.ndarray
+    window: np.ndarray
+    common: bool = eqx.field(static=True)
+
+    def on_state(self, step: jax.Array, agent: jax.Array) -> State:
+        """Return what is added to xdot of an agent during a step, (n,)."""
+        constant = jnp.asarray(self.constant)
+        if self.rms is None:
+            return constant
+        # Agent 0's draw for all; the product keeps it traced.
+        draw = self._draw(_WIND, step, 0 * agent if self.common else agent, len(self.rms))
+        return constant + jnp.asarray(self.rms) * draw
+
+    def on_input(self, step: jax.Array, agent: jax.Array) -> Input | None:
+        """Return what is added to the physical input of an agent during a step, (m,)."""
+        if self.noise is None:
+            return None
+        return jnp.asarray(self.noise) @ self._draw(_NOISE, step, agent, len(self.noise))
+
+    def _draw(self, part: int, step: jax.Array, agent: jax.Array, size: int) -> jax.Array:
+        # By name, as JAX's default generator is a setting of the user.
+        key = jax.random.wrap_key_data(jnp.asarray(self.key), impl="threefry2x32")
+        # Keyed by where and when, and not carried on: no draw depends on the ones before.
+        for number in (part, step // jnp.asarray(self.window), agent):
+            key = jax.random.fold_in(key, number)
+        # Drawn in float32 whatever the precision, which would otherwise change the draws.
+        return jax.random.normal(key, (size,), jnp.float32).astype(float)
+
+
+def draw(wind: Wind | None, step: jax.Array, agent: jax.Array) -> tuple[State | None, Input | None]:
+    """Return what acts on an agent's rate and on its input during a step; None for nothing."""
+    return (
+        (None, None) if wind is None else (wind.on_state(step, agent), wind.on_input(step, agent))
+    )
+
+
+def disturbed(plant: ControlAffine, push: State | None, noise: Input | None) -> Field:
+    """Return (x, u) -> xdot of an agent under wind and noise, which are held over a step."""
+    if push is None and noise is None:
+        return plant.velocity
+
+    def velocity(x: State, u: Input) -> State:
+        xdot = plant.velocity(x, u if noise is None else u + noise)
+        return xdot if push is None else xdot + push
+
+    return velocity
+
+
+def _by_input(model: ControlAffine, named: Mapping[str, float]) -> Array:
+    """Return a number for each input, (m,)."""
+    for name in named:
+        if name not in model.input_names:
+            raise ModelError(
+                f"`{name}` is no input of `{type(model).__name__}`, which has "
+                f"{listing(model.input_names)}{did_you_mean(name, model.input_names)}."
+            )
+    return np.array([named.get(name, 0.0) for name in model.input_names])

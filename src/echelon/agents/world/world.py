@@ -1,0 +1,60 @@
+"""What the laws do not know, as one value: laws, gains and feed-forward go on knowing the model."""
+
+import dataclasses
+from typing import final
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model_check import check_model
+from echelon.agents.world.disturbance import Disturbance
+from echelon.agents.world.plant import check_plant, differences
+from echelon.core.errors import SimulationError
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class World:
+    """What differs from the model, and what acts on the agents besides their inputs.
+
+    Args:
+        plant: the agents as they are, where they differ from the model: these move, and have these
+            actuators.
+        disturbance: wind and noise on all agents.
+    """
+
+    plant: ControlAffine | None = None
+    disturbance: Disturbance | None = None
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the agents are as the model says, and nothing disturbs them."""
+        return self.plant is None and self.disturbance is None
+
+    def plant_for(self, model: ControlAffine) -> ControlAffine:
+        """Return what moves: the plant, or the model where no other is given."""
+        return model if self.plant is None else self.plant
+
+    def check(self, model: ControlAffine) -> tuple[str, ...]:
+        """Check what is not the model, and return the warnings about it.
+
+        Raises:
+            ModelError: the plant is malformed, or has other states or inputs than the model.
+            SimulationError: the disturbance is none.
+        """
+        if self.disturbance is not None and not isinstance(self.disturbance, Disturbance):
+            raise SimulationError(
+                f"`disturbance` is a `{type(self.disturbance).__name__}`, and must be a "
+                "`Disturbance`."
+            )
+        if self.plant is None:
+            return ()
+        # First: the names of a malformed plant may be no names to compare.
+        warnings = check_model(self.plant)
+        check_plant(model, self.plant)
+        return warnings
+
+    def describe(self, model: ControlAffine) -> dict[str, str | None]:
+        """Return in words how the plant differs from the model, and what disturbs it; else None."""
+        return {
+            "plant": None if self.plant is None else differences(model, self.plant),
+            "disturbance": None if self.disturbance is None else str(self.disturbance),
+        }

@@ -1,0 +1,131 @@
+"""The command line: its commands in the order of `--help`, and how errors leave it.
+
+Heavy modules are imported inside each command, so that `--help` is quick.
+"""
+
+import contextlib
+import errno
+import functools
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from echelon import __version__
+from echelon.apps.cli.cache import keep_compiled_code
+from echelon.apps.cli.check_command import check
+from echelon.apps.cli.compare_command import compare
+from echelon.apps.cli.crash import CRASHED, note_crash
+from echelon.apps.cli.design_command import design
+from echelon.apps.cli.doctor_command import doctor
+from echelon.apps.cli.explain_command import explain
+from echelon.apps.cli.export_command import export
+from echelon.apps.cli.init_command import init
+from echelon.apps.cli.list_command import list_, schema
+from echelon.apps.cli.live_command import live
+from echelon.apps.cli.plot_command import plot
+from echelon.apps.cli.report_command import report
+from echelon.apps.cli.run_command import run
+from echelon.apps.cli.stop import STOP, Ended
+from echelon.apps.cli.streams import outlive_readers
+from echelon.apps.cli.sweep_command import sweep
+from echelon.apps.cli.tune_command import tune
+from echelon.apps.cli.verify_command import verify
+from echelon.apps.cli.video_command import video
+from echelon.apps.cli.view_command import view
+from echelon.core import disk_cache
+from echelon.core.errors import EchelonError, ModelError
+
+_EPILOG = (
+    "Exit codes: 0 done, or promised; 1 not promised, refused by verify or doctor, or an agent "
+    "left the chart of its equations; 2 bad input, or a file that cannot be written; 3 diverged; "
+    "4 an optional part is not installed; 5 verified as far as it could be checked; 70 a fault of "
+    "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept; "
+    "141 done, and the reader of the output left before its end. "
+    "ECHELON_CACHE names the folder where compiled code, and what is proved and found of bundled "
+    "parts, is kept between runs; `off` keeps none."
+)
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=_EPILOG,
+    help="Formation tracking by consensus: synthesize gains, simulate swarms, "
+    "say what is promised.",
+)
+
+
+def main() -> None:
+    """Run the command line; an error becomes one sentence and its exit code."""
+    folder = keep_compiled_code(os.environ)
+    with disk_cache.opened(folder), outlive_readers(), STOP.listen():
+        try:
+            _call()
+        except EchelonError as error:
+            _leave(str(error), error.exit_code)
+        except Ended:
+            _leave("ended before anything was computed, or left to write.", STOP.exit_code)
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+                _leave(f"nothing more can be written: {error.strerror}.", EchelonError.exit_code)
+            _leave(note_crash(error), CRASHED)
+
+
+def _call() -> None:
+    try:
+        app()
+    finally:
+        # Here, since what fails after `main` has no exit code of ours.
+        sys.stdout.flush()
+
+
+def _leave(sentence: str, code: int) -> None:
+    print(f"echelon: {sentence}", file=sys.stderr)
+    raise SystemExit(code) from None
+
+
+@app.callback(invoke_without_command=True)
+def _about(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and leave.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("-q", "--quiet", help="Print nothing but what goes wrong.")
+    ] = False,
+) -> None:
+    if quiet:
+        nowhere = context.with_resource(open(os.devnull, "w"))
+        context.with_resource(contextlib.redirect_stdout(nowhere))
+    if version:
+        print(f"echelon {__version__}")
+        raise typer.Exit()
+
+
+def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command that a file of the user's cannot end."""
+
+    @functools.wraps(command)
+    def call(*args: Any, **named: Any) -> Any:
+        try:
+            return command(*args, **named)
+        # Typer's own way out is another exception.
+        except SystemExit as error:
+            raise ModelError(
+                f"a file that the scenario names calls `sys.exit({error.code!r})`, and must not."
+            ) from error
+
+    return call
+
+
+# Listed here and not decorated at home, so that a command's file knows nothing of the program.
+_COMMANDS: tuple[Callable[..., Any], ...] = (
+    *(init, run, sweep, view, live, plot, video, report, export),
+    *(check, design, tune, compare, verify, list_, explain, doctor, schema),
+)
+for _command in _COMMANDS:
+    app.command(_command.__name__.rstrip("_"))(_guarded(_command))

@@ -1,0 +1,28 @@
+"""`echelon doctor`: versions, devices and self-checks."""
+
+import json
+
+import typer
+
+from echelon.apps.cli import tables
+from echelon.apps.cli.console import JsonOption
+
+
+def doctor(as_json: JsonOption = False) -> None:
+    """Print versions and devices, and run the physics' self-checks."""
+    from echelon.experiments.studies.doctor import checks as all_checks
+    from echelon.experiments.studies.doctor import facts as all_facts
+
+    facts, checks = all_facts(), list(all_checks())
+    if as_json:
+        print(
+            json.dumps({"facts": facts, "checks": [check._asdict() for check in checks]}, indent=2)
+        )
+    else:
+        console = tables.console()
+        console.print(tables.pairs(facts))
+        for check in checks:
+            verdict = "[green]pass[/]" if check.holds else "[red]FAIL[/]"
+            console.print(f"{verdict}  {check.claim} ({check.found})", highlight=False)
+    if not all(check.holds for check in checks):
+        raise typer.Exit(1)

@@ -1,0 +1,41 @@
+"""`echelon list` and `echelon schema`: what a scenario may name."""
+
+import json
+
+from echelon.apps.cli.console import JsonOption
+
+
+def list_(as_json: JsonOption = False) -> None:
+    """List scenarios, models, references, laws, gain methods, graphs, formations, integrators."""
+    from echelon.experiments.scenario import registry
+    from echelon.experiments.scenario.scenario import bundled_scenarios
+
+    families: dict[str, dict[str, str]] = {"scenarios": bundled_scenarios()}
+    for title, entries in (
+        ("models", registry.MODELS),
+        ("references", registry.REFERENCES),
+        ("leader laws", registry.LEADER_LAWS),
+        ("follower laws", registry.FOLLOWER_LAWS),
+        ("gain methods", registry.METHODS),
+    ):
+        families[title] = {name: entry.summary for name, entry in entries.items()}
+    families |= {
+        "graphs": registry.GRAPHS,
+        "formations": registry.FORMATIONS,
+        "integrators": registry.INTEGRATORS,
+    }
+    if as_json:
+        print(json.dumps(families, indent=2))
+        return
+    width = max(len(name) for entries in families.values() for name in entries)
+    for title, entries in families.items():
+        print(f"{title}:")
+        for name, text in entries.items():
+            print(f"  {name:<{width}}  {text}")
+
+
+def schema() -> None:
+    """Print the JSON schema of the scenario file, for editors."""
+    from echelon.experiments.scenario.scenario import json_schema
+
+    print(json.dumps(json_schema(), indent=2))

@@ -1,0 +1,133 @@
+"""What the command line prints: tables of checks, designs and facts."""
+
+import sys
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from echelon.core.statement import Statement
+    from echelon.experiments.studies.design import Design
+
+
+def console() -> "Console":
+    """Return a console that keeps tables whole where the output is no terminal."""
+    from rich.console import Console
+
+    # Wider than any table here: a row that is folded is none to `grep` or `awk`.
+    return Console() if sys.stdout.isatty() else Console(width=200)
+
+
+def pairs(facts: dict[str, str]) -> "Table":
+    """Return facts as two columns."""
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2))
+    for name, text in facts.items():
+        table.add_row(name, text)
+    return table
+
+
+def design_row(design: "Design") -> dict[str, Any]:
+    """Return what is told of a design; what does not exist is None."""
+    row: dict[str, Any] = {"method": design.method, "reason": design.reason}
+    gain, promise = design.gain, design.promise
+    if gain is None or promise is None:
+        return {**row, "seconds": design.seconds}
+    import numpy as np
+
+    found, theorem, factors = promise.certified, promise.theorem, design.factors
+    return {
+        **row,
+        "advice": design.advice,
+        "coupling": gain.coupling,
+        "edge": promise.edge,
+        "slowest_mode": promise.slowest,
+        "fastest_mode": design.fastest,
+        "longest_step": _finite(design.step),
+        "condition": float(np.linalg.cond(gain.P)),
+        "gain_margin": None if factors is None else [_finite(factor) for factor in factors],
+        "delay_margin": _finite(design.delay),
+        "promised": promise.promised,
+        "rate": promise.rate,
+        "kind": str(promise.kind) if promise.promised else None,
+        "theorem": None if theorem is None else str(theorem),
+        "radius": None if found is None else _finite(found.radius),
+        "promise": promise.as_mapping(),
+        "seconds": design.seconds,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    """Return a number, or None for what JSON has no word for."""
+    return None if value is None or value == float("inf") else value
+
+
+_COLUMNS = {
+    "method": "method",
+    "coupling": "coupling",
+    "edge": "edge",
+    "slowest_mode": "slowest,\n1/s",
+    "fastest_mode": "fastest,\n1/s",
+    "longest_step": "dt up to,\ns (1)",
+    "condition": "cond(P)",
+    "gain_margin": "gain\nmargin",
+    "delay_margin": "delay\nmargin, s",
+    "rate": "promised,\n1/s",
+    "kind": "by",
+    "theorem": "theorem",
+    "radius": "certified\nradius (2)",
+    "seconds": "seconds",
+}
+_FOOTNOTES = (
+    "(1) the longest step with inputs held over it with which every mode looked at still decays.",
+    "(2) r of sum_i delta_i'P delta_i <= r^2, less the leader's excursion over the horizon.",
+)
+
+
+def print_designs(rows: list[dict[str, Any]], sentence: str) -> None:
+    """Print the methods side by side, why some have no gain, and what is recommended."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for key, title in _COLUMNS.items():
+        table.add_column(title, justify="left" if key == "method" else "right")
+    for row in rows:
+        table.add_row(*(_cell(row.get(key)) for key in _COLUMNS))
+    out = console()
+    out.print(table)
+    told = [*_FOOTNOTES] if any(row.get("coupling") for row in rows) else []
+    for row in rows:
+        told += [f"- {row['method']}: {row[key]}" for key in ("reason", "advice") if row.get(key)]
+    for text in (*told, sentence):
+        out.print(text, highlight=False, markup=False, soft_wrap=not out.is_terminal)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, list):
+        return " - ".join("inf" if part is None else f"{part:.3g}" for part in value)
+    return "-" if value is None else str(value)
+
+
+def statements_table(lines: "Iterable[Statement]") -> "Table":
+    """Return the lines of a check as a table."""
+    rows = ((x.name, str(x.verdict), str(x.kind), x.shown, x.explanation) for x in lines)
+    return plain_table(("statement", "verdict", "kind", "number", "why, or what to change"), rows)
+
+
+def plain_table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> "Table":
+    """Return rows of plain text as a table with the titles of its columns."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column)
+    for row in rows:
+        table.add_row(*(text.replace("[", "\\[") for text in row))
+    return table

@@ -1,0 +1,256 @@
+"""The closed loop as it runs live, and knobs that compile nothing."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.hearing import edges_of
+from echelon.agents.world.disturbance import Disturbance
+from echelon.agents.world.world import World
+from echelon.apps.live.knobs import Knobs, Panel
+from echelon.apps.live.live_stepper import mover_of
+from echelon.core.errors import GraphError
+from echelon.core.numerics import precision
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.core.words import Feedforward
+from echelon.experiments.results.lyapunov import goes_both_ways, potential
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.gain import Gain
+
+PICTURE = 0.04
+"""Seconds of a picture."""
+_AHEAD = 60.0
+"""Seconds for which it is known when the graph switches."""
+
+
+@final
+class Dimmed(Law):
+    """A follower's law that is sent a share of the feed-forward: all at 1, nothing at 0."""
+
+    law: Law
+    share: Any
+    feedforward: Feedforward = eqx.field(static=True)
+    turning: bool = eqx.field(static=True)
+
+    def facing(self, heading: Scalar) -> Law:
+        """Return the law in the axes of a heading."""
+        return eqx.tree_at(lambda each: each.law, self, self.law.facing(heading))
+
+    def init(self) -> Memory:
+        """Return what the law begins with."""
+        return self.law.init()
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the input of one agent."""
+        dimmed = eqx.tree_at(
+            lambda v: v.feedforward,
+            view,
+            jnp.asarray(self.share, view.x.dtype) * view.feedforward,
+        )
+        return self.law.update(model, dimmed, memory)
+
+    def begin(self, model: ControlAffine, x: State) -> Memory:
+        """Return what the law begins with at x."""
+        return self.law.begin(model, x)
+
+    def signal(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> Any:
+        """Return what neighbours hear."""
+        return self.law.signal(model, x, offset, memory)
+
+    def settle(
+        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
+    ) -> Memory:
+        """Return the memory once the actuators have acted."""
+        return self.law.settle(model, view, wanted, got, memory)
+
+    def message(self, model: ControlAffine, x: State, v: Input, memory: Memory) -> Any:
+        """Return what the law sends."""
+        return self.law.message(model, x, v, memory)
+
+
+class Picture(NamedTuple):
+    """What is seen at a time (s): states (N, n), inputs (N, m), errors (N,), offsets (N, n).
+
+    `lyapunov` is V, NaN where there is none; `beyond` (N,) are those whose numbers are none, or
+    beyond what is computed.
+    """
+
+    time: float
+    states: Array
+    inputs: Array
+    errors: Array
+    offsets: Array
+    lyapunov: float
+    beyond: Array
+
+
+@final
+class Swarm:
+    """Agents under laws that go on for as long as someone watches.
+
+    Args:
+        parts: of a scenario.
+        settings: of it.
+        panel: of its knobs.
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others.
+    """
+
+    def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
+        """Prepare what the steps need."""
+        world = World(parts.world.plant, parts.world.disturbance or Disturbance())
+        prepared = prepare(parts.replace(world=world), settings)
+        problem, drive = prepared.problem, prepared.parts.drive
+        assert isinstance(drive, Laws)
+        with precision("float64"):
+            loop = assemble(problem, drive.leader, drive.follower)
+        law = loop.follower
+        gain = panel.gain(panel.start)
+        if gain is not None:
+            law = eqx.tree_at(lambda each: each.gain.inner, law, _inner(gain), is_leaf=_is_none)
+        elif panel.start.coupling is not None:
+            c = np.asarray(panel.start.coupling)
+            law = eqx.tree_at(lambda each: each.coupling, law, c, is_leaf=_is_none)
+        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward, law.turning)
+        self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
+        self.panel, self.settings, self.parts = panel, settings, prepared.parts
+        self.potentials: dict[Any, Callable[[Array], Array]] = {}
+        self.states, self.measured = problem.states, list(problem.meter.measured)
+        self.nearest = np.array(parts.graph.nearest_leader())
+        self.weights = np.asarray(loop.exchange.weights, np.float64)
+        self.edge = edges_of(parts.graph, loop.exchange)[0]
+        self.count = max(1, round(PICTURE / settings.dt))
+        self.offsets = panel.offsets(panel.start)
+        self.potential = self._potential(panel.start)
+        self.ahead = range(0)
+        self._look_ahead(0)
+        self.mover = mover_of(self.loop, self._unlike(), self.states, settings)
+        self.restart()
+
+    def _unlike(self) -> Loop:
+        """Return a loop that differs from this one in all that a knob turns, but for weights."""
+        other = [np.full(np.shape(leaf), np.nan) for leaf in self._turned(self.loop)]
+        return eqx.tree_at(self._turned, self.loop, tuple(other))
+
+    def _turned(self, loop: Loop) -> tuple[Any, ...]:
+        """Return the numbers of the followers' law that knobs turn."""
+        follower: Any = loop.follower
+        if self.panel.start.coupling is None:
+            return (follower.share,)
+        if self.panel.parts.drive.gain is None:
+            return follower.share, follower.law.coupling
+        own = follower.law.gain
+        return follower.share, own.coupling, own.P, own.R, own.R_inverse, own.inner
+
+    def _look_ahead(self, step: int) -> None:
+        """Let the loop know when the graph switches in the periods about a step."""
+        schedule, dt = self.parts.graph.schedule, self.settings.dt
+        if schedule is None or schedule.period is None or step in self.ahead:
+            return
+        first = max(0, int(step * dt / schedule.period) - 1)
+        horizon = max(_AHEAD, 4.0 * schedule.period)
+        switches = Switches(*schedule.switches(dt, horizon, first))
+        self.loop = eqx.tree_at(lambda each: each.switches, self.loop, switches)
+        # A whole period before its end, which no picture is as long as.
+        last = int(first + horizon / schedule.period) * schedule.period
+        self.ahead = range(int(switches.steps[0]), int(last / dt) - self.count)
+
+    @property
+    def span(self) -> float:
+        """Seconds from a picture to the next."""
+        return self.count * self.settings.dt
+
+    def restart(self, states: Array | None = None, step: int = 0) -> None:
+        """Begin again, the knobs as they are; or go on from where others have come, (N, n)."""
+        begin = self.states if states is None else states
+        self.now: Moment = self.mover.begin(self.loop, begin, step)
+
+    @property
+    def engine(self) -> str:
+        """What computes the steps, `native` or `jax`."""
+        return self.mover.engine
+
+    @property
+    def steps(self) -> int:
+        """How many steps were taken."""
+        return int(self.now.step)
+
+    def turn(self, knobs: Knobs) -> None:
+        """Let the loop run with the knobs so."""
+        self.potential = self._potential(knobs)
+        self.offsets = self.panel.offsets(knobs)
+        weights = self.weights.copy()
+        weights[..., np.isin(self.edge, list(knobs.cut))] = 0.0
+        loop = eqx.tree_at(
+            lambda each: (each.offsets, each.exchange.weights, each.motion.wind.constant),
+            self.loop,
+            (self.offsets, weights, self.panel.wind(knobs)),
+        )
+        self.loop = eqx.tree_at(self._turned, loop, self._numbers(knobs))
+
+    def _numbers(self, knobs: Knobs) -> tuple[Any, ...]:
+        """Return what these are at the knobs."""
+        share, gain = np.asarray(float(knobs.feedforward)), self.panel.gain(knobs)
+        if knobs.coupling is None:
+            return (share,)
+        c = np.asarray(knobs.coupling)
+        if gain is None:
+            return share, c
+        return share, c, gain.P, gain.R, gain.R_inverse, _inner(gain)
+
+    def _potential(self, knobs: Knobs) -> Callable[[Array], Array] | None:
+        """Return what tells V; None of a law without a P, or where a cut has parted the graph."""
+        gain = self.panel.gain(knobs)
+        P = self.parts.drive.metric(self.parts.model) if gain is None else gain.P
+        # Of a law that turns, P stands in axes that turn too.
+        if P is None or self.loop.follower.turning or not goes_both_ways(self.parts.graph):
+            return None
+        asked = knobs.cut, knobs.method, knobs.weight
+        if asked not in self.potentials:
+            try:
+                found = potential(self.parts.model, self.panel.graph(knobs), P)
+            except GraphError:
+                return None
+            # A weight that is turned passes many values.
+            self.potentials = {**dict(list(self.potentials.items())[-16:]), asked: found}
+        return self.potentials[asked]
+
+    def kick(self, agent: int, by: Array) -> None:
+        """Change the state of an agent by (n,), all at once."""
+        states = np.array(self.now.states)
+        states[agent] += by
+        self.now = self.now._replace(states=states)
+
+    def advance(self, still: bool = False) -> Picture:
+        """Go on to the next picture, or look at the present one, and return it."""
+        self._look_ahead(self.steps)
+        self.now, states, inputs = self.mover.move(self.loop, self.now, 0 if still else self.count)
+        y = states - self.offsets
+        with np.errstate(over="ignore", invalid="ignore"):
+            away = (y - y[self.nearest])[:, self.measured]
+            errors = np.linalg.norm(away, axis=1)
+        known = np.isfinite(inputs).all(axis=1) & ~self.mover.beyond(states).any(axis=1)
+        time = self.steps * self.settings.dt
+        V = float(self.potential(y[None])[0]) if known.all() and self.potential else np.nan
+        return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(known))
+
+
+def _inner(gain: Gain) -> Array:
+    """Return the inner loop of a gain, zero without one, so that either compiles to one."""
+    if gain.inner is not None:
+        return gain.inner
+    return np.zeros((len(gain.R), len(gain.P)))
+
+
+def _is_none(node: object) -> bool:
+    return node is None

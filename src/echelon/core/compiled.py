@@ -1,0 +1,191 @@
+"""Functions that JAX compiles; the command line finds them compiled by the run before."""
+
+import contextlib
+import functools
+import os
+import pickle
+import threading
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Final, Generic, NamedTuple, TypeVar, final
+
+import equinox as eqx
+import jax
+from jax.core import Tracer
+
+from echelon.core import disk_cache
+
+_R = TypeVar("_R")
+_LEAST, _NEVER = "jax_persistent_cache_min_compile_time_secs", 1e9
+"""Of compiling, s, from which on JAX keeps what it compiles."""
+_COMPILING: Final = threading.Lock()
+_OTHER: Final = b""
+"""Is kept where a program is left to JAX."""
+
+
+class _Place(NamedTuple):
+    """Stands in a tree for one of some arrays."""
+
+    number: int
+
+
+class _Compiled(NamedTuple):
+    """What runs on arrays, and the tree of what comes back."""
+
+    run: Callable[..., Sequence[jax.Array]]
+    tree: Any
+
+
+class _Call(NamedTuple):
+    """The arguments of a call: their arrays, and the tree in which these stand."""
+
+    arrays: Sequence[Any]
+    leaves: tuple[Any, ...]
+    tree: Any
+
+    def key(self) -> Hashable:
+        """Return what is equal for calls of one program."""
+        kinds = tuple(map(type, self.leaves))
+        return self.tree, self.leaves, kinds, self.forms(), disk_cache.settings()
+
+    def forms(self) -> tuple[Hashable, ...]:
+        """Return the shapes and types of the arrays."""
+        return tuple(map(_form, self.arrays))
+
+    def arguments(self, arrays: Sequence[Any]) -> Any:
+        """Return the arguments with other arrays in the places of theirs."""
+        return _filled(jax.tree.unflatten(self.tree, self.leaves), arrays)
+
+
+@final
+class Program(Generic[_R]):
+    """A function that is compiled once for all arguments of the same shapes, as by `filter_jit`.
+
+    Where compiled code is kept, neither is it traced again in the next process for arguments of
+    echelon's own classes.
+    """
+
+    def __init__(self, function: Callable[..., _R]) -> None:
+        """Wrap a function of a module."""
+        functools.update_wrapper(self, function)
+        self._function, self._plain = function, eqx.filter_jit(function)
+        self._made: dict[Hashable, _Compiled | None] = {}
+
+    def __call__(self, *args: Any, **named: Any) -> _R:
+        """Return what the function returns."""
+        call = _call_of((args, named)) if disk_cache.is_open() else None
+        if call is None:
+            return self._plain(*args, **named)
+        key = call.key()
+        if key not in self._made:
+            self._made[key] = self._make(call)
+        made = self._made[key]
+        if made is None:
+            return self._plain(*args, **named)
+        return _filled(made.tree, made.run(*call.arrays))
+
+    def _make(self, call: _Call) -> _Compiled | None:
+        """Return what is kept for a call, or compile and keep it; None where JAX is to do it."""
+        name = f"{self._function.__module__}.{self._function.__qualname__}"
+        # Places stand for what is traced; other arrays are known by their numbers.
+        file = disk_cache.place_of(name, call.forms(), jax.tree.unflatten(call.tree, call.leaves))
+        if file is None:
+            return None
+        stored = disk_cache.read(file)
+        if stored is not None:
+            # What cannot be read is made again.
+            with contextlib.suppress(Exception):
+                return None if stored == _OTHER else _load(stored, len(call.arrays))
+        made, packed = _compile(self._function, call), _OTHER
+        # What cannot be written down is for JAX to keep from the next process on.
+        with contextlib.suppress(Exception):
+            packed = _OTHER if made is None else _packed(made)
+        disk_cache.keep(file, packed)
+        return made
+
+
+def program(function: Callable[..., _R]) -> Callable[..., _R]:
+    """Return a function that JAX compiles, of arrays of JAX's or of NumPy's."""
+    return Program(function)
+
+
+def _call_of(arguments: Any) -> _Call | None:
+    """Return a call as its arrays and their places; None within a trace, of which it is a part."""
+    leaves, tree = jax.tree.flatten(arguments)
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
+        return None
+    arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+    places = map(_Place, range(len(arrays)))
+    return _Call(arrays, tuple(next(places) if eqx.is_array(x) else x for x in leaves), tree)
+
+
+def _filled(tree: Any, arrays: Sequence[Any]) -> Any:
+    """Return a tree with arrays in their places."""
+
+    def at(leaf: Any) -> Any:
+        return arrays[leaf.number] if isinstance(leaf, _Place) else leaf
+
+    return jax.tree.map(at, tree, is_leaf=lambda leaf: isinstance(leaf, _Place))
+
+
+def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
+    """Return the shape and type of an array, as JAX takes it in the precision that is on."""
+    kind = jax.dtypes.canonicalize_dtype(array.dtype, allow_extended_dtype=True)
+    return array.shape, str(kind), getattr(array, "weak_type", False)
+
+
+# ---- compiled code -------------------------------------------------------------------------------
+
+
+def _compile(function: Callable[..., Any], call: _Call) -> _Compiled | None:
+    """Return a function compiled for a call; None where it calls what is not JAX's, as LAPACK."""
+    trees = list[Any]()
+
+    def flat(*arrays: jax.Array) -> list[Any]:
+        args, named = call.arguments(arrays)
+        leaves, tree = jax.tree.flatten(function(*args, **named))
+        made = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        places = map(_Place, range(len(made)))
+        leaves = [next(places) if eqx.is_array(leaf) else leaf for leaf in leaves]
+        trees.append(jax.tree.unflatten(tree, leaves))
+        return made
+
+    # What JAX has read from its own disk cache cannot be written down again: it lacks its code.
+    # Under a name of its own it is not found there, nor is it kept there as well.
+    flat.__name__ = f"{function.__name__}_{os.urandom(8).hex()}"
+    lowered = jax.jit(flat, keep_unused=True).lower(*call.arrays)
+    if "custom_call" in lowered.as_text():
+        return None
+    # The setting is that of all threads.
+    with _COMPILING:
+        least = jax.config.values[_LEAST]
+        jax.config.update(_LEAST, _NEVER)
+        try:
+            compiled = lowered.compile()
+        finally:
+            jax.config.update(_LEAST, least)
+    return _Compiled(compiled, trees[-1])
+
+
+def _packed(made: _Compiled) -> bytes:
+    """Return compiled code and its tree as bytes.
+
+    Raises:
+        ValueError: it calls what is in the process only where JAX has made it anew.
+    """
+    # Here, since the library as such keeps nothing.
+    from jax.experimental.serialize_executable import serialize
+
+    # Such as LAPACK: without it the process would end.
+    if "custom-call" in made.run.as_text():  # type: ignore[attr-defined]
+        raise ValueError("got a call of other code, allowed is none.")
+    code, _, back = serialize(made.run)  # type: ignore[arg-type]
+    return pickle.dumps((code, back.num_leaves, made.tree))
+
+
+def _load(stored: bytes, given: int) -> _Compiled:
+    """Return compiled code that takes so many arrays, from bytes."""
+    from jax.experimental.serialize_executable import deserialize_and_load
+
+    code, made, tree = pickle.loads(stored)
+    before = jax.tree.structure(((0,) * given, {}))
+    return _Compiled(deserialize_and_load(code, before, jax.tree.structure([0] * made)), tree)

@@ -1,0 +1,264 @@
+"""A polytope of matrices that provably contains all values, or slopes, of a function on a box.
+
+The function is traced and evaluated in exact polynomial arithmetic (`rules`, `slopes`); each entry
+is affine in the coordinates of every atom (a variable's powers, an angle's waves), each atom
+lies in a polygon with rational vertices (`curves`), and so the products of these vertices hold
+every value.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+
+from echelon.core.enclosure.atoms import Atoms, Corners, CornerValues, check_count, corner_values
+from echelon.core.enclosure.interval import Interval
+from echelon.core.enclosure.polynomial import Polynomial, constant
+from echelon.core.enclosure.rules import polynomials
+from echelon.core.enclosure.slopes import number, slopes_in, variable
+from echelon.core.errors import GainError
+from echelon.core.jaxpr import each, evaluate
+from echelon.core.types import Array
+
+Bounds: TypeAlias = Sequence[float | Fraction] | Array
+_Function: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+class Box(NamedTuple):
+    """Bounds (k,) of k entries, each taken exactly; infinite where an entry is open.
+
+    Nothing is known of an open entry. A function may be linear in it, and its slopes must not
+    depend on it.
+    """
+
+    lower: Bounds
+    upper: Bounds
+
+
+class HullAtom(NamedTuple):
+    """What the vertices are products of.
+
+    `name` is the box variable (or the expression), `kind` is `interval`, `powers`, `arc` or
+    `constant`; its range is (lower, upper), angles in rad; `vertices` is how many points stand
+    around it.
+    """
+
+    name: str
+    kind: str
+    lower: float
+    upper: float
+    vertices: int
+
+
+class Hull(NamedTuple):
+    """Every Jacobian is a convex combination of `vertices` plus a matrix within +- `error`.
+
+    `vertices` (K, n, n) float64 are the exact ones rounded, and `error` (n, n) bounds the rounding
+    entry by entry; it is 0 where floats are exact.
+    """
+
+    vertices: Array
+    error: Array
+    atoms: tuple[HullAtom, ...]
+
+
+def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[str] = ()) -> Hull:
+    """Return matrices whose hull holds function(x, v) for every x and v of a box.
+
+    It is sound for the function over the reals, float constants taken exactly; what a primitive
+    without a rule makes of constants alone (an inverse of the inertia, say) is a constant too, the
+    float64 that the program computes.
+
+    Args:
+        function: (x (n,), v (m,)) -> (k, l), traceable by JAX.
+        states: bounds of x, (n,) each.
+        inputs: bounds of v, (m,) each.
+        names: of the entries of x and v, for messages and `atoms`; else x[0], ..., v[0], ...
+
+    Raises:
+        OpenError: the function depends on an entry that the box leaves open.
+        GainError: a bound is NaN or above its partner, the function has no enclosure on the box
+            (the primitive is named), or there are more than `MOST_VERTICES` vertices.
+    """
+    atoms = Atoms()
+    return _hull_of(_values(function, *_variables(atoms, states, inputs, names), atoms), atoms)
+
+
+def slope_hull(
+    function: _Function,
+    states: Box,
+    inputs: Box,
+    names: Sequence[str] = (),
+    weight: _Function | None = None,
+) -> Hull:
+    """Return matrices whose hull H holds every slope in x of a function on a box.
+
+    For any x, y and v of the box function(x, v) - function(y, v) is a matrix of H times x - y,
+    whether the function is smooth or only bends. No derivative is taken from JAX.
+
+    Args:
+        function: (x (n,), v (m,)) -> (k,), traceable by JAX.
+        states: bounds of x, (n,) each.
+        inputs: bounds of v, (m,) each.
+        names: of the entries of x and v.
+        weight: (x, v) -> (k, l), whose values stand to the right of the slopes, enclosed together.
+
+    Raises:
+        OpenError: the slopes depend on an entry that the box leaves open.
+        GainError: as in `value_hull`; or the function or the weight jumps inside the box.
+    """
+    atoms = Atoms()
+    x, v = _variables(atoms, states, inputs, names)
+    found = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    if weight is not None:
+        # A weight is asked for its slopes too, which one that jumps has not.
+        beside = _evaluate_sloped(weight, x, v, atoms)
+        found = np.concatenate([found, each(lambda entry: entry.value, beside)], axis=1)
+    return _hull_of(found, atoms)
+
+
+def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
+    """Return in which entries of x a function (x, v) -> (k,) has the slope 0 all over a box.
+
+    Nothing is multiplied out, so that slopes elsewhere may be as many as they like.
+
+    Raises:
+        OpenError: the function bends with an entry that the box leaves open.
+        GainError: as in `slope_hull`.
+    """
+    atoms = Atoms()
+    x, v = _variables(atoms, states, inputs, ())
+    slopes = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    return tuple(k for k in range(len(x)) if not any(p.terms for p in slopes[:, k]))
+
+
+def _values(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
+    """Return the values (k, l) of a matrix function, polynomials."""
+    [found] = evaluate(function, [x, v], polynomials(atoms))
+    if found.ndim != 2 or found.dtype != object:
+        raise GainError("a function of a hull must return one matrix of floats.")
+    return found
+
+
+def _evaluate_sloped(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
+    """Return the values of a function with their slopes in x."""
+    states = np.empty(len(x), object)
+    states[:] = [variable(k, p) for k, p in enumerate(x)]
+    [found] = evaluate(function, [states, each(number, v)], slopes_in(atoms))
+    return found if found.dtype == object else each(number, found)
+
+
+def _slopes(values: np.ndarray, n: int, atoms: Atoms) -> np.ndarray:
+    """Return the slopes (k, n) of values (k,), polynomials."""
+    slopes = np.full((len(values), n), constant(0), object)
+    for row, entry in enumerate(values):
+        for k, slope in entry.slopes.items():
+            slopes[row, k] = atoms.settle(slope)
+    return slopes
+
+
+def _variables(
+    atoms: Atoms, states: Box, inputs: Box, names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return x (n,) and v (m,) as variables with their ranges."""
+    n, m = _count_bounds(states, "x"), _count_bounds(inputs, "v")
+    called = list(names) or [f"x[{k}]" for k in range(n)] + [f"v[{k}]" for k in range(m)]
+    if len(called) != n + m:
+        raise GainError(f"`names` has {len(called)} entries, and must have {n + m}.")
+    bounds = [*zip(*states, strict=True), *zip(*inputs, strict=True)]
+    found = np.empty(n + m, object)
+    for k, (low, high) in enumerate(bounds):
+        found[k] = atoms.variable(called[k], _interval(low, high))
+    return found[:n], found[n:]
+
+
+def _interval(low: float | Fraction, high: float | Fraction) -> Interval | None:
+    """Return a range, nothing rounded: a float is a fraction with a power of two below."""
+    if math.isinf(low) or math.isinf(high):
+        return None
+    ends = (x if isinstance(x, Fraction) else Fraction(float(x)) for x in (low, high))
+    return Interval(*ends)
+
+
+def _count_bounds(box: Box, name: str) -> int:
+    """Return how many bounds a box has."""
+    lower, upper = (list(side) for side in box)
+    if len(lower) != len(upper):
+        raise GainError(
+            f"the bounds of `{name}` have {len(lower)} and {len(upper)} entries, "
+            "and must be two vectors of the same length."
+        )
+    for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        if not low <= high:
+            raise GainError(
+                f"the bounds of `{name}[{k}]` are {float(low):g} and {float(high):g}, "
+                "and must be in rising order."
+            )
+    return len(lower)
+
+
+def _hull_of(entries: np.ndarray, atoms: Atoms) -> Hull:
+    """Return the hull of a matrix of polynomials."""
+    # Over all entries together: corners for each entry alone would lose that they share angles.
+    used: dict[int, set[Any]] = {}
+    for p in entries.flat:
+        for atom, exponents in p.exponents().items():
+            used.setdefault(atom, set()).update(exponents)
+    corners = {atom: atoms.corners(atom, used[atom]) for atom in sorted(used)}
+    counts = {atom: len(c.points) for atom, c in corners.items()}
+    # Before anything is built, as each atom multiplies the count.
+    check_count(math.prod(counts.values()))
+    parts = [_round_values(p, corners) for p in entries.flat]
+    spread = [_expand_values(values, array, counts) for values, array, _ in parts]
+    error = np.array([bound for _, _, bound in parts]).reshape(entries.shape)
+    # Entries may not tell all products apart, and each vertex is a constraint for a solver.
+    vertices = np.unique(np.stack(spread, axis=-1), axis=0)
+    return Hull(vertices.reshape(-1, *entries.shape), error, _describe_atoms(atoms, used, counts))
+
+
+def _round_values(
+    p: Polynomial, corners: dict[int, Corners]
+) -> tuple[CornerValues, np.ndarray, float]:
+    """Return an entry's vertex values, exactly and rounded, with the bound of their difference."""
+    values = corner_values(p, corners)
+    rounded = np.empty(values.array.shape)
+    worst = Fraction(0)
+    for place, exact in np.ndenumerate(values.array):
+        try:
+            # To the nearest float; what that moves is measured exactly and becomes part of `error`.
+            rounded[place] = float(exact)
+        except OverflowError as fault:
+            raise GainError("an entry of the hull exceeds float64 on the domain.") from fault
+        worst = max(worst, abs(Fraction(float(rounded[place])) - exact))
+    return values, rounded, _round_up(worst + values.slack)
+
+
+def _round_up(x: Fraction) -> float:
+    """Return the smallest float that is not below x."""
+    near = float(x)
+    # `float` rounds to nearest, and a bound must not be rounded down.
+    return near if Fraction(near) >= x else math.nextafter(near, math.inf)
+
+
+def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, int]) -> np.ndarray:
+    """Return an entry's values at every product of vertices, in the order of `counts`."""
+    shape = [count if atom in values.atoms else 1 for atom, count in counts.items()]
+    # An entry is constant along the atoms that it does not use.
+    return np.broadcast_to(array.reshape(shape), list(counts.values())).ravel()
+
+
+def _describe_atoms(
+    atoms: Atoms, used: dict[int, set[Any]], counts: dict[int, int]
+) -> tuple[HullAtom, ...]:
+    """Return what the hull is made of, in the order in which the model uses it."""
+    found = []
+    for atom, count in counts.items():
+        known = atoms.known[atom]
+        powers = [e for e in used[atom] if isinstance(e, int)]
+        kind = "arc" if not powers else "interval" if powers == [1] else "powers"
+        low, high = float(known.reach.lo), float(known.reach.hi)
+        found.append(HullAtom(known.name, "constant" if count == 1 else kind, low, high, count))
+    return tuple(found)

@@ -1,0 +1,263 @@
+"""The dataset of a run, labelled, with units and provenance, and its summary.
+
+The dataset is one netCDF file, the summary is JSON.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.files import write_whole
+from echelon.experiments.results.foreseen import heard_in
+from echelon.experiments.results.labelled import Labelled
+from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.metrics import (
+    EdgeMetrics,
+    Metrics,
+    metrics,
+    output_errors,
+    representatives,
+    steady_error,
+)
+from echelon.experiments.results.recording import FORMAT
+from echelon.guarantees.promises.promise import promise
+from echelon.simulation.engine.result import Result
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_LISTED = 5_000
+"""Rows of a list in the summary. The dataset has what all of them are made of."""
+_Row = TypeVar("_Row")
+
+
+def dataset(result: Result) -> "xr.Dataset":
+    """Return a run as a dataset with dimensions time, agent, state, input, edge.
+
+    Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
+    `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
+    references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
+    `edge_weight`, `edge_heard` (whether each end of an edge hears the other), of a graph that
+    switches `edge_weight_then` from each `stretch_start` on with its `graph_period` (infinite
+    where nothing is repeated), the gain's `P`, `R` and `coupling`, the poles of the modes looked
+    at (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, of which a directed graph may have
+    an imaginary part in `mode_eigenvalue_imaginary`), and where inputs u are limited
+    `limit_low` <= `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format`
+    the number of this list.
+    """
+    return labelled(result).dataset()
+
+
+def labelled(result: Result) -> Labelled:
+    """Return what `dataset` is made of."""
+    model, per_agent = result.model, ("time", "agent", "state")
+    variables: dict[str, Any] = {
+        "states": (per_agent, result.states),
+        "error": (per_agent, result.errors),
+        "inputs": (("time", "agent", "input"), result.inputs),
+        "offset": (("agent", "state"), result.formation.offsets),
+        "saturated": ("agent", result.saturated),
+        "is_leader": (
+            "agent",
+            np.isin(np.arange(result.graph.agents), result.graph.leaders).astype(np.int8),
+        ),
+        "nearest_leader": ("agent", np.array(result.graph.nearest_leader())),
+        **_edges(result),
+    }
+    v = lyapunov(result)
+    if v is not None:
+        variables |= {"lyapunov": ("time", v.value), "lyapunov_rate": ("time", v.rate)}
+        variables["lyapunov_drift"] = ("time", v.drift)
+    variables |= {**_followed(result), **_gain(result), **_limits(result), **_poles(result)}
+    coordinates = {
+        "time": ("time", result.times, {"units": "s"}),
+        "agent": np.arange(result.graph.agents),
+        "state": list(model.state_names),
+        "state_unit": ("state", list(model.state_units)),
+        "input": list(model.input_names),
+        "input_unit": ("input", list(model.input_units)),
+        "output": list(model.output_names),
+        "output_unit": ("output", _output_units(model)),
+    }
+    return Labelled(variables, coordinates, _attributes(result))
+
+
+def _edges(result: Result) -> dict[str, Any]:
+    """Return the graph: its edges, who hears along them, and when they are there."""
+    graph, schedule = result.graph, result.graph.schedule
+    told: dict[str, Any] = {
+        "edge_agents": (("edge", "end"), graph.edges),
+        "edge_weight": ("edge", graph.weights),
+        "edge_heard": (("edge", "end"), heard_in(result.parts).astype(np.int8)),
+    }
+    if schedule is not None:
+        told["stretch_start"] = ("stretch", schedule.starts, {"units": "s"})
+        told["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
+        period = np.inf if schedule.period is None else schedule.period
+        told["graph_period"] = ((), period, {"units": "s"})
+    return told
+
+
+def _output_units(model: ControlAffine) -> list[str]:
+    """Return the units of the outputs, known of those that are states."""
+    units = dict(zip(model.state_names, model.state_units, strict=True))
+    return [units.get(name, "") for name in model.output_names]
+
+
+def _followed(result: Result) -> dict[str, Any]:
+    """Return what the leaders follow and how far they are from it; nothing without a reference."""
+    if result.reference is None:
+        return {}
+    found: dict[str, Any] = {"reference": (("time", "state"), result.reference)}
+    errors = [output_errors(result, leader) for leader in result.graph.leaders]
+    known = [error for error in errors if error is not None]
+    if known:
+        found["tracking_error"] = (("time", "leader", "output"), np.stack(known, axis=1))
+    return found
+
+
+def _gain(result: Result) -> dict[str, Any]:
+    """Return what the gain is; nothing without one."""
+    gain = result.drive.gain
+    if gain is None:
+        return {}
+    return {
+        # A dimension stands in a variable once, so that columns have one of their own.
+        "P": (("state", "state_column"), gain.P),
+        "R": (("input", "input_column"), gain.R),
+        "coupling": ((), gain.coupling),
+    }
+
+
+def _limits(result: Result) -> dict[str, Any]:
+    """Return what limits the inputs that were delivered; nothing where they are not."""
+    limits = result.model.input_limits if result.settings.limits else None
+    if limits is None:
+        return {}
+    matrix, low, high = (np.asarray(part, np.float64) for part in limits)
+    rows = {"limit_low": ("limit", low), "limit_high": ("limit", high)}
+    return {"limit_matrix": (("limit", "input"), matrix), **rows}
+
+
+def _poles(result: Result) -> dict[str, Any]:
+    """Return the poles near the trim; nothing where laws have none."""
+    found = promise(result.parts, result.settings)
+    if not found.linear:
+        return {}
+    poles, values = found.loop.poles, found.loop.eigenvalues
+    turning = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
+    turning = turning if np.iscomplexobj(values) else {}
+    return {
+        "pole_real": (("mode", "pole"), np.real(poles)),
+        "pole_imaginary": (("mode", "pole"), np.imag(poles)),
+        "mode_eigenvalue": ("mode", np.real(values)),
+        **turning,
+    }
+
+
+def _attributes(result: Result) -> dict[str, Any]:
+    """Return provenance and settings as attributes that netCDF can hold."""
+    settings = {**result.settings._asdict(), "steady_window": result.settings.window}
+    settings = {key: int(v) if isinstance(v, bool) else v for key, v in settings.items()}
+    laws = {
+        f"{role}_needs": "; ".join(sent) or "nothing"
+        for role, sent in result.drive.information._asdict().items()
+    }
+    told = {
+        key: text for key, text in result.world.describe(result.model).items() if text is not None
+    }
+    told |= {"outcome": result.outcome.name.lower(), "message": result.message}
+    told |= {"warnings": "\n".join(result.warnings)}
+    told |= {"promise": json.dumps(promise(result.parts, result.settings).as_mapping())}
+    if result.work is not None:
+        told["solver"] = json.dumps(result.work._asdict())
+    return {
+        **result.provenance,
+        **told,
+        **settings,
+        **laws,
+        "model": type(result.model).__name__,
+        "position": " ".join(result.model.position),
+        "directed": int(result.graph.directed),
+        "format": FORMAT,
+    }
+
+
+def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
+    """Write the dataset of a run as netCDF, whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    # In memory first: on a disk that is full the library under it ends the whole process.
+    data = labelled(run) if isinstance(run, Result) else run
+    if isinstance(data, Labelled):
+        write_whole(path, data.netcdf())
+    else:
+        write_whole(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
+
+
+def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
+    """Return the run's summary, ready for JSON; what does not exist is None."""
+    numbers = metrics(result) if numbers is None else numbers
+    gain = result.drive.gain
+    spectrum = result.graph.spectrum()
+    return {
+        "scenario": result.provenance.get("scenario", ""),
+        "outcome": {"name": result.outcome.name.lower(), "message": result.message},
+        "agents": result.graph.agents,
+        "unit": result.unit,
+        "horizon_s": result.settings.horizon,
+        "dt_s": result.settings.dt,
+        "seed": result.settings.seed,
+        **result.world.describe(result.model),
+        "leader": numbers.leader._asdict(),
+        "leaders": [each._asdict() for each in numbers.leaders],
+        "followers": [
+            _follower(each._asdict()) for each in _listed(numbers.followers, steady_error)
+        ],
+        "edges": [
+            {"edge": list(each.edge), "distance_rmse": each.distance_rmse}
+            for each in _listed(numbers.edges, _distance_error)
+        ],
+        "gain": None
+        if gain is None
+        else {
+            "method": gain.method,
+            "coupling": gain.coupling,
+            "P": gain.P.tolist(),
+            "R": gain.R.tolist(),
+        },
+        "promise": promise(result.parts, result.settings).as_mapping(),
+        "lambda_min": spectrum.low,
+        "lambda_max": spectrum.high,
+        "minimum_distance": numbers.minimum_distance,
+        "saturation_fraction": numbers.saturation_fraction,
+        "alternations": int(result.chatter.max()),
+        "steady_window_s": numbers.steady_window,
+        "warnings": list(result.warnings),
+        "engine": result.engine,
+        "wall_time_s": result.wall_time,
+        "versions": {
+            key[8:]: text for key, text in result.provenance.items() if key.startswith("version_")
+        },
+    }
+
+
+def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:
+    """Return all rows; of more than a person's tools read, the best, the median and the worst."""
+    return rows if len(rows) <= _LISTED else representatives(rows, error)
+
+
+def _distance_error(edge: EdgeMetrics) -> float:
+    return np.inf if edge.distance_rmse is None else edge.distance_rmse
+
+
+def _follower(entry: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "settling_time_s" if key == "settling_time" else key: value for key, value in entry.items()
+    }

@@ -1,0 +1,400 @@
+"""From a checked scenario to parts, and from parts to a run.
+
+Names are looked up in the registry alone.
+"""
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.models.model_check import check_model
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.references.guide import Guide
+from echelon.agents.references.reference import Reference, check_reference
+from echelon.agents.world.disturbance import Disturbance
+from echelon.agents.world.plant import check_plant, vary_parameters
+from echelon.agents.world.world import World
+from echelon.core.errors import (
+    EchelonError,
+    MissingExtraError,
+    ModelError,
+    ScenarioError,
+    listing,
+)
+from echelon.core.numerics import precision
+from echelon.core.provenance import versions
+from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.checks import section
+from echelon.experiments.scenario.part import Part, accepted, known, law_part, offered, part_of
+from echelon.experiments.scenario.scenario import Fault, Scenario, refuse
+from echelon.experiments.scenario.sections import FollowerSpec, GainSpec, LeaderSpec
+from echelon.experiments.scenario.user_code import own_code
+from echelon.experiments.scenario.yaml import joined
+from echelon.laws.law import Law
+from echelon.laws.law_check import prepare_law
+from echelon.simulation.engine.initial import initial_states
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import check_memory
+from echelon.simulation.engine.record import Stretch
+from echelon.simulation.engine.result import Result
+from echelon.simulation.engine.simulate import Keep, Progress, simulate
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.gain import Gain, Method, synthesize
+from echelon.synthesis.gains.gain_file import load_gain
+
+
+class Built(NamedTuple):
+    """What `simulate` takes: the parts of a scenario, and how it is computed."""
+
+    parts: Parts
+    settings: Settings
+
+
+class _Faults:
+    """Collects the faults of parts, each with the place of the key that made it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.found: list[Fault] = []
+
+    @contextlib.contextmanager
+    def at(self, *path: str | int) -> Iterator[None]:
+        """Note an error that is raised inside, and go on."""
+        try:
+            yield
+        except MissingExtraError:
+            raise
+        except EchelonError as error:
+            self.found.append(Fault(self.scenario.place(*path), joined(path), str(error)))
+
+    def settle(self) -> None:
+        """Raise all that was noted, a line each."""
+        if self.found:
+            refuse(self.found)
+
+
+def build(scenario: Scenario, to_run: bool = False) -> Built:
+    """Return the parts and the settings of a scenario.
+
+    Where it is to run as it stands, what it stores must have room, and nothing may have been done
+    live, which a run cannot repeat.
+
+    Raises:
+        ScenarioError: one line for each part that cannot be made, with its place in the file.
+    """
+    _check_scenario(scenario)
+    faults = _Faults(scenario)
+    # Gains are computed here, and would keep 7 digits under another precision.
+    with precision("float64"):
+        model = graph = None
+        with faults.at("simulation"):
+            _settings(scenario).check()
+        with faults.at("model"):
+            model = _model(scenario)
+            check_model(model)
+        with faults.at("graph"):
+            graph = _graph(scenario)
+        reference = None
+        with faults.at("reference"):
+            reference = _reference(scenario, model)
+        # Before the laws: without a model and a graph each would be blamed for theirs.
+        faults.settle()
+        if to_run:
+            # And before a gain is made, which takes long for many agents.
+            _check_run(scenario, faults, cast(ControlAffine, model), cast(Graph, graph))
+        return _with_laws(
+            scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
+        )
+
+
+def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph) -> None:
+    """Check that a scenario can be run as it stands, and that what is stored of it has room."""
+    with faults.at("live"):
+        if scenario.live:
+            raise ScenarioError(
+                f"got {len(scenario.live)} events, allowed is none in a run; `echelon live` "
+                "repeats them, and without `live` this is the scenario before them."
+            )
+    with faults.at("simulation"):
+        check_memory(model, graph.agents, _settings(scenario))
+    faults.settle()
+
+
+def _check_scenario(scenario: object) -> None:
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError(
+            f"`scenario` is {scenario!r}, and must be a `Scenario`, as `load_scenario` returns it."
+        )
+
+
+def _with_laws(
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Any
+) -> Built:
+    """Return all parts, with those that need a model and a graph, with these."""
+    formation = leader = follower = plant = None
+    with faults.at("plant"):
+        plant = _plant(scenario, model)
+    disturbance = _disturbance(scenario, faults, model)
+    with faults.at("formation"):
+        formation = _formation(scenario, model, graph)
+    with faults.at("follower"):
+        follower = _follower(scenario, faults, model, graph)
+    with faults.at("leader"):
+        reaction = getattr(follower, "gain", None) if scenario.leader.reacts else None
+        leader = _leader(scenario, faults, model, graph, reference, reaction)
+    for place, named in (
+        (("initial", "spread"), scenario.initial.spread or {}),
+        (("leader", "start_error"), scenario.leader.start_error),
+    ):
+        for name in named:
+            with faults.at(*place, name):
+                model.states_called(name)
+    faults.settle()
+    parts = Parts(
+        model,
+        graph,
+        cast(Formation, formation),
+        Laws(cast(Law, leader), cast(Law, follower)),
+        initial=_initial(scenario),
+        start_error=scenario.leader.start_error,
+        world=World(plant, disturbance),
+    )
+    with faults.at("initial"):
+        initial_states(parts, scenario.seed)
+    faults.settle()
+    return Built(parts, _settings(scenario))
+
+
+def _initial(scenario: Scenario) -> Any:
+    """Return spreads by state or group, and states by agent, in one mapping."""
+    # States have names and agents numbers, so that no key meets another.
+    return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
+
+
+def run(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    built: Built | None = None,
+    keep: Keep | None = None,
+    before: Sequence[Stretch] = (),
+) -> Result:
+    """Simulate a scenario, built unless its parts are given, and note where the result comes from.
+
+    `progress`, `keep` and `before` are those of `simulate`.
+
+    Raises:
+        ScenarioError: a part cannot be made.
+    """
+    _check_scenario(scenario)
+    parts = build(scenario) if built is None else built
+    return note_origin(simulate(*parts, progress, keep, before), scenario)
+
+
+def note_origin(result: Result, scenario: Scenario) -> Result:
+    """Return a result with its scenario and the versions of what computed it."""
+    told = {f"version_{name}": text for name, text in versions().items()}
+    return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
+
+
+# ---- parts --------------------------------------------------------------------------------------
+
+
+def _model(scenario: Scenario) -> ControlAffine:
+    spec = scenario.model
+    part = part_of(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
+    extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
+    if extra and "allow_unphysical" not in accepted(part.cls):
+        raise ModelError(
+            f"`allow_unphysical` has no meaning for `{part.what}`, which has no such parameter."
+        )
+    given = spec.parameters or {}
+    given = {"set": given} if isinstance(given, str) else dict(given)
+    if "set" in given and "set" not in accepted(part.cls):
+        return _named_set(part, given.pop("set"), {**given, **extra})
+    return part._replace(given={**given, **extra}).made()
+
+
+def _named_set(part: Part, name: object, changes: Mapping[str, Any]) -> ControlAffine:
+    """Return a model with a named set of parameters, some of them changed."""
+    named = getattr(part.cls, "named", None)
+    if named is None:
+        raise ModelError(
+            f"`{part.what}` has no named parameter sets, and got `{name}`; give a mapping."
+        )
+    with own_code(f"`{part.what}` cannot be made with these parameters"):
+        return named(name, **known(part.cls, part.what, changes))
+
+
+def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
+    spec = scenario.plant
+    if spec is None:
+        return None
+    plant = vary_parameters(model, spec.parameters, spec.scale)
+    check_model(plant)
+    check_plant(model, plant)
+    return plant
+
+
+def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> Disturbance | None:
+    spec = scenario.disturbance
+    if spec is None:
+        return None
+    for key in ("constant", "rms", "input_rms"):
+        with faults.at("disturbance", key):
+            # Each alone, so that its fault is told at its own line.
+            Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
+    return Disturbance(**spec.model_dump())
+
+
+def _graph(scenario: Scenario) -> Graph:
+    spec = scenario.graph
+    if spec.edges is not None:
+        rest = spec.leaders, spec.agents, spec.directed
+        if spec.schedule:
+            return Graph.switching(spec.stretches, *rest, spec.period)
+        return Graph.from_edges(spec.stretches[0][1], *rest)
+    make = getattr(Graph, str(spec.name))
+    given = {key: value for key, value in spec.model_dump().items() if value is not None}
+    graph = make(**offered(make, given))
+    return graph.one_way() if spec.directed and not graph.directed else graph
+
+
+def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
+    spec = scenario.reference
+    # What is read from a file needs the model's names, and a model that fails is told of itself.
+    if spec is None or model is None:
+        return None
+    part = part_of(
+        scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
+    )
+    reference = (
+        part.made() if spec.file is None else _read(part, scenario.folder / spec.file, model)
+    )
+    check_reference(reference)
+    return reference
+
+
+def _read(part: Part, file: Path, model: ControlAffine) -> Guide:
+    """Return a reference from its file."""
+    read = getattr(part.cls, "read", None)
+    if read is None:
+        raise ScenarioError(f"`{part.what}` is made of its keys, and is read from no `file`.")
+    if part.given:
+        raise ScenarioError(f"got `file` and {listing(part.given)}, allowed is one of them.")
+    return read(file, model)
+
+
+def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Formation:
+    spec = scenario.formation
+    if spec.name is None:
+        return Formation.from_offsets(model, graph, spec.offsets or {})
+    make = getattr(Formation, spec.name)
+    return make(model, graph, **offered(make, {"spacing": spec.spacing, "columns": spec.columns}))
+
+
+def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:
+    if spec.file is not None:
+        return load_gain(scenario.folder / spec.file, model, graph)
+    part = part_of(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
+    method = part.made()
+    with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
+        return synthesize(model, graph, method)
+
+
+def _follower(
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
+) -> Law | None:
+    spec = scenario.follower
+    part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
+    _check_keys(scenario, faults, "follower", part)
+    plain = ("feedforward", "trim", "frame")
+    offers: dict[str, Any] = {key: getattr(spec, key) for key in plain}
+    offers |= _stopping(spec)
+    if "gain" in accepted(part.cls):
+        with faults.at("follower", "gain"):
+            offers["gain"] = _gain(model, graph, spec.gain, scenario)
+        if "gain" not in offers:
+            return None
+    return _law(part, offers, model, graph)
+
+
+def _stopping(spec: LeaderSpec | FollowerSpec) -> dict[str, Any]:
+    """Return the keys of the law `stopping-point` that a role gives."""
+    given = {name: getattr(spec, name, None) for name in _STOPPING_KEYS}
+    given = {name: value for name, value in given.items() if value is not None}
+    return given | ({"speed": math.inf} if given.get("speed") == "inf" else {})
+
+
+_STOPPING_KEYS = ("roots", "rate", "coupling", "speed", "observer", "hears")
+_LAW_KEYS = ("gain", "feedforward", "trim", "frame", *_STOPPING_KEYS)
+
+
+def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:
+    """Note the keys of a role that its law does not take, which of one's own its class knows."""
+    for key in section(scenario.data, role):
+        if key in _LAW_KEYS and key not in accepted(part.cls):
+            with faults.at(role, str(key)):
+                raise ScenarioError(
+                    f"got a key that the law `{part.what}` does not take, allowed are those that "
+                    "its class names."
+                )
+
+
+def _law(part: Part, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
+    """Return the law of a scenario, completed and checked."""
+    law = part.made(offers)
+    with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
+        return prepare_law(law, model, graph)
+
+
+def _leader(
+    scenario: Scenario,
+    faults: _Faults,
+    model: ControlAffine,
+    graph: Graph,
+    reference: Any,
+    reaction: Gain | None,
+) -> Law | None:
+    spec = scenario.leader
+    part = law_part(scenario, registry.LEADER_LAWS, spec.law)
+    _check_keys(scenario, faults, "leader", part)
+    if spec.reacts and "reaction" not in accepted(part.cls):
+        raise ScenarioError(
+            f"`reacts` is true, and the law `{part.what}` cannot be told to react; use `tracking`."
+        )
+    if spec.reacts and reaction is None:
+        raise ScenarioError("`reacts` needs a follower law with a gain, and this one has none.")
+    if reference is not None and "reference" not in accepted(part.cls):
+        raise ScenarioError(f"there is a `reference`, and the law `{part.what}` takes none.")
+    offers: dict[str, Any] = {
+        "reference": reference,
+        "reaction": reaction,
+        "start_error": spec.start_error,
+        "horizon": scenario.simulation.horizon,
+        "limits": scenario.simulation.limits,
+        # One inner loop for all, unless the file says otherwise.
+        **{k: v for k, v in _stopping(scenario.follower).items() if k in ("roots", "rate")},
+    }
+    own = _stopping(spec)
+    if {"roots", "rate"} & own.keys():
+        offers = {key: value for key, value in offers.items() if key not in ("roots", "rate")}
+    offers |= own
+    if spec.gain is not None:
+        with faults.at("leader", "gain"):
+            offers["gain"] = _gain(model, graph, spec.gain, scenario)
+        if "gain" not in offers:
+            return None
+    return _law(part, offers, model, graph)
+
+
+def _settings(scenario: Scenario) -> Settings:
+    return Settings(
+        **scenario.simulation.model_dump(),
+        seed=scenario.seed,
+        steady_window=scenario.report.steady_window,
+    )

@@ -1,0 +1,135 @@
+"""The page of all keys of a scenario, made from the schema and from what the names make."""
+
+import inspect
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.scenario import json_schema
+
+_HEAD = """# Scenario keys
+
+All keys of a scenario file; a first one is in the [first quarter of an hour](start.md), and words
+such as *trim* and *gain* in the [glossary](glossary.md). A *section* is a mapping with the keys of
+its own table below; where no default stands, a key may be left out. *By state or group* means a
+mapping from names of the model, such as `{x: 1.0}` or `{position: 1.0}` for all its coordinates.
+Numbers are in SI units and angles in rad; *1* marks a number without a unit. `python:
+file.py:Class` stands for a class of [your own](extending.md). The page is made by
+`echelon.experiments.scenario.keys` from the schema that checks the file.
+"""
+_COLUMNS = ("key", "what", "unit", "default", "meaning")
+
+
+def keys_page() -> str:
+    """Return the page in Markdown."""
+    schema = json_schema()
+    parts = [_HEAD, *_section("the file", schema, schema["$defs"])]
+    for name, what in schema["properties"].items():
+        inner = _referred(what, schema["$defs"])
+        if inner is not None:
+            parts += _section(f"`{name}`", inner, schema["$defs"])
+    parts += _section("`gain`, of leader or follower", schema["$defs"]["GainSpec"], schema["$defs"])
+    parts += [*_named("References", registry.REFERENCES), *_named("Models", registry.MODELS)]
+    return "\n".join(parts)
+
+
+def _section(title: str, part: Mapping[str, Any], defs: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a heading, the section's sentence and the table of its keys."""
+    yield f"## {title[0].upper()}{title[1:]}\n"
+    yield f"{_line(part['description'])}\n"
+    rows = []
+    for key, what in part["properties"].items():
+        inner = _referred(what, defs)
+        section = inner is not None and inner is not defs["OwnClass"]
+        meaning = what.get("description") or (inner or {}).get("description", "")
+        kind = "section" if section else _kind(what, defs)
+        default = _default(key, what, part)
+        rows.append((f"`{key}`", kind, what.get("unit", ""), default, _line(meaning)))
+    yield from _table(_COLUMNS, rows)
+
+
+def _referred(what: Mapping[str, Any], defs: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the section that a key holds; None where it holds a value."""
+    ways = [way for way in what.get("anyOf", [what]) if way.get("type") != "null"]
+    if len(ways) != 1 or "$ref" not in ways[0]:
+        return None
+    return defs[ways[0]["$ref"].rpartition("/")[2]]
+
+
+def _default(key: str, what: Mapping[str, Any], part: Mapping[str, Any]) -> str:
+    if key in part.get("required", ()):
+        return "required"
+    value = what.get("default")
+    if value in (None, {}):
+        return ""
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def _kind(what: Mapping[str, Any], defs: Mapping[str, Any]) -> str:
+    """Return in words what a key takes."""
+    if "anyOf" in what:
+        ways = [_kind(way, defs) for way in what["anyOf"] if way.get("type") != "null"]
+        return " or ".join(dict.fromkeys(ways))
+    if "$ref" in what:
+        return "`{python: file.py:Class, ...}`"
+    if "const" in what:
+        return f"`{what['const']}`"
+    if "enum" in what:
+        return ", ".join(f"`{name}`" for name in what["enum"])
+    if what.get("type") == "object":
+        inner = what.get("additionalProperties")
+        # Where anything may stand, the model alone knows what.
+        return f"mapping to {_kind(inner, defs)}" if isinstance(inner, dict) else "mapping"
+    if what.get("type") == "array":
+        return "list"
+    return _scalar(what)
+
+
+_SCALARS = {"integer": "whole number", "number": "number", "boolean": "`true` or `false`"}
+
+
+def _scalar(what: Mapping[str, Any]) -> str:
+    kind = what.get("type", "")
+    if isinstance(kind, list):
+        return " or ".join(_kind({"type": each}, {}) for each in kind)
+    name = _SCALARS.get(kind, "text" if kind == "string" else "anything")
+    if "exclusiveMinimum" in what:
+        return f"{name} above {what['exclusiveMinimum']}"
+    return f"{name} from {what['minimum']} on" if "minimum" in what else name
+
+
+def _named(title: str, entries: Mapping[str, registry.Entry]) -> Iterator[str]:
+    """Yield what each name of a family takes beside it, as its class says."""
+    yield f"## {title}\n"
+    yield "What each name is, and its own keys; units stand in the [reference](api.md).\n"
+    rows = []
+    for name, entry in entries.items():
+        taken = inspect.signature(resolve(entry)).parameters.values()
+        rows.append((f"`{name}`", entry.summary, ", ".join(map(_taken, taken)) or "none"))
+    yield from _table(("name", "what", "keys"), rows)
+
+
+def _taken(key: inspect.Parameter) -> str:
+    return f"`{key.name}`" if key.default is key.empty else f"`{key.name}: {_yaml(key.default)}`"
+
+
+def _yaml(value: object) -> str:
+    """Return a default as a scenario would have it."""
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_yaml, value))}]"
+    return str(value).lower() if isinstance(value, bool) or value is None else f"{value}"
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
+    for row in (head, ("---",) * len(head), *rows):
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
+    yield ""
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
+if __name__ == "__main__":
+    print(keys_page(), end="")

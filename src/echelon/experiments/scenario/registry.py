@@ -1,0 +1,173 @@
+"""The one table of names that a scenario file may use.
+
+Each stands with where it lives and one line on what it is. Only text stands here, so that names can
+be listed and checked without importing JAX. A new member of a family adds one line.
+"""
+
+from typing import NamedTuple
+
+
+class Entry(NamedTuple):
+    """Where a named part lives and what it is, in one line; of methods and laws also their keys.
+
+    Attributes:
+        target: `module:Attribute`.
+        summary: for lists.
+        needs: keys that a scenario must give with it.
+        takes: keys that it may give.
+    """
+
+    target: str
+    summary: str
+    needs: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
+
+
+def _models(**entries: tuple[str, str]) -> dict[str, Entry]:
+    return {
+        name.replace("_", "-"): Entry(f"echelon.agents.models:{cls}", text)
+        for name, (cls, text) in entries.items()
+    }
+
+
+MODELS = _models(
+    single_integrator=("SingleIntegrator", "position driven by velocity, in any dimension"),
+    double_integrator=(
+        "DoubleIntegrator",
+        "position and velocity driven by acceleration, with linear drag",
+    ),
+    linear=("Linear", "A, B, C given as matrices"),
+    van_der_pol=("VanDerPol", "Van der Pol oscillator with a force input"),
+    pendulum=("Pendulum", "damped pendulum with a torque input"),
+    unicycle=("Unicycle", "planar vehicle with speed and turn rate, seen at its axle"),
+    unicycle_point=("UnicyclePoint", "the same vehicle, seen at a point ahead of its axle"),
+    planar_quadrotor=("PlanarQuadrotor", "quadrotor in a vertical plane, 6 states"),
+    quadrotor=("Quadrotor", "quadrotor in space, 12 states, ZYX Euler angles, per-motor limits"),
+    quadrotor_euler=("QuadrotorEuler", "quadrotor under computed torque, inputs are accelerations"),
+    quadrotor_thrust=("QuadrotorThrust", "the same with its thrust as a 13th state: g is constant"),
+    quadrotor_printed=(
+        "PrintedQuadrotor",
+        "literal: the paper's equations, without gravity or thrust rotation",
+    ),
+)
+
+REFERENCES = {
+    "lemniscate": Entry(
+        "echelon.agents.references:Lemniscate", "the paper's loop (lemniscate of Bernoulli)"
+    ),
+    "figure-eight": Entry("echelon.agents.references:FigureEight", "sin and sin 2 figure eight"),
+    "circle": Entry("echelon.agents.references:Circle", "circle at constant height"),
+    "hover": Entry("echelon.agents.references:Hover", "one fixed point"),
+    "line": Entry("echelon.agents.references:Line", "straight line at constant velocity"),
+    "waypoints": Entry(
+        "echelon.agents.references:Waypoints", "smooth polynomials through timed points"
+    ),
+    "states": Entry(
+        "echelon.agents.references:StatePath",
+        "states and inputs over time, from a CSV file, of any model",
+    ),
+}
+
+# The keys of methods and laws are the arguments of the class; they stand here too since the class
+# needs JAX.
+METHODS = {
+    "riccati": Entry(
+        "echelon.synthesis.gains:Riccati",
+        "Riccati equation at the trim, coupling 1/lambda_min",
+        takes=("Q", "R", "coupling"),
+    ),
+    "given": Entry(
+        "echelon.synthesis.gains:FixedGain",
+        "a P (and R, coupling) of your own",
+        needs=("P",),
+        takes=("R", "coupling"),
+    ),
+    "inner-loop": Entry(
+        "echelon.synthesis.gains:InnerLoop",
+        "damp all but position, then any coupling works",
+        takes=("Q", "R", "coupling", "symmetry_weight"),
+    ),
+    "monotone": Entry(
+        "echelon.synthesis.gains:Monotone",
+        "the paper's Assumption 5 on a domain, as an SDP",
+        needs=("domain",),
+        takes=("coupling",),
+    ),
+    "robust-lqr": Entry(
+        "echelon.synthesis.gains:RobustLQR",
+        "one P for all Jacobians of a domain, as an SDP",
+        needs=("domain",),
+        takes=("Q", "R", "coupling", "exact"),
+    ),
+    "contraction": Entry(
+        "echelon.synthesis.gains:Contraction",
+        "weakest gain of a given rate on a domain",
+        needs=("domain", "rate"),
+        takes=("coupling", "exact"),
+    ),
+}
+DEFAULT_METHOD = "riccati"
+_ARGUMENTS = (key for entry in METHODS.values() for key in entry.needs + entry.takes)
+GAIN_KEYS = tuple(dict.fromkeys(("method", *_ARGUMENTS, "python", "file")))
+"""All keys of a gain, each once."""
+
+FOLLOWER_LAWS = {
+    "consensus": Entry(
+        "echelon.laws:Consensus",
+        "u = u_ff - c R^-1 g(x)^T P (e + d)",
+        takes=("gain", "feedforward", "trim", "frame"),
+    ),
+    "stopping-point": Entry(
+        "echelon.laws:StoppingPoint",
+        "agree on where each would come to rest; converges from anywhere",
+        takes=("roots", "rate", "coupling", "speed", "observer", "feedforward", "hears"),
+    ),
+    "agreement": Entry(
+        "echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"
+    ),
+    "passive": Entry("echelon.laws:TrimInput", "the trim input, nothing else"),
+}
+
+LEADER_LAWS = {
+    "tracking": Entry(
+        "echelon.laws:Tracking",
+        "flatness feed-forward and Riccati feedback on the reference",
+        takes=("gain",),
+    ),
+    "lqr": Entry("echelon.laws:PathLQR", "time-varying LQR along the reference, of any model"),
+    "optimal-tracking": Entry(
+        "echelon.simulation.optimal.leader:OptimalTracking",
+        "a plan of least tracking error, and feedback about it",
+        takes=("gain",),
+    ),
+    "stopping-point": Entry(
+        "echelon.laws:StoppingLeader",
+        "the followers' law of that name, led by the reference",
+        takes=("roots", "rate", "coupling", "speed", "observer"),
+    ),
+    "agreement": FOLLOWER_LAWS["agreement"],
+    "passive": FOLLOWER_LAWS["passive"],
+}
+
+GRAPHS = {
+    "path": "agents in a line, each linked to the next",
+    "ring": "a path whose ends are linked",
+    "star": "every agent linked to agent 0",
+    "complete": "every agent linked to every other",
+    "grid": "rows and columns, linked to the nearest four",
+    "geometric": "random points of the unit square, linked within a radius",
+}
+
+FORMATIONS = {
+    "triangle": "three agents in a triangle behind the leader",
+    "line": "agents in a straight line",
+    "wedge": "two arms behind the leader",
+    "circle": "agents on a circle around the leader",
+    "grid": "rows and columns",
+}
+
+INTEGRATORS = {
+    "rk4": "classical Runge-Kutta of order 4, input held over the step",
+    "euler": "x + dt (f + g u)",
+    "printed": "literal: Algorithm 1 as printed, x <- f + g u, no dt",
+}

@@ -1,0 +1,46 @@
+"""A scenario with all the files that it names, so that its folder alone repeats the run."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+from echelon.experiments.scenario.override import named_files
+from echelon.experiments.scenario.scenario import Scenario
+from echelon.experiments.scenario.yaml import KeyPath, dump_yaml
+
+
+def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]]:
+    """Return the YAML in which every named file lies in the folder `place` beside it.
+
+    With it come the names there, each with the file that belongs there. A scenario that names no
+    file is as it was, comments included.
+    """
+    data = copy.deepcopy(scenario.data)
+    files: dict[str, Path] = {}
+    for path, file, rest in list(named_files(data, ())):
+        source = (scenario.folder / file).resolve()
+        name = _free(f"{place}/{source.name}", source, files)
+        files[name] = source
+        _replace(data, path, name + rest)
+    return (dump_yaml(data) if files else scenario.text), files
+
+
+def files_of(scenario: Scenario) -> list[Path]:
+    """Return the file of a scenario and all that it names."""
+    return [scenario.file, *self_contained(scenario, "")[1].values()]
+
+
+def _free(name: str, source: Path, taken: dict[str, Path]) -> str:
+    """Return a name that no other file has, such as `inputs/2/gain.json`."""
+    folder, _, base = name.rpartition("/")
+    count = 1
+    while taken.get(name, source) != source:
+        count += 1
+        name = f"{folder}/{count}/{base}"
+    return name
+
+
+def _replace(data: Any, path: KeyPath, value: str) -> None:
+    for key in path[:-1]:
+        data = data[key]
+    data[path[-1]] = value

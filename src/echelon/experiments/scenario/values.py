@@ -1,0 +1,149 @@
+"""The kinds of value in a scenario file, each with its check, its sentence and its JSON schema.
+
+Numbers are real numbers only: neither truth values nor text that looks like a number. Values that
+are not finite pass here; they are refused for the whole file at once.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Literal, final
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    GetCoreSchemaHandler,
+    PlainValidator,
+    WithJsonSchema,
+)
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from echelon.experiments.scenario.yaml import are
+
+
+@final
+class Allowed:
+    """Marks a type of which one phrase says what is allowed, whichever part of it fails.
+
+    The names are what a misspelt word may have meant; the schema replaces the type's own.
+    """
+
+    def __init__(
+        self, phrase: str, names: Sequence[str] = (), schema: CoreSchema | None = None
+    ) -> None:
+        self.phrase, self.names, self.schema = phrase, names, schema
+
+    def __get_pydantic_core_schema__(
+        self, source: type, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.custom_error_schema(
+            self.schema or handler(source),
+            "allowed",
+            custom_error_message=self.phrase,
+            custom_error_context={"names": " ".join(self.names)},
+        )
+
+
+def Unit(text: str) -> Any:
+    """Mark a number with its SI unit, `1` where it has none; the schema and its page tell it."""
+    return Field(json_schema_extra={"unit": text})
+
+
+def OneOf(names: Iterable[str]) -> Allowed:
+    """Mark text that must be one of the names of a registry table."""
+    listed = list(names)
+    # `Literal[*names]` makes the same schema, and no type checker reads it
+    return Allowed(are(listed), listed, core_schema.literal_schema(listed))
+
+
+def OwnOr(names: Iterable[str]) -> Allowed:
+    """Mark what is a name of a registry table or a class of the user's own."""
+    listed = list(names)
+    return Allowed(f"{are(listed)}, or `python: file.py:Class`", listed)
+
+
+def _weighted(edge: object) -> object:
+    """Return an edge with its weight, 1 unless it is given."""
+    if not isinstance(edge, list) or len(edge) not in (2, 3):
+        raise PydanticCustomError("allowed", "is a pair `[i, j]` or a triple `[i, j, weight]`")
+    return (*edge, 1.0)[:3]
+
+
+def _refuse_loop(edge: tuple[int, int, float]) -> tuple[int, int, float]:
+    if edge[0] == edge[1]:
+        raise PydanticCustomError("allowed", "is an edge between two different agents")
+    return edge
+
+
+def _square(value: tuple[Any, ...]) -> tuple[tuple[float, ...], ...]:
+    """Return a square matrix as rows; a list of numbers is its diagonal."""
+    size = len(value)
+    if all(isinstance(number, float) for number in value):
+        return tuple(
+            tuple(number if i == j else 0.0 for j in range(size)) for i, number in enumerate(value)
+        )
+    if any(len(row) != size for row in value):
+        raise ValueError("not square")
+    return value
+
+
+def _numeric(value: object) -> object:
+    """Return a number or nested lists of numbers with lists as tuples."""
+    if isinstance(value, list):
+        return tuple(map(_numeric, value))
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        # the list may be long, so the message shows what is no number and not the whole list
+        allowed = "is a number or a nested list of numbers"
+        raise PydanticCustomError("allowed", allowed, {"got": value})
+    if isinstance(value, int) and abs(value) >= _WHOLE:
+        allowed = "is a whole number below 2^63, or one with an exponent, as `1e23`"
+        raise PydanticCustomError("allowed", allowed, {"got": value})
+    return value
+
+
+FolderName = Annotated[
+    str,
+    Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"),
+    Allowed("is text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"),
+]
+ClassInFile = Annotated[
+    str,
+    Field(pattern=r"^.+\.py:[A-Za-z_][A-Za-z0-9_]*$"),
+    Allowed("is a file and a class in it, as in `pendulum.py:Pendulum`"),
+]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+_WHOLE = 2**63
+"""The first whole number that NumPy and JAX do not know."""
+Count = Annotated[int, Field(ge=1, lt=_WHOLE)]
+Seed = Annotated[int, Field(ge=0, lt=_WHOLE)]
+Agent = Annotated[int, Field(ge=0, lt=_WHOLE)]
+Agents = Annotated[tuple[Agent, ...], Field(strict=False)]
+Edge = Annotated[
+    tuple[Agent, Agent, Positive],
+    BeforeValidator(
+        _weighted, json_schema_input_type=tuple[Agent, Agent] | tuple[Agent, Agent, Positive]
+    ),
+    AfterValidator(_refuse_loop),
+]
+Edges = Annotated[tuple[Edge, ...], Field(strict=False)]
+Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
+Speed = Annotated[
+    Literal["inf"] | Positive | Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)],
+    Allowed("is a positive number, a list of such, or `inf`", ["inf"]),
+]
+Matrix = Annotated[
+    Numbers | Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)],
+    AfterValidator(_square),
+]
+Array = Annotated[
+    Matrix, Allowed("is a list of numbers (the diagonal) or a list of as many rows as columns")
+]
+MatrixOrIdentity = Annotated[
+    Literal["identity"] | Matrix,
+    Allowed("is `identity`, a list of numbers (the diagonal) or a square matrix", ["identity"]),
+]
+Numeric = Annotated[Any, PlainValidator(_numeric), WithJsonSchema({"type": ["number", "array"]})]
+Parameters = Annotated[
+    str | dict[str, Any] | None,
+    Allowed("is the name of a set of parameters or a mapping from names to values"),
+]

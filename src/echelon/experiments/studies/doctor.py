@@ -1,0 +1,168 @@
+"""Self-checks of an installation: versions, devices, and whether the physics holds here."""
+
+import importlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models import ControlAffine, Pendulum, Quadrotor
+from echelon.agents.models.linearization import linearize
+from echelon.agents.models.model_check import check_model
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.references import Lemniscate
+from echelon.core import disk_cache, numerics
+from echelon.core.errors import ModelError
+from echelon.core.provenance import versions
+from echelon.experiments.results.metrics import metrics
+from echelon.experiments.scenario import registry
+from echelon.laws.consensus import Consensus
+from echelon.laws.tracking import Tracking
+from echelon.simulation.codegen import vectors
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.simulate import simulate
+from echelon.simulation.native.threads import processors
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.gains.gain import synthesize
+from echelon.synthesis.gains.riccati import Riccati
+
+
+class Check(NamedTuple):
+    """One self-check: what is claimed, whether it holds, and the number behind it."""
+
+    claim: str
+    holds: bool
+    found: str
+
+
+def facts() -> dict[str, str]:
+    """Return versions and devices."""
+    devices = ", ".join(
+        f"{device.platform}:{device.id} ({device.device_kind})" for device in jax.devices()
+    )
+    count = processors()
+    native = f"{vectors()}; {count} thread{'s' * (count != 1)}, as many as processors"
+    return {**versions(), "devices": devices, "native code": native}
+
+
+def checks() -> Iterator[Check]:
+    """Run the self-checks one after the other."""
+    tests: tuple[Callable[[], Check], ...] = (
+        _double_precision,
+        _precision_kept,
+        _models,
+        _spectra,
+        _order,
+        _flatness,
+        _closed_loop,
+    )
+    for test in tests:
+        # What an earlier command found says nothing of this machine as it is now.
+        with numerics.precision("float64"), disk_cache.opened(None):
+            check = test()
+        yield check
+
+
+def _double_precision() -> Check:
+    # In float32 it would be off by 1e-8.
+    third = float(jnp.asarray(1.0) / 3.0)
+    return Check(
+        "computing is in float64 without a flag",
+        third == 1.0 / 3.0,
+        f"1/3 is off by {abs(third - 1 / 3):.1g}",
+    )
+
+
+def _precision_kept() -> Check:
+    """Linearize in a float32 program."""
+    # Nobody else asks for this damping, so that no answer from before is handed out.
+    damping = 0.1234567890123
+    with numerics.precision("float32"):
+        found = linearize(Pendulum(damping=damping)).A
+        after = jnp.asarray(1.0).dtype
+    off = abs(float(found[1, 1]) + damping)
+    return Check(
+        "a float32 program gets float64 answers, and stays what it is",
+        off < 1e-15 and after == jnp.float32,
+        f"A is off by {off:.1g}, and JAX is in {after} after it",
+    )
+
+
+def _models() -> Check:
+    """Check every model of the list, by its own defaults where it has some."""
+    given = {"linear": {"A": ((0.0, 1.0), (0.0, 0.0)), "B": ((0.0,), (1.0,))}}
+    faults = []
+    for name, entry in registry.MODELS.items():
+        module, _, cls = entry.target.partition(":")
+        make: Callable[..., ControlAffine] = getattr(importlib.import_module(module), cls)
+        try:
+            check_model(make(**given.get(name, {})))
+        except ModelError as error:
+            faults.append(str(error))
+    return Check(
+        "every bundled model is finite, with its trim an equilibrium",
+        not faults,
+        " ".join(faults) or f"{len(registry.MODELS)} models",
+    )
+
+
+def _spectra() -> Check:
+    # The paper's tree. By hand: det(L - x) = (1 - x) (x^2 - 4 x + 1).
+    tree = Graph.from_edges([(0, 1), (1, 2), (1, 3)]).spectrum().eigenvalues
+    off = float(np.abs(tree - np.array([2.0 - np.sqrt(3.0), 1.0, 2.0 + np.sqrt(3.0)])).max())
+    return Check(
+        "the tree's grounded spectrum is 2 - sqrt 3, 1, 2 + sqrt 3",
+        off < 1e-12,
+        f"off by {off:.1g}",
+    )
+
+
+def _order() -> Check:
+    """Measure the order of the Runge-Kutta step on the pendulum."""
+    model, x, u = Pendulum(), jnp.array([1.0, 0.0]), jnp.zeros(1)
+
+    def end(steps: int) -> jax.Array:
+        step = lambda _, x: numerics.rk4(model.velocity, x, u, 1.0 / steps)  # noqa: E731
+        return jax.lax.fori_loop(0, steps, step, x)
+
+    coarse, fine, finest = (end(steps) for steps in (20, 40, 80))
+    # Halving a step divides the error by 2^4, but for its next order: 3.8 leaves room for that and
+    # none for order 3.
+    order = float(np.log2(jnp.linalg.norm(coarse - fine) / jnp.linalg.norm(fine - finest)))
+    return Check("the Runge-Kutta step has order 4", order > 3.8, f"measured {order:.2f}")
+
+
+def _flatness() -> Check:
+    """Compare the rate of the quadrotor's flat state with its dynamics."""
+    model, reference = Quadrotor.crazyflie(), Lemniscate()
+
+    t = jnp.asarray(1.3)
+    (x, u), (rate, _) = jax.jvp(partial(reference.follow, model), (t,), (jnp.ones_like(t),))
+    # An identity of the exact map, so that nothing but rounding may be left.
+    off = float(jnp.abs(rate - model.velocity(x, u)).max())
+    return Check(
+        "the quadrotor's flatness map solves its equations", off < 1e-9, f"residual {off:.1g}"
+    )
+
+
+def _closed_loop() -> Check:
+    model, graph = Quadrotor.crazyflie(), Graph.path(3)
+    formation = Formation.from_offsets(model, graph, {1: (1.0, 0.0, 0.0), 2: (2.0, 0.0, 0.0)})
+    follower = Consensus(synthesize(model, graph, Riccati()), feedforward="relay")
+    parts = Parts(
+        model,
+        graph,
+        formation,
+        Laws(Tracking(Lemniscate()), follower),
+        initial={"position": 0.5, "attitude": 0.2},
+    )
+    settings = Settings(horizon=30.0, dt=0.01, store_every=10, steady_window=2.0)
+    worst = metrics(simulate(parts, settings)).worst_steady or float("inf")
+    return Check(
+        "two followers join a flying leader", worst < 1e-6, f"{worst:.1g} m off after 30 s"
+    )

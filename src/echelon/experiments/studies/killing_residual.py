@@ -1,0 +1,73 @@
+"""How much the inputs themselves stretch distances, and so which theorem is to be had."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.compiled import program
+from echelon.core.statement import Line, Statement
+from echelon.core.types import Array, States
+from echelon.core.words import Kind, Verdict
+from echelon.guarantees.promises.promise import Promise
+from echelon.simulation.engine.parts import Parts
+from echelon.synthesis.certificates.domain import Domain
+from echelon.synthesis.certificates.jacobians import has_constant_input_map
+
+_SAMPLES = 400
+_NEAR = 0.5  # without a domain, g is looked at this far about the trim
+
+
+def killing_line(parts: Parts, promise: Promise) -> Statement:
+    """Return the Killing residual of g, on the domain of the gain if it has one."""
+    gain = parts.drive.gain
+    claim = None if gain is None else gain.certificate.region
+    domain = _near(parts.model) if claim is None else claim.domain
+    where = f"within {_NEAR:g} of the trim" if claim is None else "on the domain"
+    residual, kind = killing_residual(parts.model, promise.loop.closed.P, domain)
+    name, shown = Line.KILLING, f"{residual:.3g} 1/s"
+    if kind is Kind.PROOF:
+        text = f"g is constant {where}: a region is nonlocal (T1)"
+        return Statement(name, Verdict.HOLDS, kind, residual, shown, text)
+    text = f"per unit of input, {where}: g varies, so a region is local (T2)"
+    remedy = "a model with its inputs as states has constant g"
+    return Statement(name, Verdict.FAILS, kind, residual, shown, text, remedy)
+
+
+def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[float, Kind]:
+    """Return how fast one unit of an input stretches or shrinks distances in P, 1/s, and the kind.
+
+    It is half the largest eigenvalue, in size, of P^-1/2 (P dg_k + dg_k'P) P^-1/2 over the inputs k
+    and states of the domain, dg_k the derivative of column k of g S: the Lie derivative of the
+    metric, zero where that column is a Killing field. It is 0 by proof where a hull shows g to be
+    constant, and is else read off 400 states.
+    """
+    states, _ = domain.sample(_SAMPLES)
+    base = np.asarray(model.trim[0], float)
+    slopes = np.asarray(_input_slopes(model, jnp.asarray(base + states)))
+    # A hull takes a second, and one slope that is not zero says what it would.
+    if not slopes.any() and has_constant_input_map(model, domain):
+        return 0.0, Kind.PROOF
+    # P is symmetric, so that dg'P is the transpose of P dg.
+    weighted = P @ np.moveaxis(slopes, 2, 1)
+    # Any root of P^-1 gives the eigenvalues of P^-1 (P dg + dg'P), and Cholesky's costs least.
+    root = np.linalg.inv(np.linalg.cholesky(P))
+    values = np.linalg.eigvalsh(root @ (weighted + weighted.swapaxes(-1, -2)) @ root.T)
+    return 0.5 * float(np.abs(values).max()), Kind.SAMPLES
+
+
+@program
+def _input_slopes(model: ControlAffine, states: States) -> jax.Array:
+    """Return the derivatives of g S, (S, n, m, n)."""
+    return jax.vmap(jax.jacfwd(model.normalized_input_map))(states)
+
+
+def _near(model: ControlAffine) -> Domain:
+    """Return a box about the trim, inside the model's chart."""
+    n, m = len(model.state_names), len(model.input_names)
+    reach, trim = np.full(n, _NEAR), np.asarray(model.trim[0], float)
+    for name, (low, high) in model.chart.items():
+        k = model.state_names.index(name)
+        # Half way to the border of the chart, near which slopes may grow without bound.
+        reach[k] = min(_NEAR, 0.5 * (trim[k] - low), 0.5 * (high - trim[k]))
+    return Domain(-reach, reach, np.zeros(m), np.zeros(m))

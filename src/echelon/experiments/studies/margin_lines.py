@@ -1,0 +1,179 @@
+"""How far the loop near the trim is from losing what it promises."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from echelon.agents.models.linearization import trim_slopes
+from echelon.agents.models.model import ControlAffine
+from echelon.core.statement import Hypothesis, Line, Statement
+from echelon.core.types import Array
+from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.guarantees.promises.closed_loop import Loop
+from echelon.guarantees.promises.promise import Promise
+from echelon.guarantees.stopping.stopping_run import agreement_modes
+from echelon.laws.stopping_point import StoppingPoint
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.certificates import margins
+from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
+
+_KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
+_WIDE = 4
+"""Of lambda_max by lambda_min; beyond it little is left of the delay that could be borne."""
+_STIFF = 1e10
+"""Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
+
+
+def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
+    """Yield the margins of a loop that decays."""
+    loop = promise.loop
+    if parts.graph.schedule is not None:
+        yield from _turns_lines(promise)
+        return
+    if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
+        text = "any coupling; what delay is left depends on c and the graph alone"
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        yield from _stopping_lines(parts, settings)
+        return
+    if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
+        verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
+        if not promise.linear:
+            verdict, text = Verdict.VACUOUS, "the model bends at the trim, and has no modes there"
+        yield Statement(Line.MARGINS, verdict, _KIND, text=text)
+        return
+    stiffness = margins.stiffness(loop.closed)
+    if stiffness > _STIFF:
+        text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
+        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
+        return
+    low, high = margins.gain_margin(loop.closed)
+    shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
+    yield Statement(Line.GAIN, _HOLDS, _KIND, low, shown, text)
+    delay = margins.delay_margin(loop.closed)
+    shown = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
+    text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
+    yield Statement(Line.DELAY, _HOLDS, _KIND, delay.delay, shown, text)
+    low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
+    alike = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
+    yield _spread_line(low, high, delay.delay, alike)
+    yield _scaling_line(parts.model, loop)
+    # The bound of the network rests on a symmetric matrix.
+    yield from _push_lines(parts.model, loop) if loop.symmetric else ()
+    yield from _string_line(parts, loop)
+
+
+def _turns_lines(promise: Promise) -> Iterator[Statement]:
+    """Yield what is known of graphs that take turns: how weak the coupling may get (T8)."""
+    edge, lines = promise.edge, promise.hypotheses
+    anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
+    if not anywhere and edge is not None and not lines[Hypothesis.DECAYS].fails:
+        low = edge / promise.loop.closed.coupling
+        what = "factors on the coupling with which one P serves all graphs, whenever they switch"
+        yield Statement(Line.GAIN, _HOLDS, _KIND, low, f"{low:.3g} to inf", what)
+    text = "any coupling; " if anywhere else ""
+    text += "what delay is left is of one graph, and none is known for graphs that take turns"
+    yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+
+
+def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
+    """Warn where the graph makes its fastest mode many times as strong as its slowest.
+
+    Couplings are chosen for lambda_min, and what delay a mode bears falls with c lambda; `best` is
+    the delay that is left at lambda_min alone.
+    """
+    ratio, shown = high / low, f"{high / low:.3g}"
+    if not ratio > _WIDE:
+        text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
+        return Statement(Line.SPREAD, _HOLDS, _KIND, ratio, shown, text)
+    text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
+    text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
+    remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
+    return Statement(Line.SPREAD, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
+
+
+def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
+    """Yield what delay agreement bears where zeta' = -c L zeta: pi/2 - |arg lambda| by c |lambda|.
+
+    A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and reaches the axis first at that
+    delay.
+    """
+    law, dt = getattr(parts.drive, "follower", None), settings.dt
+    assert isinstance(law, StoppingPoint)
+    c, values = float(law.strength(dt)), agreement_modes(parts.graph, law)
+    delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
+    at, sizes = int(delays.argmin()), np.abs(values)
+    shown = f"{1e3 * delays[at]:.3g} ms"
+    text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"
+    yield Statement(Line.DELAY, _HOLDS, _KIND, float(delays[at]), shown, text)
+    best = 0.5 * np.pi / (c * float(np.real(values).min()))
+    yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
+
+
+def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
+    # The trim input, and an inner loop's, weaken with the rest.
+    slopes = trim_slopes(model) - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
+    worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
+    text, shown = (
+        "each input 30 % weaker or stronger (at these corners, not between them), as by a wrong "
+        "mass or inertia",
+        f"{worst:.3g} 1/s",
+    )
+    remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
+    return Statement(Line.SCALING, Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
+
+
+class _Push(NamedTuple):
+    """A disturbance w that enters by E (n, q), and the states that are watched."""
+
+    E: Array
+    where: str
+    watched: tuple[int, ...]
+
+
+def _push(model: ControlAffine) -> _Push:
+    """Return accelerations of a vehicle, or else of all states; positions, or else all states."""
+    n, groups = len(model.state_names), model.state_groups
+    # Wind is a force, and enters a vehicle's equations as an acceleration alone.
+    pushed = model.states_called("velocity") if "velocity" in groups else tuple(range(n))
+    names = ", ".join(f"`{model.state_names[k]}`" for k in pushed)
+    units = {model.state_units[k] for k in pushed}
+    unit = units.pop() if len(units) == 1 else ""
+    per = {"m/s": " m/s^2", "": ""}.get(unit, f" {unit}/s")
+    return _Push(np.eye(n)[:, pushed], f"1{per} on {names}", model.position_indices() or pushed)
+
+
+def _push_lines(model: ControlAffine, loop: Loop) -> Iterator[Statement]:
+    E, where, watched = _push(model)
+    units = {model.state_units[k] for k in watched}
+    unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
+
+    def line(name: Line, bounds: Array, text: str) -> Statement:
+        shown = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
+        worst, text = float(bounds[list(watched)].max()), f"{unit}per {where}: {text}; {loop.where}"
+        return Statement(name, _HOLDS, _KIND, worst, shown, text)
+
+    text = "no push of that norm on all followers together takes any farther"
+    yield line(Line.PUSHED, invariant_ellipsoid(loop.closed, E), text)
+    text = "the exact peak, for a push shaped like the worst eigenvector"
+    yield line(Line.PUSHED_MODE, peak_gain(loop.closed, E), text)
+
+
+def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
+    """On a tree with unit weights: what a chain of parents' inputs would amplify."""
+    graph = parts.graph
+    tree = len(graph.edges) == graph.agents - 1 and len(graph.leaders) == 1
+    tree = tree and graph.schedule is None
+    if not tree or not (graph.weights == 1.0).all() or loop.closed.coupling < 0.5:
+        return
+    gain = margins.string_gain(loop.closed).gain
+    depth = int(graph.depths().max())
+    shown = f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
+    # Heard one way, a branch is such a chain whatever is fed forward.
+    used = parts.drive.feedforward is Feedforward.PARENT or graph.directed
+    text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
+    if not used:
+        text = "what feeding forward the parent's input would amplify; it is not used here"
+    verdict = _HOLDS if used else Verdict.NOT_NEEDED
+    yield Statement(Line.STRING, verdict, _KIND, gain**depth, shown, text)

@@ -1,0 +1,73 @@
+"""What a promise is asked of."""
+
+from typing import NamedTuple
+
+from echelon.agents.models.linearization import at_trim
+from echelon.core.types import Array
+from echelon.core.words import Feedforward
+from echelon.guarantees.promises.closed_loop import Loop
+from echelon.guarantees.promises.frozen_laws import Frozen
+from echelon.guarantees.promises.leaders import Leaders
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.certificates.certificate import RegionCertificate
+from echelon.synthesis.certificates.domain import Domain
+
+
+class Case(NamedTuple):
+    """What a promise is asked of.
+
+    Attributes:
+        parts: what runs, prepared.
+        settings: how.
+        loop: the closed loop near the trim.
+        leaders: what they do by themselves.
+        region: what is promised on a domain; None for nothing.
+        beside: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
+            they could be found; else None.
+        frozen: the law along the leader's path and at the starts; None where it is not asked.
+    """
+
+    parts: Parts
+    settings: Settings
+    loop: Loop
+    leaders: Leaders
+    region: RegionCertificate | None
+    beside: Array | None
+    frozen: Frozen | None
+
+    @property
+    def domain(self) -> Domain | None:
+        """What the region speaks of; None without one."""
+        return None if self.region is None else self.region.domain
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the model has a linearization at its trim."""
+        return not at_trim(self.parts.model).bends.any()
+
+    @property
+    def governed(self) -> bool:
+        """Whether the followers run a law that a theorem speaks of, u = u_ff - c R^-1 g'P z."""
+        return self.parts.drive.metric(self.parts.model) is not None
+
+    @property
+    def fed_by_parents(self) -> bool:
+        """Whether each follower is sent the input of its parent."""
+        return self.parts.drive.feedforward is Feedforward.PARENT
+
+    @property
+    def matched(self) -> bool:
+        """Whether the followers are sent an input, or the leader has none beyond the trim."""
+        sent = self.parts.drive.feedforward is not Feedforward.NONE
+        return sent or self.leaders.rest or self.leaders.alike
+
+    @property
+    def disturbed(self) -> str:
+        """What acts that no promise covers, in words; empty without any."""
+        world = self.parts.world
+        found = {
+            "wind or noise acts on the agents": world.disturbance,
+            "the agents differ from the model": world.plant,
+        }
+        return " and ".join(text for text, what in found.items() if what is not None)

@@ -1,0 +1,125 @@
+"""The set of starts from which no follower leaves the domain of a promise."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.types import Array
+from echelon.core.words import Kind, Theorem, Verdict
+from echelon.guarantees.promises.leaders import Leaders, excursion, own_paths
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.certificates.certificate import RegionCertificate
+from echelon.synthesis.certificates.jacobians import has_constant_input_map
+
+
+class CertifiedSet(NamedTuple):
+    """{sum_i delta_i'P delta_i <= radius^2}, from which no follower leaves the domain.
+
+    Attributes:
+        radius: 0 where the set is empty, infinite where the domain bounds nothing.
+        kind: of the argument; samples where the leader's excursion is read off a run of its own.
+        why: what limits the radius, or why there is none.
+        remedy: what would make one; empty where there is one.
+    """
+
+    radius: float
+    kind: Kind
+    why: str
+    remedy: str = ""
+
+
+def certified_set(
+    parts: Parts, settings: Settings, leaders: Leaders, region: RegionCertificate | None
+) -> CertifiedSet | None:
+    """Return the set that a region of theorem T1 or A5 certifies, less the leader's excursion.
+
+    r^2 = min_j (margin_j - excursion_j)^2 / W_jj, W = P^-1. Where only the drift is known (A5) and
+    g varies, what cannot rise is V = delta'(L kron P) delta, which costs the factor
+    lambda_min / lambda_max.
+    """
+    if region is None or region.theorem is Theorem.T2:
+        return None
+    kind, free = region.kind, region.theorem is Theorem.A5
+    if free and not leaders.rest and not _constant(parts, region):
+        text = "g varies, and a leader that moves then adds to V"
+        return CertifiedSet(0.0, kind, text, "use a model whose g is constant")
+    trim = np.asarray(parts.model.trim[0], float)
+    if leaders.rest and (leaders.starts == trim).all():
+        return _less(parts, region, kind, np.zeros(len(trim)))
+    if leaders.answer:
+        text = "the leader reacts, so its excursion is not its own"
+        return CertifiedSet(0.0, kind, text, "set `leader.reacts: false`")
+    paths = own_paths(parts, settings, leaders.starts)
+    if paths is None:
+        text = "the leader alone diverges"
+        return CertifiedSet(0.0, kind, text, "give `leader.gain` another method")
+    return _less(parts, region, Kind.SAMPLES, excursion(parts, paths))
+
+
+def _less(parts: Parts, region: RegionCertificate, kind: Kind, away: Array) -> CertifiedSet:
+    """Return the set that is left when the leader goes so far from the trim, (n,)."""
+    gain, model = parts.drive.gain, parts.model
+    assert gain is not None
+    # Of angles that wind, differences are those of T1 only where agents are less than pi apart.
+    margins = np.minimum(region.domain.margins(), np.where(winding(model), 0.5 * np.pi, np.inf))
+    radii = np.maximum(margins - away, 0.0) / np.sqrt(np.diag(np.linalg.inv(gain.P)))
+    if not np.isfinite(radii).any():
+        return CertifiedSet(np.inf, region.kind, "everywhere: the domain bounds no state")
+    j = int(np.argmin(radii))
+    name, wide = model.state_names[j], margins[j]
+    if radii[j] == 0.0:
+        text = f"the leader alone reaches {away[j]:.3g} in `{name}`, and the domain {wide:.3g}"
+        return CertifiedSet(0.0, kind, text, "widen the domain, or slow the reference")
+    # On a directed graph a sum with weights falls, which one agent's share may exceed so much.
+    shrink = 1.0 / np.sqrt(parts.graph.spectrum().skew)
+    if region.theorem is Theorem.A5 and not _constant(parts, region):
+        shrink = np.sqrt(parts.graph.spectrum().proved / parts.graph.spectrum().high)
+    text = f"of sum_i delta_i'P delta_i <= r^2, limited by `{name}`: {wide:.3g}"
+    text += f" less {away[j]:.3g} of the leader" if away.any() else ", leader at the trim"
+    return CertifiedSet(float(shrink * radii[j]), kind, text)
+
+
+def winding(model: ControlAffine) -> Array:
+    """Return which states (n,) are angles, a whole turn of which is no difference."""
+    turns = 2.0 * np.pi * np.eye(len(model.state_names))
+    differences = np.stack([model.difference(jnp.asarray(x), jnp.zeros(len(x))) for x in turns])
+    return ~np.isclose(np.diag(differences), 2.0 * np.pi)
+
+
+def _constant(parts: Parts, region: RegionCertificate) -> bool:
+    return has_constant_input_map(parts.model, region.domain)
+
+
+def size_of(parts: Parts, states: Array) -> float:
+    """Return r of the set {sum_i delta_i'P delta_i = r^2} on which states (N, n) lie."""
+    gain = parts.drive.gain
+    assert gain is not None
+    y = states - parts.formation.offsets
+    delta = y - y[list(parts.graph.nearest_leader())]
+    return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
+
+
+def set_lines(
+    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
+) -> list[Statement]:
+    """Return the set as a line, and whether the starts (N, n) lie in it."""
+    if found is None:
+        local = region is not None and region.theorem is Theorem.T2
+        text = "T2 is local and certifies no set" if local else "needs a region"
+        return [
+            Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
+            for name in (Hypothesis.SET, Hypothesis.STARTS)
+        ]
+    size, radius, text, remedy = size_of(parts, states), found.radius, "", ""
+    shown, holds = f"radius {radius:.3g}" if radius else "empty", Verdict.of(radius > 0.0)
+    line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why, found.remedy)
+    text, holds = "from there no follower leaves the domain", Verdict.of(size <= radius)
+    if not size <= radius:
+        text, remedy = "what the set promises does not reach them", "start nearer to the goals"
+    shown = f"{size:.3g} of {radius:.3g}"
+    starts = Statement(Hypothesis.STARTS, holds, found.kind, size, shown, text, remedy)
+    return [line, starts]

@@ -1,0 +1,63 @@
+"""What a gain says of itself, compared with what is computed for what runs."""
+
+import numpy as np
+
+from echelon.agents.models.linearization import at_trim
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.words import Kind, Verdict
+from echelon.guarantees.promises.closed_loop import Loop, grounded_slowest
+from echelon.simulation.engine.parts import Parts
+from echelon.synthesis.certificates.certificate import RegionCertificate
+from echelon.synthesis.gains.gain import Gain
+
+_SAME = 1e-6
+"""Relative; less than that is rounding, or another library's eigenvalues."""
+_ROUNDING = 1e-9  # of the fastest mode, in the slowest
+
+
+def claims_line(parts: Parts, loop: Loop, found: RegionCertificate | None) -> Statement:
+    """Return whether the certificate that a gain carries is of what runs.
+
+    Args:
+        parts: what runs.
+        loop: near the trim.
+        found: what the gain's metric promises here where the leader's input is relayed.
+    """
+    gain = parts.drive.gain
+    if gain is None:
+        text = "there is no gain"
+        return Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, Kind.LINEARIZATION, text=text)
+    text = _difference(parts, gain, loop, found)
+    verdict, remedy = Verdict.of(not text), "what is promised here is computed anew" if text else ""
+    text = text or "they are of this model, graph and coupling"
+    return Statement(Hypothesis.CLAIMS, verdict, Kind.LINEARIZATION, text=text, remedy=remedy)
+
+
+def _difference(parts: Parts, gain: Gain, loop: Loop, found: RegionCertificate | None) -> str:
+    """Return the first difference in words; empty without any."""
+    claim, low = gain.certificate, parts.graph.spectrum().low
+    if abs(claim.lambda_min - low) > _SAME * low:
+        return (
+            f"the gain was made for lambda_min {claim.lambda_min:.4g}, and this graph has {low:.4g}"
+        )
+    slowest = grounded_slowest(gain, loop.linear, parts.graph)
+    fastest = float(np.abs(np.linalg.eigvals(loop.linear.A - loop.linear.B @ loop.gains[-1])).max())
+    bends = at_trim(parts.model).bends.any()
+    if not bends and abs(claim.abscissa - slowest) > _SAME * abs(slowest) + _ROUNDING * fastest:
+        return (
+            f"the gain says that its slowest mode is {claim.abscissa:.4g} 1/s, and this model at "
+            f"coupling {gain.coupling:.4g} has {slowest:.4g} 1/s"
+        )
+    if claim.edge is not None and loop.certificate.edge is None:
+        text = f"the gain says that every mode decays from coupling {claim.edge:.4g} on"
+        return f"{text}, and here its argument does not hold"
+    ours, theirs = _rate(found), _rate(claim.region)
+    return "" if ours == theirs else f"the gain says {theirs} on its domain, and here it is {ours}"
+
+
+def _rate(region: RegionCertificate | None) -> str:
+    """Return a promise on a domain in words, with the digits that are compared."""
+    if region is None:
+        return "nothing"
+    kind, theorem = region.kind, region.theorem
+    return f"{region.rate:.5g} 1/s ({kind}, {theorem})"

@@ -1,0 +1,229 @@
+"""The closed loop near the trim: the modes into which the disagreement splits."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from echelon.agents.models.linearization import Linearization, linearize
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.eigenvalues import in_order
+from echelon.agents.network.graph import Graph
+from echelon.agents.network.spectrum import Spectrum
+from echelon.core.linear import held_radius, longest_step
+from echelon.core.types import Array
+from echelon.core.words import Feedforward
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.certificates.certificate import Certificate, certify
+from echelon.synthesis.certificates.lmi import falls, rate_of
+from echelon.synthesis.certificates.margins import ClosedLoop, slowest_between
+from echelon.synthesis.gains.gain import Gain
+
+SHOWN = 32
+"""Of more eigenvalues of the graph than these, so many stand for all in the margins."""
+_FEW = 8  # modes that a longest step is sought with, the extreme ones among them
+_DENSE = 400
+_MANY = 1000
+"""As many complex eigenvalues as a circle of agents may have."""
+_SLACK = 1e-9
+"""Relative; what a solver leaves of the inequality behind an edge, which is often tight."""
+
+
+class Loop(NamedTuple):
+    """The law near the trim, on the graph that runs.
+
+    Attributes:
+        linear: A (with the inner loop closed) and B at the trim.
+        inner: (m, n), the inner loop K that is closed in A; zero without one.
+        closed: the modes that margins are taken of.
+        where: which eigenvalues of the graph those are, in words.
+        symmetric: whether they are of a symmetric matrix between followers' errors.
+        every: whether the modes of all eigenvalues of the graph decay, not only of those.
+        slowest: real part of the slowest mode, 1/s; of a large graph, of the modes looked at.
+        certificate: of the linearization.
+        common: the rate, 1/s, at which the sum of all delta_i'P delta_i falls near the trim on
+            every one of the graphs that take turns (T8), below 0 where it may rise; None where the
+            graph does not switch.
+    """
+
+    linear: Linearization
+    inner: Array
+    closed: ClosedLoop
+    where: str
+    symmetric: bool
+    every: bool
+    slowest: float
+    certificate: Certificate
+    common: float | None = None
+
+    @property
+    def gains(self) -> Array:
+        """What acts on the state in each mode, inner loop included, (K, m, n)."""
+        return self.inner + self.closed.strengths[:, None, None] * self.closed.K
+
+    @property
+    def eigenvalues(self) -> Array:
+        """Of the graph, (K,): those whose modes were looked at."""
+        return self.closed.strengths / self.closed.coupling
+
+    @property
+    def poles(self) -> Array:
+        """Of each mode looked at, (K, n)."""
+        A, B = self.linear
+        return np.linalg.eigvals(A - self.closed.strengths[:, None, None] * (B @ self.closed.K))
+
+    def radius(self, settings: Settings) -> float:
+        """Return the largest spectral radius of a step of the integrator that runs."""
+        A, B = self.open
+        return held_radius(A, B, self.gains, settings.dt, settings.integrator)
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) of that integrator with which every mode decays."""
+        A, B = self.open
+        few = telling(self.closed.strengths, _FEW)
+        return longest_step(A, B, self.gains[few], settings.integrator)
+
+    @property
+    def open(self) -> Linearization:
+        """A and B without any loop."""
+        return Linearization(self.linear.A + self.linear.B @ self.inner, self.linear.B)
+
+
+class Modes(NamedTuple):
+    """What the disagreement splits by.
+
+    Attributes:
+        spectrum: the eigenvalues that the feed-forward leaves.
+        symmetric: whether they are of the grounded Laplacian, which is.
+        what: they are, in words.
+    """
+
+    spectrum: Spectrum
+    symmetric: bool
+    what: str = "eigenvalues"
+
+
+def loop_of(parts: Parts) -> Loop:
+    """Return the closed loop of prepared parts."""
+    model, gain = parts.model, parts.drive.gain
+    n, m = len(model.state_names), len(model.input_names)
+    P, R, c, inner = parts.drive.metric(model), np.eye(m), 1.0, None
+    P = np.eye(n) if P is None else P
+    if gain is not None:
+        R, c, inner = gain.R, gain.coupling, gain.inner
+    linear, modes = linearize(model).with_inner(inner), modes_of(parts)
+    edge = None if gain is None else _edge(gain, linear, modes.spectrum.low)
+    certificate = certify(linear, modes.spectrum, P, R, c, edge)
+    values, where = _representatives(modes)
+    closed, slowest = ClosedLoop(*linear, P, R, c, values), certificate.abscissa
+    if certificate.modes < modes.spectrum.total:
+        slowest = max(slowest, slowest_between(closed))
+    inner = np.zeros((m, n)) if inner is None else inner
+    common = None
+    if parts.graph.schedule is not None and gain is not None:
+        common = _common(parts, gain, linear)
+    every = slowest < 0.0
+    return Loop(linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common)
+
+
+def _common(parts: Parts, gain: Gain, linear: Linearization) -> float:
+    """Return at what rate one P serves all graphs that take turns."""
+    weakest = parts.graph.spectrum().proved
+    if not weakest > 0.0 or all_alike(parts.drive, parts.model):
+        return -np.inf
+    return rate_of(gain.P, linear.A[None], linear.B, gain.R, 2.0 * gain.coupling * weakest)
+
+
+def modes_of(parts: Parts) -> Modes:
+    """Return what the disagreement of prepared parts splits by.
+
+    Where the leaders obey the followers' law, nobody is grounded: the disagreement obeys the
+    Laplacian of all agents, whose eigenvalues but 0 lie above the least of the grounded one and,
+    by Anderson and Morley, below the largest sum of two neighbours' degrees. On a directed graph
+    neither is known, and all are computed.
+    """
+    graph = parts.graph
+    if parts.drive.feedforward is Feedforward.PARENT:
+        return Modes(graph.parent_spectrum(), False, "edges' weights")
+    if not all_alike(parts.drive, parts.model):
+        return Modes(graph.spectrum(), not graph.directed and graph.schedule is None)
+    if graph.directed:
+        return Modes(_of_all(graph), False)
+    if graph.agents <= _DENSE:
+        whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
+        return Modes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
+    degrees = graph.laplacian().diagonal()
+    ends = np.array([graph.spectrum().low, degrees[graph.edges].sum(axis=1).max()])
+    return Modes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
+
+
+def _of_all(graph: Graph) -> Spectrum:
+    """Return the eigenvalues of the Laplacian of all agents of a directed graph, but for one 0.
+
+    The disagreement between agents has a mode for each of them; another 0 is one that never ends.
+    """
+    values = np.linalg.eigvals(graph.laplacian().toarray()).astype(complex)
+    values = in_order(np.delete(values, np.abs(values).argmin()))
+    return Spectrum(values, len(values), 0.0)
+
+
+def all_alike(drive: Drive, model: ControlAffine) -> bool:
+    """Tell whether the leaders obey the followers' law, with nothing fed forward."""
+    leader, follower = getattr(drive, "leader", None), getattr(drive, "follower", None)
+    same = leader is not None and type(leader) is type(follower)
+    silent = drive.feedforward is Feedforward.NONE and drive.metric(model) is not None
+    return same and silent and bool(eqx.tree_equal(leader, follower))
+
+
+def _edge(gain: Gain, linear: Linearization, low: float) -> float | None:
+    """Return the coupling from which on the gain's own argument holds here; None without one.
+
+    The argument is P A + A'P - rho P B R^-1 B'P <= 0 at a strength rho = 2 c lambda that is the
+    gain's own; it is looked at again with this A and B.
+    """
+    claim = gain.certificate
+    if claim.edge is None or not low > 0.0:
+        return None
+    rho = 2.0 * claim.edge * claim.lambda_min
+    closed = linear.A - 0.5 * rho * linear.B @ gain.R_inverse @ linear.B.T @ gain.P
+    return 0.5 * rho / low if falls(gain.P, closed[None], _SLACK) else None
+
+
+def grounded_slowest(gain: Gain, linear: Linearization, graph: Graph) -> float:
+    """Return the slowest mode, 1/s, as a gain's own certificate has it."""
+    return certify(linear, graph.spectrum(), gain.P, gain.R, gain.coupling, None).abscissa
+
+
+def telling(values: Array, count: int) -> Array:
+    """Return the places of so many eigenvalues (K,), spread evenly, and of those at an extreme.
+
+    Of complex ones those count too that are the largest, lean the most, or are left the least
+    delay, (pi/2 - |arg lambda|) / |lambda|: of each, the first few.
+    """
+    few = np.linspace(0, len(values) - 1, count).astype(int)
+    if not np.iscomplexobj(values):
+        return np.unique(few)
+    size, lean = np.maximum(np.abs(values), 1e-300), np.abs(np.angle(values))
+    marks = (-size, -np.abs(np.imag(values)), -lean, (0.5 * np.pi - lean) / size)
+    return np.unique([*few, *(k for mark in marks for k in np.argsort(mark)[: count // 2])])
+
+
+def _representatives(modes: Modes) -> tuple[Array, str]:
+    """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
+    (values, total, *_), _, what = modes
+    if np.iscomplexobj(values):
+        # The modes of a conjugate pair mirror each other.
+        values = np.unique(values[np.imag(values) >= 0.0])
+        # A pair in the midst may need the shortest step, so all are looked at where they can be.
+        few = telling(values, _MANY)
+        which = "all" if len(few) == len(values) else f"{len(few)}, the extreme ones among them,"
+        return values[few], f"{which} {what} of the graph, one of each pair"
+    if len(values) < total:
+        between = np.geomspace(values[0], values[-1], SHOWN)
+        return between, f"lambda_min, lambda_max and {SHOWN - 2} values between them"
+    if total <= SHOWN:
+        return values, f"all {what} of the graph"
+    places = np.linspace(0, total - 1, SHOWN).round().astype(int)
+    return values[places], f"{SHOWN} of {total} {what}, the extreme ones among them"

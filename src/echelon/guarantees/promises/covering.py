@@ -1,0 +1,88 @@
+"""Whether what a theorem promises covers a run: where it started, and whether it stayed inside."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from echelon.core.statement import Hypothesis
+from echelon.core.types import Array
+from echelon.core.words import Kind, Theorem
+from echelon.guarantees.promises.promise import Promise
+from echelon.simulation.engine.result import Result
+
+_EDGE = 1e-9  # relative; a state that rests on a bound has not left it
+
+
+class Exit(NamedTuple):
+    """Who was outside of the domain first, at which stored time (s), in which state or input."""
+
+    time: float
+    agent: int
+    name: str
+
+
+def coverage(result: Result, promise: Promise) -> Iterator[str]:
+    """Say of a theorem's promise whether a run kept to what it rests on."""
+    if promise.theorem is None or not len(result.times):
+        return
+    what = "proof" if promise.kind is Kind.PROOF else "promise on the domain"
+    left = None if promise.region is None else first_exit(result, promise)
+    limited = float(result.saturated.max())
+    against, remedy = promise.without, "leave it out to see what it costs"
+    if left is not None:
+        against = f"agent {left.agent} left the domain at {left.time:.4g} s (`{left.name}`)"
+        remedy = "widen the `domain`, start nearer to the goals, or slow the reference"
+    elif limited:
+        against = f"a limit acted on an agent in {100.0 * limited:.3g} % of the steps"
+        remedy = "start nearer to the goals, or slow the reference"
+    if against:
+        yield f"The {what} does not cover this run: {against}; {remedy}."
+    else:
+        yield f"The {what} covers this run: {_stayed(promise)}."
+
+
+def _stayed(promise: Promise) -> str:
+    """Return why a run is covered that stayed in the domain."""
+    if promise.theorem is Theorem.T5:
+        return f"no limit acted, and from these starts {promise.hypotheses[Hypothesis.STARTS].text}"
+    if promise.theorem is Theorem.T2:
+        return "the leader stayed in the domain, and small errors about it shrink"
+    starts = promise.hypotheses[Hypothesis.STARTS]
+    if starts.fails:
+        text = f"the starts lie outside of the certified set ({starts.shown}), but all agents "
+        return f"{text}stayed in the domain at every stored frame"
+    return (
+        f"the starts lie in the certified set ({starts.shown}), and all agents stayed in the domain"
+    )
+
+
+def first_exit(result: Result, promise: Promise) -> Exit | None:
+    """Return who leaves the domain first, its offset aside; None where nobody does.
+
+    T1 and A5 ask it of all agents. T2 asks it of the leaders, and of their inputs, with which the
+    slopes of a varying g count.
+    """
+    region, model, graph = promise.region, result.model, result.graph
+    assert region is not None
+    domain, leads, local = region.domain, list(graph.leaders), promise.theorem is Theorem.T2
+    who = leads if local else list(range(graph.agents))
+    x = (result.states - result.formation.offsets)[:, who] - np.asarray(model.trim[0], float)
+    found = [_outside(result, x, (domain.lower, domain.upper), who, model.state_names)]
+    if local:
+        v = model.normalized(result.inputs[:, leads])
+        box = (domain.input_lower, domain.input_upper)
+        found.append(_outside(result, v, box, leads, model.input_names))
+    return min((each for each in found if each is not None), default=None)
+
+
+def _outside(
+    result: Result, values: Array, box: tuple[Array, Array], who: list[int], names: tuple[str, ...]
+) -> Exit | None:
+    """Return the first of values (T, K, k) outside of a box."""
+    low, high = (bound + _EDGE * sign * np.abs(bound) for bound, sign in zip(box, (-1.0, 1.0)))
+    out = np.argwhere((values < low) | (values > high))
+    if not len(out):
+        return None
+    frame, place, k = out[0]
+    return Exit(float(result.times[frame]), who[place], names[k])

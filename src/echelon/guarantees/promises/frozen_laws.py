@@ -1,0 +1,311 @@
+"""The laws frozen at states away from the trim: along the leader's path, and where agents start.
+
+Behind a leader at x(t) small errors obey delta' = (A - lambda B K) delta with A, B and K those of
+x(t), and split by the eigenvalues of the graph as they do at the trim. What these do in turn, each
+for as long as it is the nearest sample, is a sign and no proof.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.heading import state_turn
+from echelon.agents.models.model import ControlAffine
+from echelon.core import linear
+from echelon.core.compiled import program
+from echelon.core.linear import exponential, held_radius, held_step
+from echelon.core.types import Array, Input, State, States
+from echelon.core.words import Feedforward
+from echelon.guarantees.promises.closed_loop import Loop, telling
+from echelon.guarantees.promises.leader_path import MOMENTS, Route, Rows, route_of
+from echelon.guarantees.promises.leaders import Leaders
+from echelon.laws.law import Law, LocalView, gain_of, without_certificates
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+
+_STARTS = 64
+"""Starts that are looked at, with the moments of the path one shape for the compiler."""
+_MODES = 8  # of the graph, the extreme ones among them
+_HARDEST = 8  # states with the fastest modes, which a longest step is sought with
+_TENFOLD = float(np.log(10.0))
+
+
+class Growth(NamedTuple):
+    """What small errors do along a path.
+
+    Attributes:
+        rate: at which they grow over all of it, 1/s; below 0 where they shrink.
+        most: ln of how often they multiply in the part of it that is worst for them.
+        when: s, where they grow fastest.
+        whose: errors they are.
+    """
+
+    rate: float
+    most: float
+    when: float
+    whose: str
+
+    @property
+    def lost(self) -> bool:
+        """Whether they grow over all of it, or tenfold in a part."""
+        return not (self.rate < 0.0 and self.most < _TENFOLD)
+
+
+class Slopes(NamedTuple):
+    """An agent's motion about K states, and what its law feeds back there in L modes.
+
+    Attributes:
+        A: (K, n, n), with the input held.
+        B: (K, n, m), of physical inputs.
+        gains: (K, L, m, n).
+    """
+
+    A: Array
+    B: Array
+    gains: Array
+
+    def modes(self) -> Array:
+        """Return the eigenvalues of all loops, (K, L, n)."""
+        return np.linalg.eigvals(self.A[:, None] - self.B[:, None] @ self.gains)
+
+    def stable(self) -> "Slopes":
+        """Return those that decay if the input is not held: no step helps the others."""
+        return Slopes(*(part[self.growth() < 0.0] for part in self))
+
+    def growth(self) -> Array:
+        """Return the slowest mode about each state, (K,), 1/s."""
+        return np.real(self.modes()).max(axis=(1, 2))
+
+    def along(self, times: Array, whose: str) -> Growth:
+        """Return what errors do where these follow each other at times (K,)."""
+        span, slowest = float(times[-1] - times[0]) / max(1, len(times) - 1), self.growth()
+        # The largest sum of neighbours (Kadane): what grows before and shrinks after is left out.
+        most = sums = 0.0
+        for each in span * slowest:
+            sums = max(0.0, sums + float(each))
+            most = max(most, sums)
+        when = float(times[slowest.argmax()])
+        return Growth(self._exponent(span), most, when, whose)
+
+    def _exponent(self, span: float) -> float:
+        """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
+        J = self.A[:, None] - self.B[:, None] @ self.gains
+        each = exponential(span * J)
+        product, logs = each[0], np.zeros(J.shape[1])
+        for flow in each[1:]:
+            sizes = np.linalg.norm(product, axis=(1, 2))
+            # Sizes apart, since a product of two hundred would be beyond all numbers.
+            logs += np.log(sizes)
+            product = flow @ (product / sizes[:, None, None])
+        radii = np.abs(np.linalg.eigvals(product)).max(axis=1)
+        return float((logs + np.log(radii)).max() / (span * len(J)))
+
+    def hardest(self) -> "Slopes":
+        """Return the few states about which modes are fastest."""
+        fastest = np.abs(self.modes()).max(axis=(1, 2))
+        few = np.argsort(fastest)[-_HARDEST:]
+        return Slopes(*(part[few] for part in self))
+
+    def radius(self, settings: Settings) -> float:
+        """Return the largest spectral radius of a step of the integrator that runs; 0 of none."""
+        if not len(self.A):
+            return 0.0
+        A, B, gains = self.A[:, None], self.B[:, None], self.gains
+        return held_radius(A, B, gains, settings.dt, settings.integrator)
+
+    def decaying(self, settings: Settings) -> Array:
+        """Return about which states, (K,), held steps decay wherever the loops themselves do."""
+        A, B, gains = self.A[:, None], self.B[:, None], self.gains
+        F, G = held_step(A, B, settings.dt, settings.integrator)
+        radii = np.abs(np.linalg.eigvals(F - G @ gains)).max(axis=(1, 2))
+        return (self.growth() >= 0.0) | (radii < 1.0)
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) with which every loop decays; infinite of none."""
+        if not len(self.A):
+            return float("inf")
+        A, B, gains = self.hardest()
+        return linear.longest_step(A[:, None], B[:, None], gains, settings.integrator)
+
+
+class Frozen(NamedTuple):
+    """The laws frozen away from the trim.
+
+    Attributes:
+        times: (K,) s; none where the leader rests at its trim or follows no known path.
+        along: the followers' law along the leader's path.
+        leader: the leader's own law there; None where it is not known.
+        starts: the followers' law where agents start.
+        blamed: what takes the law out of where it stabilizes, in words; empty where nothing does.
+        turns: the least and the largest rate of the heading along the path, rad/s, in whose axes
+            all slopes are; none where it does not turn, or the law does not.
+    """
+
+    times: Array
+    along: Slopes
+    leader: Slopes | None
+    starts: Slopes
+    blamed: str
+    turns: tuple[float, ...] = ()
+
+    @property
+    def travelled(self) -> tuple[Slopes, ...]:
+        """The laws along the path; none where there is no path."""
+        both = (self.along, self.leader)
+        return tuple(each for each in both if each is not None) if len(self.times) else ()
+
+    def radii(self, settings: Settings) -> tuple[float, float]:
+        """Return the largest spectral radius of a step along the path, and where agents start."""
+        along = (each.stable().radius(settings) for each in self.travelled)
+        return max(along, default=0.0), self.starts.stable().radius(settings)
+
+    def growth(self) -> Growth:
+        """Return what errors do along the path, of those who do worse."""
+        found = (
+            each.along(self.times, who)
+            for each, who in zip(self.travelled, ("followers'", "leader's"))
+        )
+        return max(found, key=lambda one: (one.lost, one.rate))
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) with which the laws decay wherever they are frozen."""
+        all_ = (*self.travelled, self.starts)
+        return min(each.stable().longest_step(settings) for each in all_)
+
+
+def longest_step(loop: Loop, frozen: Frozen | None, settings: Settings) -> float:
+    """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
+    steps = [loop.longest_step(settings)]
+    # The printed step is of Algorithm 1 as it stands, and never made shorter.
+    if frozen is not None and settings.integrator != "printed":
+        steps.append(frozen.longest_step(settings))
+    return min(steps)
+
+
+def frozen_of(
+    parts: Parts, settings: Settings, loop: Loop, leaders: Leaders, states: Array
+) -> Frozen | None:
+    """Return the laws of prepared parts frozen where they go, agents starting in states (N, n).
+
+    None where nobody leaves the trim, or the agents obey no law that is known.
+    """
+    trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
+    if not isinstance(parts.drive, Laws):
+        return None
+    path = route_of(parts, settings, leaders)
+    if not len(path.times) and (starts == trim).all():
+        return None
+    few = starts[_few(starts)]
+    both = zip(path.rows, path.at_start(parts.model, few), strict=True)
+    rows = Rows._make(map(np.concatenate, both))
+    count, all_ = len(path.times), _followers(parts, loop, rows)
+    along, begun = (Slopes(*(x[part] for x in all_)) for part in (slice(count), slice(count, None)))
+    turns = path.extreme_rates()
+    own = _leader(parts, path.own_headings(parts), along)
+    found = Frozen(path.times, along, own, begun, "", turns)
+    if not count or not found.growth().lost:
+        return found
+    return found._replace(blamed=_blamed(parts, loop, path, found))
+
+
+def frozen_at(
+    parts: Parts, settings: Settings, loop: Loop, leaders: Leaders, states: Array
+) -> Slopes:
+    """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
+
+    They are those of `frozen_of`, the same number of each run after the other.
+    """
+    starts = states - parts.formation.offsets
+    starts = starts[:, _few(starts[0])]
+    path = route_of(parts, settings, leaders)
+    rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
+    size = MOMENTS + _STARTS
+    found = [
+        _followers(parts, loop, Rows._make(part[k : k + size] for part in rows))
+        for k in range(0, len(rows.times), size)
+    ]
+    return Slopes._make(map(np.concatenate, zip(*found, strict=True)))
+
+
+def _few(starts: Array) -> Array:
+    """Return which agents' starts (N, n) are looked at."""
+    return np.unique(np.linspace(0, len(starts) - 1, _STARTS).astype(int))
+
+
+# ---- the laws there -----------------------------------------------------------------------------
+
+
+def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
+    """Return the followers' law about each agent's state, in a few modes of the graph."""
+    assert isinstance(parts.drive, Laws)
+    count = len(rows.times)
+    more = MOMENTS + _STARTS - count
+    # Rows of one number, so that every path and every swarm is compiled once.
+    full = (np.concatenate([part, np.repeat(part[-1:], more, axis=0)]) for part in rows)
+    law = without_certificates(parts.drive.follower)
+    found = _about(parts.model, law, *[*full][:4])
+    A, B, alone, felt = (np.asarray(part)[:count] for part in found)
+    if rows.rates.any():
+        # In axes that turn, delta turns the other way by itself.
+        A = A - rows.rates[:, None, None] * state_turn(parts.model).slope
+    values = loop.closed.eigenvalues
+    few = values[telling(values, _MODES)]
+    return Slopes(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
+
+
+@program
+def _about(
+    model: ControlAffine, law: Law, t: jax.Array, x: States, v: jax.Array, y: States
+) -> tuple[jax.Array, ...]:
+    """Return A, B, and what the law feeds back of the state and of the disagreement (K, m, n)."""
+    # Rows stand in the axes of the heading already.
+    law = law.facing(jnp.zeros((), x.dtype)) if law.turning else law
+
+    def one(t: jax.Array, x: State, v: Input, y: State) -> tuple[jax.Array, ...]:
+        silent, sent = law.feedforward is Feedforward.NONE, jnp.zeros_like(v)
+        sent = sent if silent else law.broadcast(model, x, v)
+
+        def act(s: State, strength: jax.Array) -> tuple[Input, Input]:
+            view = LocalView(t, s, jnp.zeros_like(y), strength * model.difference(s, y), sent)
+            u = law.update(model, view, law.init())[0]
+            return u, u
+
+        # Both strengths by one trace, which is most of what this costs.
+        slope = jax.vmap(jax.jacfwd(act, has_aux=True), (None, 0))
+        (alone, both), (u, _) = slope(y, jnp.arange(2.0))
+        A = jax.jacfwd(lambda s: model.velocity(s, u))(y)
+        return A, model.input_map(y), -alone, alone - both
+
+    return jax.vmap(one)(t, x, v, y)
+
+
+def _leader(parts: Parts, headings: Array, along: Slopes) -> Slopes | None:
+    """Return the leader's own law along its path; None where it has no gain."""
+    assert isinstance(parts.drive, Laws)
+    model, gain = parts.model, gain_of(parts.drive.leader)
+    if gain is None:
+        return None
+    S, P = np.asarray(model.input_scale, float), gain.P
+    if headings.any():
+        D = exponential(headings[:, None, None] * state_turn(model).slope)
+        P = D @ P @ np.swapaxes(D, 1, 2)
+    fed_back = gain.coupling * S @ gain.R_inverse @ S.T @ np.swapaxes(along.B, 1, 2) @ P
+    return along._replace(gains=fed_back[:, None])
+
+
+def _blamed(parts: Parts, loop: Loop, path: Route, found: Frozen) -> str:
+    """Return the state whose return to the trim helps most where the law is worst, in words."""
+    assert isinstance(parts.drive, Laws)
+    model, trim = parts.model, np.asarray(parts.model.trim[0], float)
+    n, k = len(trim), int(np.flatnonzero(path.times == found.growth().when)[0])
+    there = np.tile(path.states[k], (n, 1))
+    np.fill_diagonal(there, trim)
+    here = Rows(*(np.repeat(part[k : k + 1], n, axis=0) for part in path.rows))
+    slopes = _followers(parts, loop, here._replace(leaders=there, states=there))
+    own = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
+    growth = slopes.growth() if own is None else np.maximum(slopes.growth(), own.growth())
+    j = int(growth.argmin())
+    return f"`{model.state_names[j]}` {path.states[k, j]:.3g} {model.state_units[j]}".rstrip()

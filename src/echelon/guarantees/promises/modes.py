@@ -1,0 +1,200 @@
+"""What a promise asks of the law's modes: near the trim, along the leader's path, in held steps."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from echelon.core.linear import held_radius
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.words import Kind, Theorem, Verdict
+from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.frozen_laws import longest_step
+from echelon.guarantees.promises.turning import turning
+from echelon.simulation.engine.law_drive import Laws
+from echelon.synthesis.certificates.margins import detectability
+
+_LINEAR = Kind.LINEARIZATION
+_BENT = "the model bends at the trim, and has no modes there"
+
+
+def modes(case: Case) -> Iterator[Statement]:
+    """Yield what a promise rests on near the trim, as the model has modes there or bends."""
+    yield from _linear(case) if case.smooth or not case.governed else _bent(case)
+
+
+def _linear(case: Case) -> Iterator[Statement]:
+    yield _detectable(case)
+    yield _coupled(case)
+    yield _decaying(case)
+    yield _along(case)
+    yield from turning(case)
+    yield held(case)
+    if case.parts.graph.schedule is not None:
+        yield _taking_turns(case)
+
+
+# ---- where the model bends ----------------------------------------------------------------------
+
+
+def _bent(case: Case) -> Iterator[Statement]:
+    """Yield what is left of these lines where there is no linearization: what a region says."""
+    for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLED, Hypothesis.ALONG):
+        yield Statement(name, Verdict.VACUOUS, _LINEAR, text=_BENT)
+    region = case.region
+    if region is None or region.theorem is Theorem.A5:
+        yield Statement(Hypothesis.DECAYS, Verdict.VACUOUS, _LINEAR, text=_BENT)
+    else:
+        text = "by the slopes of all sides of the trim, where the model bends"
+        rate, shown = -region.rate, f"{-region.rate:.3g} 1/s"
+        yield Statement(Hypothesis.DECAYS, Verdict.HOLDS, region.kind, rate, shown, text)
+    yield _held_beside(case)
+
+
+def _held_beside(case: Case) -> Statement:
+    """Whether each side of a bend decays in steps of the integrator, as if it were all around."""
+    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
+    shown = f"dt {settings.dt:g} s"
+    if case.region is None or case.beside is None:
+        return Statement(name, Verdict.VACUOUS, Kind.SAMPLES, None, shown, _BENT)
+    A, dt = case.beside[:, None], settings.dt
+    radius = held_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
+    text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
+    if radius < 1.0:
+        return Statement(name, Verdict.HOLDS, Kind.SAMPLES, radius, shown, text)
+    text, remedy = f"the step `dt` = {dt:g} s is too long for this gain: {text}", "shorten "
+    remedy = f"{remedy}`simulation.dt`, or lower the gain"
+    reason = "with the input held over the step `dt` it grows"
+    return Statement(name, Verdict.FAILS, Kind.SAMPLES, radius, shown, text, remedy, reason)
+
+
+# ---- where it has a linearization ---------------------------------------------------------------
+
+
+def _detectable(case: Case) -> Statement:
+    model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
+    if not case.governed:
+        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, text="there is no P")
+    rank, n = loop.certificate.observable, len(model.state_names)
+    hidden = detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
+    names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
+    along = ", ".join(f"`{model.state_names[k]}`" for k in names)
+    text, remedy = "z = 0 is reached", ""
+    if hidden:
+        text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} "
+        text, remedy = f"{text}it does not decay by itself", "choose another P"
+    verdict = Verdict.of(not hidden)
+    return Statement(name, verdict, _LINEAR, rank, f"rank {rank} of {n}", text, remedy)
+
+
+def _coupled(case: Case) -> Statement:
+    edge, c = case.loop.certificate.edge, case.loop.closed.coupling
+    if edge is None:
+        text = "no edge known"
+        return Statement(Hypothesis.COUPLED, Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
+    fine, shown = c >= edge, f"c {c:.4g}, edge {edge:.4g}"
+    text, remedy = (
+        "from the edge on every mode decays: near the trim, of linear agents anywhere",
+        "",
+    )
+    if not fine:
+        text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
+        remedy = f"raise `coupling` to {edge:.4g} or more"
+    return Statement(Hypothesis.COUPLED, Verdict.of(fine), Kind.PROOF, c, shown, text, remedy)
+
+
+def _decaying(case: Case) -> Statement:
+    """Whether every mode of the network decays; `every` covers what lies between extremes."""
+    name, loop, remedy, reason = Hypothesis.DECAYS, case.loop, "", ""
+    if not case.governed:
+        law = isinstance(case.parts.drive, Laws)
+        text = "the followers' law does not act on the disagreement"
+        text = text if law else f"no theorem is known of `{type(case.parts.drive).__name__}`"
+        remedy = "use `consensus`" if law else "use laws, which theorems speak of"
+        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
+    text = f"over {loop.certificate.modes} eigenvalues of the graph"
+    if case.fed_by_parents:
+        text = "over the edges' weights, as parents' inputs are fed forward"
+    elif len(loop.closed.eigenvalues) > loop.certificate.modes:
+        text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
+    if not loop.every:
+        remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
+        reason = "the disagreement does not decay"
+    verdict, shown = Verdict.of(loop.every), f"{loop.slowest:.3g} 1/s"
+    return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)
+
+
+def _taking_turns(case: Case) -> Statement:
+    """Whether the disagreement decays however graphs take turns.
+
+    Stable modes of each do not say so; one sum of squares that falls on all of them does, whenever
+    they switch (theory page, T8).
+    """
+    name, loop = Hypothesis.SWITCHING, case.loop
+    edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
+    if not case.governed:
+        text = "no theorem is known of this law on graphs that take turns"
+        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, "use `consensus`", text)
+    # At the edge the sum may only stay; what feels nothing then decays by detectability.
+    if common is not None and edge is not None and c >= edge and common > -np.inf:
+        text, rate = "whenever they do: sum_i delta_i'P delta_i rises on none", max(0.0, common)
+        return Statement(name, Verdict.HOLDS, _LINEAR, rate, f"{rate:.3g} 1/s", text)
+    text = "no one P is known to serve all the graphs that take turns"
+    remedy = "use the law `stopping-point`"
+    if edge is not None and not c >= edge:
+        remedy = f"raise `coupling` to {edge:.4g} or more, or {remedy}"
+    return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
+
+
+def _along(case: Case) -> Statement:
+    """Whether the laws are stable where the reference takes them, frozen there: no proof."""
+    name, frozen = Hypothesis.ALONG, case.frozen
+    if not (case.loop.every and case.governed):
+        return Statement(name, Verdict.NOT_NEEDED, Kind.SAMPLES, text="there is nothing to lose")
+    if frozen is None or not frozen.travelled:
+        text = "the leader rests at the trim, or follows no path of its own"
+        return Statement(name, Verdict.NOT_NEEDED, Kind.SAMPLES, text=text)
+    found, states = frozen.growth(), len(frozen.times)
+    shown = f"{found.rate:.3g} 1/s"
+    if not found.lost:
+        text = f"small errors shrink over {states} states of it, each frozen until the next"
+        return Statement(name, Verdict.HOLDS, Kind.SAMPLES, found.rate, shown, text)
+    grown = f"{np.exp(min(found.most, 99.0)):.2g}-fold on a part of it"
+    grown = f"at {shown}" if found.rate >= 0.0 else grown
+    text = f"along the leader's path the {found.whose} errors grow {grown}, fastest at "
+    text += f"{found.when:.3g} s, where {frozen.blamed} takes the law farthest from its trim"
+    remedy = f"keep {frozen.blamed.partition(' ')[0]} nearer to the trim there"
+    return Statement(name, Verdict.FAILS, Kind.SAMPLES, found.rate, shown, text, remedy, text)
+
+
+def held(case: Case) -> Statement:
+    """Whether it still decays in steps of the integrator that runs, with the input held."""
+    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
+    if not (loop.every and case.governed):
+        shown, text = f"dt {settings.dt:g} s", "there is nothing to lose"
+        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, None, shown, text)
+    radius, printed = loop.radius(settings), settings.integrator == "printed"
+    goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
+    if printed and goals.any():
+        text = "`printed` takes f + g u for the state, and so forgets the goals"
+        return _step(case, np.inf, text, "use `simulation.integrator: rk4`")
+    found = {f"a step, {loop.where}": radius}
+    if case.frozen and not printed:
+        places = ("a step along the leader's path", "a step where agents start")
+        found |= zip(places, case.frozen.radii(settings))
+    where = next((x for x, one in found.items() if not one < 1.0), f"a step, {loop.where}")
+    remedy = "use `simulation.integrator: rk4`" if printed else ""
+    return _step(case, found[where], f"spectral radius {found[where]:.4g} {where}", remedy)
+
+
+def _step(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
+    """Return the line of a step from a spectral radius and where it is met."""
+    name, dt = Hypothesis.STEP, case.settings.dt
+    if radius < 1.0:
+        return Statement(name, Verdict.HOLDS, _LINEAR, radius, f"dt {dt:g} s", text)
+    if not remedy:
+        longest = longest_step(case.loop, case.frozen, case.settings)
+        remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
+    # Where agents start it lasts a moment, and a promise is of starts near the goals.
+    reason = "" if "agents start" in text else "with the input held over the step `dt` it grows"
+    text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
+    return Statement(name, Verdict.FAILS, _LINEAR, radius, f"dt {dt:g} s", text, remedy, reason)

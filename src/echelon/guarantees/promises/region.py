@@ -1,0 +1,205 @@
+"""What the metric of a gain promises on its domain for the model, graph, coupling and law that run.
+
+A region that a gain carries is a claim of when it was made. Here it is computed again: the
+Jacobians are enclosed from the model that runs, the strength 2 c lambda_min is that of its coupling
+and graph, and a proof is proved anew. All of that is kept in a process, so it is not paid twice.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from echelon.agents.models.linearization import at_trim, linearize
+from echelon.agents.models.model import ControlAffine
+from echelon.core.errors import GainError
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.types import Array
+from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.guarantees.promises.leaders import Leaders
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.synthesis.certificates.certificate import RegionCertificate
+from echelon.synthesis.certificates.domain import Domain
+from echelon.synthesis.certificates.domain_metrics import (
+    Pairs,
+    contracting_region,
+    drift_region,
+    pairs_on,
+)
+from echelon.synthesis.certificates.jacobians import jacobians
+from echelon.synthesis.certificates.lmi import falls
+from echelon.synthesis.gains.gain import Gain
+
+_NAME = Hypothesis.REGION
+_NEAR = 1e-3
+"""How far about a trim the slopes of its sides are looked at, in units of each state."""
+
+
+class Region(NamedTuple):
+    """What is promised on a domain, if anything, the line that says so, and the bare claim.
+
+    Attributes:
+        certificate: of the law that runs; None where nothing is promised.
+        relayed: what the metric promises where the leader's input is relayed; None for nothing.
+        line: what was found.
+    """
+
+    certificate: RegionCertificate | None
+    relayed: RegionCertificate | None
+    line: Statement
+
+
+def region_of(parts: Parts, leaders: Leaders) -> Region:
+    """Return what is promised on the domain that the gain of prepared parts was made for."""
+    gain = parts.drive.gain
+    if gain is not None and gain.certificate.region is None and at_trim(parts.model).bends.any():
+        return _beside_bends(parts, leaders, gain)
+    if gain is None or gain.certificate.region is None:
+        text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
+        line = Statement(_NAME, Verdict.NOT_NEEDED, Kind.PROOF, shown="none", text=text)
+        return Region(None, None, line)
+    try:
+        found = _computed(parts, gain, gain.certificate.region)
+    except GainError as error:
+        return Region(None, None, _lost(str(error).rstrip("."), "make the gain again"))
+    if found is None and not _strength(parts, gain) > 0.0:
+        text = "on this graph no sum of squares is known that falls whatever the slopes are"
+        return Region(None, None, _lost(text, "let agents hear each other both ways"))
+    if found is None:
+        strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
+        text = f"P contracts at no rate on the domain {strength}"
+        return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
+    text, remedy = _withheld(parts, leaders, gain, found)
+    if text:
+        return Region(None, found, _lost(text, remedy))
+    return Region(found, found, _line(parts, found))
+
+
+def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
+    """Return what a metric promises about a trim at which the model bends.
+
+    It has no linearization there, but a hull holds the slopes of all its sides nearby.
+    """
+    text = "the slopes beside the trim, where the model bends, do not all contract in P"
+    none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, shown="none", text=text)
+    try:
+        pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
+        found = pairs and _contraction(parts, gain, pairs, exact=False)
+    except GainError:
+        found = None
+    if found is None or found.kind is Kind.SAMPLES or _not_the_law(parts, leaders, found)[0]:
+        return Region(None, None, none)
+    return Region(found, None, _line(parts, found))
+
+
+def _near(model: ControlAffine) -> Domain:
+    return Domain.about(model, dict.fromkeys(model.state_names, _NEAR))
+
+
+def slopes_beside(parts: Parts) -> Array | None:
+    """Return the drift's slopes on all sides of the trim, (K, n, n); None where none are found."""
+    gain = parts.drive.gain
+    try:
+        return None if gain is None else pairs_on(parts.model, _near(parts.model), gain.R).A
+    except GainError:
+        return None
+
+
+def _with_inner(parts: Parts, gain: Gain, pairs: Pairs) -> Pairs | None:
+    """Return the slopes with a gain's inner loop closed; None where g turns what the loop does."""
+    if gain.inner is None:
+        return pairs
+    if pairs.W is not None:
+        return None
+    linear = linearize(parts.model)
+    # g is constant, so the loop adds the same matrix to every slope.
+    closed = pairs.A + (linear.with_inner(gain.inner).A - linear.A)
+    return pairs._replace(A=closed, found=pairs.found._replace(matrices=closed))
+
+
+def _contraction(parts: Parts, gain: Gain, pairs: Pairs, exact: bool) -> RegionCertificate | None:
+    """Return what a gain's metric contracts at its coupling; None for nothing."""
+    B, spectrum = linearize(parts.model).B, parts.graph.spectrum()
+    return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)
+
+
+def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCertificate | None:
+    """Return what the metric promises on the claim's domain behind a relayed input."""
+    model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
+    if claim.theorem is Theorem.A5:
+        found = jacobians(model, claim.domain)
+        if not falls(gain.P, found.matrices):
+            return None
+        return drift_region(model, claim.domain, found, gain.P, gain.coupling, spectrum)
+    return _contraction(parts, gain, pairs_on(model, claim.domain, gain.R), exact)
+
+
+def _strength(parts: Parts, gain: Gain) -> float:
+    return 2.0 * gain.coupling * parts.graph.spectrum().proved
+
+
+def _withheld(
+    parts: Parts, leaders: Leaders, gain: Gain, found: RegionCertificate
+) -> tuple[str, str]:
+    """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
+    if gain.inner is not None:
+        return "the hull is of the drift without the gain's inner loop", "leave the loop out"
+    return _not_the_law(parts, leaders, found)
+
+
+def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tuple[str, str]:
+    """Return why what is fed forward takes away what the metric could keep, and what would not."""
+    if _turns_away(parts, leaders):
+        text = f"the law turns with the leader's heading, and {found.theorem} is of axes that do "
+        return f"{text}not", "keep the leader's heading at the trim's"
+    feedforward, theorem = parts.drive.feedforward, found.theorem
+    # The parent of all is a leader where no agent is farther away, and what it sends is relayed.
+    if feedforward is Feedforward.PARENT and parts.graph.depths().max() > 1:
+        text = "parents' inputs are fed forward, and the modes are no longer those of a symmetric "
+        return f"{text}matrix, which {theorem} rests on", "set `feedforward: relay`"
+    if feedforward is Feedforward.NONE and not leaders.rest:
+        text = f"{theorem} needs the leader's input at every follower, or at rest at its trim"
+        return text, "set `feedforward: relay`"
+    # A leader at its trim makes no velocity beyond it, and its raw input is that of the trim.
+    if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2 and not leaders.rest:
+        text = "T2 is of the leader's raw input; what each agent makes of its velocity turns with g"
+        return f"{text}, and is not enclosed", "set `feedforward: relay`"
+    if not leaders.agree:
+        return f"{theorem} speaks of one leader, or of leaders that agree", "start them alike"
+    return "", ""
+
+
+def _turns_away(parts: Parts, leaders: Leaders) -> bool:
+    """Tell whether the law may be another than in the trim's axes."""
+    if not (isinstance(parts.drive, Laws) and parts.drive.follower.turning):
+        return False
+    # A leader that rests at its trim keeps its heading.
+    trim = np.asarray(parts.model.trim[0], float)
+    return not (leaders.rest and (leaders.starts == trim).all())
+
+
+def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:
+    """Return a region no stronger than what its hypotheses say of the offsets on its domain."""
+    [line] = (x for x in lines if x.statement is Hypothesis.SYMMETRY)
+    found, needed = region.certificate, line.verdict is not Verdict.NOT_NEEDED
+    if found is None or not needed or line.kind.strength >= found.kind.strength:
+        return region
+    why = "the offsets are tried at samples of the domain, and not proved"
+    found = dataclasses.replace(found, kind=line.kind, why=why)
+    return region._replace(certificate=found, line=_line(parts, found))
+
+
+def _lost(text: str, remedy: str) -> Statement:
+    return Statement(_NAME, Verdict.FAILS, Kind.PROOF, None, "none", text, remedy)
+
+
+def _line(parts: Parts, found: RegionCertificate) -> Statement:
+    theorem, kind = found.theorem, found.kind
+    text = f"{theorem}: {theorem.value} {found.domain.in_words(parts.model)}"
+    text += f"; no more than {kind}, since {found.why}" if found.why else ""
+    shown, skew = f"{found.rate:.3g} 1/s", parts.graph.spectrum().skew
+    if skew > 1.0:
+        text += f"; their squares weighted as T7 has it, {skew:.3g} to 1 at most"
+    return Statement(_NAME, Verdict.of(True), kind, found.rate, shown, text)

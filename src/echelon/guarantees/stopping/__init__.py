@@ -1,0 +1,1 @@
+"""Theorem T5: what is guaranteed under the law `stopping-point`."""

@@ -1,0 +1,227 @@
+"""How near to the borders of their flat coordinates the agents of a run may come (T5)."""
+
+import math
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from echelon.agents.models.model import FlatBound
+from echelon.core.errors import GainError, listing
+from echelon.core.types import Array
+from echelon.core.words import Kind
+from echelon.guarantees.stopping.chain_clearance import (
+    Push,
+    Room,
+    length_room_of,
+    room_of,
+    root_above,
+)
+from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.path_bounds import Least, least_on_path
+from echelon.guarantees.stopping.stopping_run import Stopping
+
+_ROUNDED = Fraction(1, 10**6)
+"""Of a derivative of a flat output: a thousand times what floats leave of it at a start."""
+_LEVEL = 1e-9
+"""What floats leave of a level start, far below the slack of the room."""
+_STARTS = 64
+"""Starts of agents that are looked at one by one; those that differ in one speed alone are two."""
+
+
+class Border(NamedTuple):
+    """A border of the chart: what is left to it, and by which kind of argument.
+
+    Attributes:
+        bound: what the model says of it.
+        left: how far agents stay from it, at least.
+        steepest: how far the outputs' speed may be off the leader's at the start.
+        kind: of the argument.
+        path: what the leader's path takes the bounded derivative to, at least.
+        fastest: the `speed` of each output at which agreement alone may lead to it.
+        led: whether the leader starts on its path in these outputs, and so keeps to it.
+        turn: by what angle (deg) a velocity as large as the leader's may be off it at the start;
+            infinite where the bound is of no velocity.
+        told: what is claimed, and of what it was computed; ready for JSON.
+    """
+
+    bound: FlatBound
+    left: Fraction
+    steepest: float
+    kind: Kind
+    path: float
+    fastest: float
+    led: bool
+    turn: float
+    told: dict[str, Any]
+
+    @property
+    def many(self) -> bool:
+        """Whether it is of the length of a vector."""
+        return len(self.bound.outputs) > 1
+
+    @property
+    def outputs(self) -> str:
+        """Its outputs, in words."""
+        return listing(self.bound.outputs)
+
+    @property
+    def speeds(self) -> str:
+        """Their first derivatives, in words."""
+        each = ", ".join(f"`{name}'`" for name in self.bound.outputs)
+        return f"({each})" if self.many else each
+
+    def what(self) -> str:
+        """Return what is bounded, in words."""
+        each = ", ".join(name + "'" * self.bound.derivative for name in self.bound.outputs)
+        return f"the length of ({each})" if self.many else each
+
+
+def border_of(run: Stopping, bound: FlatBound) -> Border:
+    """Return how near to a border the agents of a run may come.
+
+    Raises:
+        GainError: there are too many different starts, or roots have no common unit.
+    """
+    chains, order = run.law.ready.chains, bound.derivative - 1
+    places = [chains.outputs.index(name) for name in bound.outputs]
+    chain = run.chain(places[0])
+    least = least_on_path(run.leader, run.parts.model, run.settings.horizon, places, order + 1)
+    allowed = Fraction(least.value) - Fraction(bound.above) - _ROUNDED
+    fastest = float(allowed / chain.gain(order)) / math.sqrt(len(places))
+    speeds = [run.own_speed(k) for k in places]
+    own, s = _together(speeds), _together(map(run.speed, places))
+    led = max(speeds) < _LEVEL and _is_on_path(run, places)
+    none = Fraction(-1), 0.0
+    known = Border(bound, *none, least.kind, least.value, fastest, led, math.inf, {})
+    if own is None or s is None:
+        return known
+    asked = _Asked(run, bound, places, chain, own, s, allowed)
+    rooms, starts = _along(asked) if known.many else _upward(asked)
+    left = min(allowed - room.fall for room in rooms)
+    # Said of agents behind a leader that keeps to the speed of its path.
+    steepest = float(length_room_of(chain, order, (), s, allowed).steepest)
+    told = {**_told(asked, least, left), **starts, "steepest": steepest}
+    turn = _turn(run, places, steepest) if known.many and order == 0 else math.inf
+    return known._replace(left=left, steepest=steepest, turn=turn, told=told)
+
+
+def _is_on_path(run: Stopping, places: list[int]) -> bool:
+    """Tell whether leaders start as their path moves, in all that the inner loop lets go by."""
+    leads, degree = list(run.parts.graph.leaders), run.law.ready.chains.degrees[places[0]]
+    off = (run.flat[leads] - run.ahead)[:, 1:degree, places]
+    return bool(np.abs(off).max(initial=0.0) < _LEVEL)
+
+
+def _turn(run: Stopping, places: list[int], chord: float) -> float:
+    """Return the angle (deg) between velocities of the leader's size that are a chord apart."""
+    size = float(np.linalg.norm(run.ahead[1, places]))
+    return math.degrees(2.0 * math.asin(min(1.0, 0.5 * chord / size))) if size > 0.0 else math.inf
+
+
+class _Asked(NamedTuple):
+    """A border with what it is computed of: bounds of |w| of leader and agent, what is allowed."""
+
+    run: Stopping
+    bound: FlatBound
+    places: list[int]
+    chain: Chain
+    own: Fraction
+    speed: Fraction
+    allowed: Fraction
+
+
+def _together(speeds: Any) -> Fraction | None:
+    """Return a bound of the length of a vector whose entries are within speeds; None for none."""
+    each = list(speeds)
+    if any(map(math.isinf, each)):
+        return None
+    exact = [Fraction(s) for s in each]
+    return exact[0] if len(exact) == 1 else root_above(sum((s**2 for s in exact), Fraction(0)))
+
+
+def _told(asked: _Asked, least: Least, left: Fraction) -> dict[str, Any]:
+    chain, p = asked.chain, len(asked.chain.powers)
+    return {
+        "outputs": list(asked.bound.outputs),
+        "derivative": asked.bound.derivative,
+        "above": asked.bound.above,
+        "path": least.value,
+        "roots": list(asked.run.law.roots_for(p)),
+        "speed": float(asked.speed),
+        "leader_speed": float(asked.own),
+        "gains": [float(chain.gain(order)) for order in range(p + 1)],
+        "left": float(left),
+    }
+
+
+def _upward(asked: _Asked) -> tuple[list[Room], dict[str, Any]]:
+    """Return the rooms of one output, which may go far on its other side, and the starts."""
+    run, [k], chain = asked.run, asked.places, asked.chain
+    leads, p = list(run.parts.graph.leaders), len(chain.powers)
+    led = _few(run.flat[leads, :, k] - run.ahead[:, k])
+    away = _few(run.flat[:, :, k] - run.flat[list(run.parts.graph.nearest_leader()), :, k])
+    rooms = [
+        room_of(
+            chain,
+            asked.bound.derivative - 1,
+            (
+                Push(_exact(lead[1 : p + 1]), asked.own),
+                Push(_exact(start[1 : p + 1]), asked.speed),
+            ),
+            asked.allowed,
+        )
+        for lead in led
+        for start in away
+    ]
+    told = {"starts": away, "leader_starts": led}
+    return rooms, {name: starts[:, 1 : p + 1].tolist() for name, starts in told.items()}
+
+
+def _along(asked: _Asked) -> tuple[list[Room], dict[str, Any]]:
+    """Return the rooms of several outputs, and the starts against the leader's path."""
+    run, p = asked.run, len(asked.chain.powers)
+    away = (run.flat - run.ahead)[:, 1 : p + 1, asked.places].swapaxes(1, 2)
+    if p == 1:
+        # A length that falls by itself: the longest stands for all.
+        away = away[[int(np.linalg.norm(away[:, :, 0], axis=1).argmax())]]
+    away = _distinct(away)
+    order, total = asked.bound.derivative - 1, asked.own + asked.speed
+    rooms = [
+        length_room_of(asked.chain, order, list(map(_exact, start)), total, asked.allowed)
+        for start in away
+    ]
+    return rooms, {"starts": away.tolist()}
+
+
+def _exact(values: Array) -> tuple[Fraction, ...]:
+    return tuple(map(Fraction, values.tolist()))
+
+
+def _few(starts: Array) -> Array:
+    """Return starts (K, r) that stand for all: the extreme ones where the speed alone differs.
+
+    Raises:
+        GainError: there are too many.
+    """
+    starts = starts.copy()
+    starts[:, 0] = 0.0
+    starts[np.abs(starts) < _LEVEL] = 0.0
+    if not starts[:, 2:].any() and starts.shape[1] > 1:
+        low, high = starts[:, 1].argmin(), starts[:, 1].argmax()
+        return starts[sorted({int(low), int(high)})]
+    return _distinct(starts)
+
+
+def _distinct(starts: Array) -> Array:
+    """Return each start once.
+
+    Raises:
+        GainError: there are too many.
+    """
+    found = np.unique(starts, axis=0)
+    if len(found) > _STARTS:
+        raise GainError(
+            f"{len(found)} starts differ in more than a speed, and {_STARTS} are tried."
+        )
+    return found

@@ -1,0 +1,392 @@
+"""Whether the motors of agents give all that the law `stopping-point` asks of them (T5)."""
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from echelon.agents.models.airframe import Airframe
+from echelon.agents.models.model import ControlAffine
+from echelon.core.enclosure.interval import ELEMENTARY, Interval, point
+from echelon.core.memoize import kept
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.types import Array
+from echelon.core.words import Kind, Verdict
+from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.motor_bounds import (
+    Asked,
+    Motors,
+    Pushed,
+    add_pushes,
+    motors_of,
+    motors_suffice,
+)
+from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
+from echelon.guarantees.stopping.stopping_run import Stopping
+from echelon.guarantees.stopping.time_slices import rounded_up, slices_of
+from echelon.laws.stopping_point import StoppingLeader
+
+_OUTPUTS, _DEGREES = ("x", "y", "z", "yaw"), (4, 4, 4, 2)
+"""Of the body that the motors move, as its flat coordinates."""
+_ROUNDED = Fraction(1, 10**6)
+"""Of a start in flat coordinates: a thousand times what floats leave of it."""
+_STARTS = 64
+"""Starts that are looked at one by one where all together are too many for the motors."""
+_STEPS = 8
+"""Of a bisection for how far a start may be off: a 250th of where it begins."""
+_ZERO = Fraction(0)
+_UNKNOWN = "no certificate is known of these limits; a run says whether one acted"
+_STILL = Pushed((), (), (), (_ZERO, _ZERO, _ZERO))
+
+
+class Alone(NamedTuple):
+    """How far one thing may be off at a start, at any place and heading, the rest as the leader's.
+
+    Attributes:
+        tilt: rad, at the leader's velocity, without a body rate.
+        sideways, upward: a velocity off the leader's, m/s.
+        rate: a body rate of roll and pitch of a level agent at the leader's velocity, rad/s.
+        rest: whether agents may begin level and at rest.
+    """
+
+    tilt: float
+    sideways: float
+    upward: float
+    rate: float
+    rest: bool
+
+    def sentence(self) -> str:
+        """Return the same in words."""
+        rest = ", or level and at rest" if self.rest else ""
+        return (
+            "any place and heading, beside a leader on its path but for its place: tilted by "
+            f"{math.degrees(self.tilt):.3g} deg at its velocity, or {self.sideways:.3g} m/s off "
+            f"that sideways, or {self.upward:.3g} m/s upward, or level with {self.rate:.3g} rad/s "
+            f"of roll and pitch{rest}"
+        )
+
+
+class Strain(NamedTuple):
+    """What the motors give from the starts of a run, and from which others they would do.
+
+    Attributes:
+        kind: of the argument.
+        least, largest: of a motor's thrust, N.
+        most: that it has, N.
+        tilt: the steepest, rad.
+        alone: None where agents that start like the leader do not.
+        told: of what it was computed; ready for JSON.
+    """
+
+    kind: Kind
+    least: float
+    largest: float
+    most: float
+    tilt: float
+    alone: Alone | None
+    told: dict[str, Any]
+
+    def sentence(self) -> str:
+        """Return what is promised of motors."""
+        text = f"From these starts motors give between {self.least:.3g} and {self.largest:.3g} N "
+        text += f"of their {self.most:.4g} N, and nobody tilts by more than "
+        text += f"{math.degrees(self.tilt):.3g} deg"
+        more = "" if self.alone is None else f"; they suffice from {self.alone.sentence()}"
+        return f"{text}{more}."
+
+    def as_mapping(self) -> dict[str, Any]:
+        """Return it ready for JSON."""
+        alone = None if self.alone is None else self.alone._asdict()
+        numbers = {"least": self.least, "largest": self.largest, "tilt": self.tilt}
+        return {**numbers, "most": self.most, "alone": alone, **self.told}
+
+
+class Strained(NamedTuple):
+    """The strain, if it is known and the motors bear it, and the line that says so."""
+
+    strain: Strain | None
+    line: Statement
+
+
+class _Case(NamedTuple):
+    """What the motors of a run are asked for.
+
+    Attributes:
+        frame: of the agents.
+        chain: of their position.
+        path: what the leader's path asks.
+        led: the leader's start off its path, and its speeds.
+        speeds: of the agents.
+        base: what agents are asked for that start as their leader.
+        starts: of the agents.
+    """
+
+    frame: Airframe
+    chain: Chain
+    path: "_Path"
+    led: Pushed
+    speeds: tuple[Fraction, Fraction, Fraction]
+    base: tuple[Asked, ...]
+    starts: Sequence[Pushed]
+
+    @classmethod
+    def of(cls, run: Stopping, frame: Airframe) -> "_Case":
+        """Return it of a run."""
+        chain, graph = run.chain(0), run.parts.graph
+        speeds = _speeds([run.speed(k) for k in range(4)])
+        off = run.flat[list(graph.leaders)] - run.ahead
+        led = _largest([_start(each) for each in off])
+        led = led._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
+        path = _path(run.leader, run.parts.model, run.settings.horizon, chain)
+        base = _pushed(chain, path.asked, led, speeds)
+        away = (run.flat - run.flat[list(graph.nearest_leader())])[list(graph.followers)]
+        starts = [_start(each) for each in np.unique(away, axis=0)]
+        return cls(frame, chain, path, led, speeds, base, starts)
+
+
+def motors_bear(run: Stopping) -> bool:
+    """Tell whether the motors are certified from the starts of a run."""
+    frame = run.parts.model.airframe
+    if frame is None or _beyond(run):
+        return False
+    case = _Case.of(run, frame)
+    return _from(case)[0].within(Fraction(frame.motor_thrust))
+
+
+def strain_of(run: Stopping) -> Strained:
+    """Return whether the motors of a run's agents suffice, by T5 with limits."""
+    frame, reason = run.parts.model.airframe, _beyond(run)
+    if frame is None or reason:
+        text = reason or _UNKNOWN
+        return Strained(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
+    case = _Case.of(run, frame)
+    found, starts = _from(case)
+    kind, shown, most = case.path.kind, _shown(found), Fraction(frame.motor_thrust)
+    if not found.within(most):
+        text = "from these starts the motors are not shown to give what is asked"
+        text += f": {shown}" if shown else ", and the thrust not to vanish"
+        remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
+        remedy += "to the leader's velocity and attitude; `echelon design` finds some"
+        return Strained(None, _line(Verdict.FAILS, kind, found, shown, text, remedy))
+    ahead = _ahead(frame, run.ahead)
+    strain = Strain(
+        kind,
+        _floor(found.least),
+        -_floor(-found.largest),
+        float(most),
+        -_floor(-found.tilt),
+        _alone(frame, case.chain, case.base, ahead),
+        _told(case, run.law.roots_for(3), starts, ahead),
+    )
+    text = "the motors give what is asked from these starts, all the way"
+    return Strained(strain, _line(Verdict.HOLDS, kind, found, shown, text))
+
+
+def _beyond(run: Stopping) -> str:
+    """Return why nothing is to be asked of motors, or nothing is known; empty where it is."""
+    chains = run.law.ready.chains
+    if not run.settings.limits or run.parts.model.input_limits is None:
+        return "the inputs have no limits"
+    if (chains.outputs, chains.degrees) != (_OUTPUTS, _DEGREES):
+        return _UNKNOWN
+    speeds = [*map(run.speed, range(4)), *map(run.own_speed, range(4))]
+    return "a `speed` is infinite" if any(map(math.isinf, speeds)) else ""
+
+
+def _line(
+    verdict: Verdict, kind: Kind, found: Motors | None, shown: str, text: str, remedy: str = ""
+) -> Statement:
+    number = None if found is None or found.slope is None else float(found.least)
+    # Without a reason: a promise of agents without limits is one too.
+    return Statement(Hypothesis.LIMITS, verdict, kind, number, shown, text, remedy)
+
+
+def _shown(found: Motors) -> str:
+    if found.slope is None:
+        return ""
+    tilt = math.degrees(float(found.tilt))
+    return f"{float(found.least):.3g} .. {float(found.largest):.3g} N, {tilt:.3g} deg"
+
+
+def _floor(x: Fraction) -> float:
+    """Return the largest float that is not above x."""
+    near = float(x)
+    return near if Fraction(near) <= x else math.nextafter(near, -math.inf)
+
+
+# ---- the path ------------------------------------------------------------------------------------
+
+
+class _Path(NamedTuple):
+    kind: Kind
+    asked: tuple[Asked, ...]
+
+
+@kept
+def _path(leader: StoppingLeader, model: ControlAffine, horizon: float, chain: Chain) -> _Path:
+    """Return what a leader's path asks on each slice of time."""
+    pieces = pieces_of(leader, model, horizon, _OUTPUTS, max(_DEGREES))
+    spans = ((piece.begin, piece.end) for piece in slices_of(chain))
+    return _Path(pieces.kind, tuple(_asked(pieces, *span) for span in spans))
+
+
+def _asked(pieces: Pieces, begin: Fraction, end: Fraction | None) -> Asked:
+    """Return what a path asks in a stretch of time."""
+    rows = pieces.between(begin, end)
+
+    def most(order: int, *outputs: int) -> Fraction:
+        return max(_norm([_size(row[order][k]) for k in outputs]) for row in rows)
+
+    low = min(row[2][2].lo for row in rows)
+    high = max(row[2][2].hi for row in rows)
+    sideways = (most(2, 0, 1), most(3, 0, 1), most(4, 0, 1))
+    return Asked(sideways, low, high, (most(3, 2), most(4, 2)), (most(1, 3), most(2, 3)))
+
+
+def _size(x: Interval) -> Fraction:
+    return max(abs(x.lo), abs(x.hi))
+
+
+def _norm(sizes: Sequence[Fraction]) -> Fraction:
+    """Return a bound of the root of the sum of squares."""
+    [first, *rest] = sizes
+    if not any(rest):
+        return rounded_up(first)
+    total = sum((size * size for size in sizes), _ZERO)
+    return rounded_up(ELEMENTARY["sqrt"].range(point(total)).hi)
+
+
+# ---- agents --------------------------------------------------------------------------------------
+
+
+def _speeds(values: Sequence[float]) -> tuple[Fraction, Fraction, Fraction]:
+    x, y, z, yaw = map(Fraction, values)
+    return _norm([x, y]), z, yaw
+
+
+def _start(flat: Array) -> Pushed:
+    """Return the sizes of a start off what an agent follows, (4, 4) in flat coordinates."""
+    sizes = [[abs(Fraction(x)) + _ROUNDED for x in row] for row in flat[1:].tolist()]
+    sideways = tuple(_norm(row[:2]) for row in sizes)
+    return Pushed(sideways, tuple(row[2] for row in sizes), (sizes[0][3],), _STILL.speeds)
+
+
+def _largest(starts: Sequence[Pushed]) -> Pushed:
+    """Return one that is as large as each in everything."""
+    parts = zip(*(start[:3] for start in starts), strict=True)
+    sideways, upward, turn = (tuple(map(max, zip(*part, strict=True))) for part in parts)
+    return Pushed(sideways, upward, turn, _STILL.speeds)
+
+
+@kept
+def _pushed(
+    chain: Chain, path: tuple[Asked, ...], led: Pushed, speeds: tuple[Fraction, ...]
+) -> tuple[Asked, ...]:
+    """Return what is asked of agents that start as their leader, on each slice."""
+    own = _STILL._replace(speeds=speeds)
+    pairs = zip(slices_of(chain), path, strict=True)
+    return tuple(add_pushes(piece, asked, (led, own)) for piece, asked in pairs)
+
+
+def _from(case: _Case) -> tuple[Motors, Sequence[Pushed]]:
+    """Return what motors give from any of the starts, and which are looked at for that."""
+    frame, slices, starts = case.frame, slices_of(case.chain), case.starts
+    largest = _largest(starts)
+    whole = motors_of(frame, slices, case.base, (largest,))
+    if whole.within(Fraction(frame.motor_thrust)) or len(starts) > _STARTS:
+        return whole, [largest]
+    each = [motors_of(frame, slices, case.base, (start,)) for start in starts]
+    slopes = [one.slope for one in each if one.slope is not None]
+    if len(slopes) < len(each):
+        return whole, [largest]
+    least, most = min(one.least for one in each), max(one.largest for one in each)
+    return Motors(least, most, max(slopes)), starts
+
+
+class _Ahead(NamedTuple):
+    """Sizes of how a leader's path begins, m and s.
+
+    Attributes:
+        speed, push, jerk: its horizontal velocity, and the derivatives of that.
+        rise: its vertical velocity.
+        lift: g and its vertical acceleration together.
+        climb: the rate of that.
+        turn: of its yaw.
+    """
+
+    speed: Fraction
+    push: Fraction
+    jerk: Fraction
+    rise: Fraction
+    lift: Fraction
+    climb: Fraction
+    turn: Fraction
+
+
+def _ahead(frame: Airframe, path: Array) -> _Ahead:
+    start = _start(path)
+    (speed, push, jerk), (rise, up, climb) = start.sideways, start.upward
+    lift = Fraction(frame.gravity) + up
+    return _Ahead(speed, push, jerk, rise, lift, climb, start.turn[0])
+
+
+@kept
+def _alone(frame: Airframe, chain: Chain, base: tuple[Asked, ...], path: _Ahead) -> Alone | None:
+    """Return how far one thing may be off at a start that is else the leader's."""
+    slices = slices_of(chain)
+
+    def fits(sideways: tuple[Fraction, ...], upward: Fraction = _ZERO) -> bool:
+        start = Pushed(sideways, (upward,), (path.turn,), _STILL.speeds)
+        return motors_suffice(frame, slices, base, start)
+
+    # The thrust is set level, so that z'' and its rate are the path's: a tilt of tangent t
+    # accelerates by (g + z'') t, at a rate of t times the path's; a body rate w of a level agent
+    # adds (g + z'') w to that.
+    if not fits((_ZERO,)):
+        return None
+    _, a, j, rise, lift, climb, _ = path
+    tilt = _farthest(lambda t: fits((_ZERO, lift * t + a, climb * t + j)), Fraction(4))
+    return Alone(
+        math.atan(tilt),
+        _farthest(lambda x: fits((x,)), Fraction(40)),
+        _farthest(lambda x: fits((_ZERO,), x), Fraction(20)),
+        _farthest(lambda w: fits((_ZERO, a, j + lift * w)), Fraction(40)),
+        fits((path.speed, a, j), rise),
+    )
+
+
+def _farthest(fits: Callable[[Fraction], bool], most: Fraction) -> float:
+    """Return a number that fits, and near which larger ones do not; zero where none does."""
+    low, high = _ZERO, most
+    for _ in range(_STEPS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return float(low)
+
+
+def _told(
+    case: _Case, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
+) -> dict[str, Any]:
+    """Return what the strain was computed of, ready for JSON."""
+    return {
+        "airframe": case.frame._asdict(),
+        "roots": list(roots),
+        "speeds": [float(s) for s in case.speeds],
+        "leader": _numbers(case.led),
+        "starts": [_numbers(start) for start in starts],
+        "ahead": {name: float(x) for name, x in ahead._asdict().items()},
+        "path": [
+            [float(piece.begin), *(float(x) for part in asked for x in _flat(part))]
+            for piece, asked in zip(slices_of(case.chain), case.path.asked, strict=True)
+        ],
+    }
+
+
+def _flat(part: Fraction | tuple[Fraction, ...]) -> tuple[Fraction, ...]:
+    return part if isinstance(part, tuple) else (part,)
+
+
+def _numbers(push: Pushed) -> dict[str, list[float]]:
+    return {name: [float(x) for x in part] for name, part in push._asdict().items()}

@@ -1,0 +1,320 @@
+"""A run under the law `stopping-point` as its theorem sees it, and what else that rests on (T5)."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+
+from echelon.agents.models.chains import flat_output, flatten
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.core.compiled import program
+from echelon.core.linear import held_radius
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.types import Array
+from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.guarantees.stopping.chain_response import Chain
+from echelon.laws.flat_loop import FlatLoop
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.settings import Settings
+
+_PROOF = Kind.PROOF
+
+
+class Stopping(NamedTuple):
+    """A run under the law, as its theorem sees it.
+
+    Attributes:
+        parts: prepared.
+        settings: how it is computed.
+        states: (N, n) at the start.
+        flat: (N, r, m) the same in flat coordinates, less the offsets.
+        ahead: (r, m) of what the leader follows.
+    """
+
+    parts: Parts
+    settings: Settings
+    states: Array
+    flat: Array
+    ahead: Array
+
+    @property
+    def law(self) -> StoppingPoint:
+        """The followers' law."""
+        return self.parts.drive.follower  # pyright: ignore
+
+    @property
+    def leader(self) -> StoppingLeader:
+        """The leader's law."""
+        return self.parts.drive.leader  # pyright: ignore
+
+    @property
+    def coupling(self) -> float:
+        """C."""
+        return float(self.law.strength(self.settings.dt))
+
+    @property
+    def rate(self) -> float:
+        """The slowest mode of the formation, 1/s, as a positive number."""
+        agreement = self.agreement
+        moves = max(self.law.ready.chains.degrees) > 1
+        return min(self.law.slowest_root, agreement) if moves else agreement
+
+    @property
+    def agreement(self) -> float:
+        """The slowest disagreement of stopping points near rest, 1/s, as a positive number.
+
+        Of a graph that switches again and again, what errors fall by in a period (Floquet), and of
+        one that switches for a while, that of the graph which stays.
+        """
+        schedule, c = self.parts.graph.schedule, self.coupling
+        if schedule is None:
+            assert self.law.reach is not None
+            return c * self.law.reach.slowest
+        whole = self.parts.graph.stretches(self.law.leaderward)
+        if schedule.period is None:
+            return c * float(np.linalg.eigvals(whole[-1].toarray()).real.min())
+        flow = np.eye(len(self.parts.graph.followers))
+        spans = np.diff(schedule.starts, append=schedule.period)
+        for span, L in zip(spans, whole, strict=True):
+            flow = scipy.linalg.expm(-c * span * L.toarray()) @ flow
+        return -float(np.log(np.abs(np.linalg.eigvals(flow)).max())) / schedule.period
+
+    def chain(self, output: int) -> Chain:
+        """Return the chain of an output.
+
+        Raises:
+            GainError: its roots have no common unit.
+        """
+        degree = self.law.ready.chains.degrees[output]
+        return Chain.of(self.law.roots_for(degree - 1))
+
+    def speed(self, output: int) -> float:
+        """Return s of a follower against the leader: of each link on the way, told by parents."""
+        return self.links * self.law.speed_of(output)
+
+    @property
+    def links(self) -> int:
+        """How many speeds add up on the way from a leader."""
+        told = self.law.feedforward is Feedforward.PARENT
+        return int(self.parts.graph.depths().max()) if told else 1
+
+    @property
+    def longest_step(self) -> float:
+        """The longest step (s) that keeps the largest stopping point from growing."""
+        assert self.law.reach is not None
+        return 1.0 / (self.coupling * self.law.reach.heaviest)
+
+    def own_speed(self, output: int) -> float:
+        """Return the speed against its path that a leader may have: what it starts off, or s_0."""
+        leads = list(self.parts.graph.leaders)
+        weights = self.leader.ready.weights[:, output]
+        away = np.abs(weights @ (self.flat[leads] - self.ahead)[:, :, output].T).max()
+        c = float(self.leader.strength(self.settings.dt))
+        # Its distance never grows, and sigma(c zeta) is below c zeta.
+        return min(self.leader.speed_of(output), c * float(away))
+
+
+def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | None:
+    """Return what T5 speaks of; None under another law."""
+    drive = parts.drive
+    if not isinstance(drive, Laws) or not isinstance(drive.follower, StoppingPoint):
+        return None
+    assert isinstance(drive.leader, StoppingLeader)
+    offsets = jnp.asarray(parts.formation.offsets)
+    flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
+    return Stopping(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
+
+
+@program
+def _flat(
+    model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
+) -> jax.Array:
+    chains = law.ready.chains
+
+    def one(x: jax.Array, offset: jax.Array) -> jax.Array:
+        values = flatten(model, chains, x, law.begin(model, x).chain).values
+        shift = flat_output(model, chains.outputs, offset)
+        return values.at[0].add(flat_output(model, chains.outputs, 0.0 * offset) - shift)
+
+    return jax.vmap(one)(states, offsets)
+
+
+# ---- what else it rests on -----------------------------------------------------------------------
+
+
+def condition_lines(run: Stopping) -> Iterator[Statement]:
+    """Yield the conditions of T5 beside the tube."""
+    n = len(run.parts.model.state_names)
+    text = "of the flat outputs they are; those of other states are none"
+    broken = _moves_others(run)
+    remedy, reason = "", ""
+    if broken:
+        text, remedy = (
+            f"the offset of `{broken}` is none of a flat output",
+            "offset flat outputs only",
+        )
+        reason = "an offset is no symmetry of the law"
+    verdict = Verdict.of(not broken)
+    yield Statement(Hypothesis.SYMMETRY, verdict, _PROOF, None, "", text, remedy, reason)
+    text = "in flat coordinates every agent is linear, with or without a trim"
+    yield Statement(Hypothesis.SMOOTH, Verdict.NOT_NEEDED, _PROOF, text=text)
+    text = f"feedback makes chains of all {n} states and the integrators before inputs"
+    yield Statement(Hypothesis.DETECTABLE, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield Statement(Hypothesis.MATCHED, Verdict.HOLDS, _PROOF, text=f"{run.law.information[1]}")
+    c = run.coupling
+    shown = f"c {c:.4g}, edge 0"
+    yield Statement(Hypothesis.COUPLED, Verdict.HOLDS, _PROOF, c, shown, "any coupling will do")
+    text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
+    if run.parts.graph.schedule is not None:
+        text = "the slower of the slowest root and of what is left after a period, or in the end"
+    shown = f"{-run.rate:.3g} 1/s"
+    yield Statement(Hypothesis.DECAYS, Verdict.HOLDS, _PROOF, -run.rate, shown, text)
+    text = "the law is linear in flat coordinates wherever it goes"
+    yield Statement(Hypothesis.ALONG, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield _step_line(run)
+    if run.parts.graph.schedule is not None:
+        yield _switching_line(run)
+    yield Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, _PROOF, text="there is no gain")
+
+
+def _switching_line(run: Stopping) -> Statement:
+    """Say along which edges the leader reaches everybody: checked when the graph was made."""
+    schedule = run.parts.graph.schedule
+    assert schedule is not None
+    text = f"the leader reaches everybody along the edges from {schedule.starts[-1]:g} s on"
+    if schedule.period is not None:
+        text = f"the leader reaches everybody along the edges of any {schedule.period:g} s together"
+    text += ", and zeta' is told in spite of edges that are not there"
+    return Statement(Hypothesis.SWITCHING, Verdict.HOLDS, _PROOF, run.rate, "", text)
+
+
+def _moves_others(run: Stopping) -> str:
+    """Return the first state with an offset that is no flat output; empty without one."""
+    outputs, model = run.law.ready.chains.outputs, run.parts.model
+    for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0)):
+        if model.state_names[k] not in outputs:
+            return model.state_names[k]
+    return ""
+
+
+def _step_line(run: Stopping) -> Statement:
+    """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
+    assert run.law.reach is not None
+    name, dt, c = Hypothesis.STEP, run.settings.dt, run.coupling
+    share = c * run.law.reach.heaviest * dt
+    radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
+    led = float(run.leader.strength(dt)) * dt
+    if led > 1.0 + 1e-12:
+        # Its distance from its path would grow, on which the tube and the motors rest.
+        text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {led:.3g} is above 1"
+        remedy = f"lower `leader.coupling` to {1.0 / dt:.4g}"
+        return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, led, shown, text, remedy, text)
+    if share <= 1.0 + 1e-12 and radius < 1.0:
+        text = f"Euler's step of zeta grows nowhere; spectral radius {radius:.4g} a step"
+        return Statement(name, Verdict.HOLDS, Kind.LINEARIZATION, share, shown, text)
+    text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
+    remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
+    remedy += f"`simulation.dt` to {1.0 / (c * run.law.reach.heaviest):.3g} s"
+    if share <= 1.0:
+        text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
+        text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
+        remedy += "`simulation.dt`"
+    return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, share, shown, text, remedy, text)
+
+
+def _radius(run: Stopping) -> float:
+    """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
+    led = np.array([run.leader.strength(run.settings.dt)])
+    followed = _held(run, run.law.ready, run.coupling * _strengths(run))
+    return max(followed, _held(run, run.leader.ready, led))
+
+
+def _held(run: Stopping, loop: FlatLoop, strengths: Array) -> float:
+    """Return the same of agents that feel what is off by so much each (K,), 1/s."""
+    found = 0.0
+    for k, degree in enumerate(loop.chains.degrees):
+        A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
+        stop = loop.stiffness[k] * loop.weights[:degree, k]
+        inner = np.append(0.0, stop[:-1])
+        gains = inner + strengths[:, None] * stop
+        dt, how = run.settings.dt, run.settings.integrator
+        found = max(found, held_radius(A, B, gains[:, None], dt, how))
+    return found
+
+
+def _strengths(run: Stopping) -> Array:
+    """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
+    graph, reach = run.parts.graph, run.law.reach
+    assert reach is not None
+    if run.law.leaderward or graph.directed or graph.schedule is not None:
+        return agreement_modes(graph, run.law)
+    # By Gershgorin none is larger than 2 d_max.
+    return np.array([reach.slowest, 2.0 * reach.heaviest])
+
+
+def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
+    """Return eigenvalues lambda by which stopping points agree, zeta~' = -c lambda zeta~, (K,).
+
+    Of graphs that take turns, those of each but for 0, of who is not reached for a while.
+    """
+    values = graph.spectrum().eigenvalues
+    if law.leaderward:
+        # Triangular in the order of how far agents are from the leader.
+        values = np.unique([L.diagonal() for L in graph.stretches(True)])
+    return values[np.abs(values) > 1e-12 * np.abs(values).max()]
+
+
+def drift_reason(run: Stopping) -> Statement | None:
+    """Return why what lasts carries the leader away for ever; None where it does not."""
+    world, model, loop = run.parts.world, run.parts.model, run.leader.ready
+    if world.ideal:
+        return None
+    push = np.zeros(len(model.state_names))
+    if world.disturbance is not None:
+        push = model.per_state(world.disturbance.constant)
+    found = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
+    for k, (current, force) in enumerate(np.abs(np.stack(found)).T.tolist()):
+        s, inner = run.leader.speed_of(k), loop.chains.degrees[k] > 1
+        # The observer watches y' as the model has it, and of what is commanded at once y itself.
+        seen = run.leader.observer
+        current = 0.0 if seen and not inner else current
+        force = float(loop.weights[1, k]) * force if inner and not seen else 0.0
+        if current + force >= s:
+            return _drifts(loop.chains.outputs[k], current, force, s, inner)
+    return None
+
+
+def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> Statement:
+    """Say what a current, and a force by what it asks of agreement, do to a leader of speed s."""
+    asked = current + force
+    what = " and ".join(word for word, d in (("current", current), ("push", force)) if d)
+    text = f"a lasting {what} along `{name}` asks agreement for {asked:.3g} of speed, the "
+    text += f"leader's is {s:.3g}, and it can drift away for ever"
+    helps = "" if inner and current >= s else "set `observer: true`, or "
+    remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
+    fails = Verdict.FAILS
+    return Statement(Hypothesis.EXACT, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text)
+
+
+@program
+def _pushed(
+    model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return what outputs' speeds and accelerations differ by at the trim (m,), by the push."""
+    chains = loop.chains
+    x, u = (jnp.asarray(np.asarray(part, float)) for part in model.trim)
+
+    def output(x: jax.Array) -> jax.Array:
+        return flat_output(model, chains.outputs, x)
+
+    def speed(x: jax.Array) -> jax.Array:
+        return jax.jvp(output, (x,), (model.velocity(x, u),))[1]
+
+    more = plant.velocity(x, u) + push - model.velocity(x, u)
+    return jax.jvp(output, (x,), (more,))[1], jax.jvp(speed, (x,), (more,))[1]

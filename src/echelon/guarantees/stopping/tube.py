@@ -1,0 +1,238 @@
+"""What T5 promises of a run: how far agents go, from which starts, and when they are there."""
+
+import math
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from echelon.core.errors import GainError
+from echelon.core.statement import Hypothesis, Statement
+from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.guarantees.stopping.arrival import Arrival, arrival_of
+from echelon.guarantees.stopping.borders import Border, border_of
+from echelon.guarantees.stopping.flat_everywhere import bounds_of
+from echelon.guarantees.stopping.motor_load import Strain, strain_of
+from echelon.guarantees.stopping.stopping_run import Stopping
+
+_PROOF = Kind.PROOF
+
+
+_ANY = ("any graph in which the leader reaches everybody", "this graph")
+
+
+class Tube(NamedTuple):
+    """What is promised by T5.
+
+    Attributes:
+        kind: of the argument.
+        rate: at which errors shrink in the end, 1/s.
+        gains: of the longest chain, sup |v^(l)| over sup |w| for l = 0, 1, ...
+        left: how far the nearest agent stays from the border of the chart, at least, in the unit of
+            the bounded derivative; infinite where there is no border.
+        steepest: how far the bounded output's speed may be off the leader's at the start.
+        arrival: when all are within 1 cm, if it can be told and was asked for.
+        who: which starts are meant, in words.
+        borders: what is claimed of each border, and of what it was computed; ready for JSON.
+        strain: what the motors give; None where they have no limits, or may not suffice, or were
+            not asked for.
+        graphs: which graphs are meant, and this one, in words.
+    """
+
+    kind: Kind
+    rate: float
+    gains: tuple[float, ...]
+    left: float
+    steepest: float
+    arrival: Arrival | None
+    who: str
+    borders: tuple[dict[str, Any], ...]
+    strain: Strain | None
+    graphs: tuple[str, str] = _ANY
+
+    @property
+    def theorem(self) -> Theorem:
+        """T5."""
+        return Theorem.T5
+
+    def sentence(self) -> str:
+        """Return what is promised, in one sentence."""
+        when = (
+            ""
+            if self.arrival is None
+            else f"; these starts are within 1 cm from {self.arrival.time:.3g} s on"
+        )
+        return (
+            f"{self.kind.value}: from {self.who}, errors go to zero for any number of agents and "
+            f"{self.graphs[0]}, where the model is exact and zeta' "
+            f"is told at all times (T5); on {self.graphs[1]} in the end at "
+            f"{self.rate:.3g} 1/s or faster{when}."
+            + ("" if self.strain is None else f" {self.strain.sentence()}")
+        )
+
+    def as_mapping(self) -> dict[str, object]:
+        """Return it ready for JSON."""
+        finite = {name: getattr(self, name) for name in ("left", "steepest")}
+        finite = {name: None if math.isinf(x) else x for name, x in finite.items()}
+        when = None if self.arrival is None else self.arrival.time
+        return {
+            "format": "echelon tube 1",
+            "who": self.who,
+            "gains": list(self.gains),
+            **finite,
+            "within_1_cm_from": when,
+            "borders": list(self.borders),
+            "motors": None if self.strain is None else self.strain.as_mapping(),
+        }
+
+
+class _Found(NamedTuple):
+    """The tube, if it holds, and the lines that say so."""
+
+    tube: Tube | None
+    lines: tuple[Statement, ...]
+
+
+def tube_of(run: Stopping, briefly: bool = False) -> _Found:
+    """Return what T5 promises, and its lines: the inner gains, the set, and the starts.
+
+    And when agents arrive and what motors give, which is most of the work and on which nothing else
+    rests, unless it is to be said `briefly`.
+    """
+    model, chains = run.parts.model, run.law.ready.chains
+    longest = int(np.argmax(chains.degrees))
+    try:
+        found = run.chain(longest)
+        gains = tuple(float(found.gain(k)) for k in range(max(1, len(found.powers) + 1)))
+        bounds = bounds_of(model, chains)
+        borders = None if bounds is None else [border_of(run, b) for b in bounds]
+    except GainError as error:
+        text = str(error).rstrip(".")
+        remedy = "choose `roots` of a larger common unit" if "unit" in text else "let them be alike"
+        return _nothing(text, remedy)
+    shown = ", ".join(f"{gain:.4g}" for gain in gains)
+    text = "of what agreement asks, at most, in speed and its derivatives: no size of the formation"
+    inner = Statement(Hypothesis.REGION, Verdict.HOLDS, _PROOF, gains[-1], shown, f"T5: {text}")
+    if borders is None:
+        name = f"`{type(model).__name__}`"
+        text = f"{name} does not say where its flat coordinates end"
+        return _nothing(text, "state `flat_chains` and `flat_bounds` in the model", inner)
+    left = min((b.left for b in borders), default=Fraction(10**9))
+    kind = min((b.kind for b in borders), key=lambda kind: kind.strength, default=_PROOF)
+    steepest = min((b.steepest for b in borders), default=math.inf)
+    lines = [inner, *_set_lines(run, borders, kind)]
+    if any(line.fails for line in lines):
+        return _Found(None, tuple(lines))
+    who = _who(run, borders)
+    far = math.inf if not borders else float(left)
+    told = tuple(border.told for border in borders)
+    tube = Tube(kind, run.rate, gains, far, steepest, None, who, told, None, _graphs(run))
+    if briefly:
+        return _Found(tube, tuple(lines))
+    arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
+    strain, line = strain_of(run)
+    return _Found(tube._replace(arrival=arrival, strain=strain), (*lines, line))
+
+
+def _graphs(run: Stopping) -> tuple[str, str]:
+    """Return of which graphs T5 speaks, and how this one is called."""
+    schedule, law = run.parts.graph.schedule, run.law
+    if law.feedforward is Feedforward.PARENT:
+        # The speeds of the links add up in the tube.
+        return f"any tree in which none is more than {run.links} links from a leader", "this one"
+    if schedule is None:
+        return _ANY
+    every = "in the end" if schedule.period is None else "in every period"
+    along = "along neighbours nearer to it " if law.leaderward else ""
+    return f"any graphs that take turns and by which the leader reaches everybody {along}{every}", (
+        "these"
+    )
+
+
+def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
+    """Return that no tube is known, and why."""
+    reason = f"{text}, so no tube is known"
+    name = Hypothesis.SET if before else Hypothesis.REGION
+    lines = [Statement(name, Verdict.FAILS, _PROOF, None, "none", text, remedy, reason)]
+    rest = {Hypothesis.REGION, Hypothesis.SET, Hypothesis.STARTS} - {name}
+    rest -= {cast(Hypothesis, line.statement) for line in before}
+    text = "needs a tube"
+    lines += [Statement(each, Verdict.NOT_NEEDED, _PROOF, text=text) for each in rest]
+    return _Found(None, (*before, *lines))
+
+
+_NO_BORDER = "no border of flat coordinates can be met"
+
+
+def _set_lines(run: Stopping, borders: Sequence[Border], kind: Kind) -> Iterator[Statement]:
+    """Yield what set of starts is certified, and whether this run's lie in it."""
+    if not borders:
+        text = "its flat coordinates have no border: any state is a start"
+        yield Statement(Hypothesis.SET, Verdict.HOLDS, kind, math.inf, "everywhere", text)
+        yield Statement(Hypothesis.STARTS, Verdict.HOLDS, kind, 0.0, "inside", _NO_BORDER)
+        return
+    nearest = min(borders, key=lambda b: b.left)
+    yield _room_line(run, nearest, kind)
+    if not nearest.steepest > 0.0:
+        yield Statement(Hypothesis.STARTS, Verdict.NOT_NEEDED, kind, text="there is no set")
+        return
+    far, bound, remedy, reason = float(nearest.left), nearest.bound, "", ""
+    text = f"{nearest.what()} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
+    if not nearest.left > 0:
+        text = f"from these starts {nearest.what()} is not proved to stay above {bound.above:.4g}"
+        where, reason = nearest.outputs, text
+        remedy = f"start nearer to the leader's speed in {where}, start the leader on its path "
+        remedy += f"there, or lower `speed` of {where}, of the leader and the followers"
+    shown, holds = f"{far:.3g} left", Verdict.of(nearest.left > 0)
+    yield Statement(Hypothesis.STARTS, holds, kind, far, shown, text, remedy, reason)
+
+
+def _room_line(run: Stopping, border: Border, kind: Kind) -> Statement:
+    """Say how far starts may be off behind a leader that keeps to its path."""
+    bound, steepest, text = border.bound, border.steepest, ""
+    remedy, shown = "", f"{steepest:.3g} off"
+    if not border.fastest > 0.0:
+        text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
+        text, remedy = f"{text}ends at {bound.above:.3g}", "choose a path that keeps away from it"
+    elif not steepest > 0.0:
+        s = run.speed(run.law.ready.chains.outputs.index(bound.outputs[0]))
+        text = f"at a `speed` of {s:.3g} agreement alone may take {border.what()} to "
+        text = f"{text}{bound.above:.3g}, where the chart ends"
+        # What one link may have of a speed against the leader.
+        least = border.fastest / run.links
+        remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
+    holds, reason = Verdict.of(steepest > 0.0), text
+    if not text:
+        text = f"any place, with {bound.within}, and {border.speeds} so far off the leader's, "
+        text = f"{text}which keeps to its path in {border.outputs}"
+    return Statement(Hypothesis.SET, holds, kind, steepest, shown, text, remedy, reason)
+
+
+def _who(run: Stopping, borders: Sequence[Border]) -> str:
+    """Return which starts are meant, in words."""
+    if not borders:
+        return "any state of any agent"
+    within = " and ".join(b.bound.within for b in borders)
+    free = "any position, heading, sideways speed and turning"
+    free = "any position" if any(b.many for b in borders) else free
+    if not all(b.led for b in borders):
+        speeds = " and ".join(b.speeds for b in borders)
+        # Of the leader's speed against its path no more is used than what these starts ask for.
+        free = f"{free} of the followers, with {within}, their {speeds} as at these starts"
+        return f"{free}, and the leader as at these starts"
+    off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_turned(b)}" for b in borders)
+    return f"{free}, with {within}, and {off} of the leader's, which keeps to its path there"
+
+
+def _turned(border: Border) -> str:
+    """Return by what angle a velocity of the leader's size may be off it, in words."""
+    if math.isinf(border.turn):
+        return ""
+    return f" (at its speed, {border.turn:.3g} deg to either side)"
+
+
+def _positions(run: Stopping) -> tuple[int, ...]:
+    """Return which outputs are a position."""
+    outputs, position = run.law.ready.chains.outputs, run.parts.model.position
+    return tuple(k for k, name in enumerate(outputs) if name in position)

@@ -1,0 +1,216 @@
+"""A second opinion on a tube of T5, from what a run or a check has written of it.
+
+The certificate encloses polynomials by Bernstein's coefficients. Here sign changes are counted by
+Sturm's sequences, and between them everything is integrated by Gauss's quadrature; what a start and
+a bounded push do together is followed over time. Nothing of the certificate is used.
+"""
+
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from echelon.core.types import Array, PathLike
+from echelon.guarantees.verifier.findings import Finding, said, same
+from echelon.guarantees.verifier.motor_claims import motor_findings
+
+FORMAT = "echelon tube 1"
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
+_FINE = Fraction(1, 2**50)
+_CELLS = 6000
+"""Of the time in which the slowest mode falls by e^-30."""
+
+
+def read_tube(path: PathLike) -> Mapping[str, Any] | None:
+    """Return the tube that a file tells of: a run's summary or a check's JSON; else None."""
+    try:
+        told = json.loads(Path(path).read_text("utf-8"))
+    except (OSError, ValueError):
+        # Who reads gains says it better.
+        return None
+    promise = told.get("promise", told) if isinstance(told, dict) else {}
+    tube = promise.get("anywhere") if isinstance(promise, dict) else None
+    return tube if isinstance(tube, dict) and tube.get("format") == FORMAT else None
+
+
+def tube_findings(tube: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield what is found of each claim of a tube."""
+    for border in tube["borders"]:
+        roots = _exact(border["roots"])
+        name = ", ".join(f"`{output}`" for output in border["outputs"])
+        for order, stored in enumerate(border["gains"]):
+            found = _gain(roots, order)
+            yield same(f"gain {order} of {name}", stored, found, 1e-8, "quadrature between roots")
+        yield from _room(border, roots, name)
+    if tube.get("motors") is not None:
+        yield from motor_findings(tube["motors"])
+
+
+def _room(border: Mapping[str, Any], roots: Sequence[Fraction], name: str) -> Iterator[Finding]:
+    """Yield whether what is left to a border is left, and a start as steep as is claimed fits."""
+    order = int(border["derivative"]) - 1
+    allowed = float(border["path"]) - float(border["above"])
+    total = float(border["speed"]) + float(border["leader_speed"])
+    if len(border["outputs"]) > 1:
+        left = min(allowed - _length(roots, order, np.array(s), total) for s in border["starts"])
+    else:
+        pairs = itertools.product(border["leader_starts"], border["starts"])
+        both = [np.add(_padded(a, len(roots)), _padded(b, len(roots))) for a, b in pairs]
+        left = min(allowed - _fall(roots, order, start, total) for start in both)
+    stored = float(border["left"])
+    fine = 0.0 < stored <= left + 1e-9
+    yield said(f"room left to {name}", fine, stored, left, "followed over time")
+    steep = np.eye(len(roots))[0] * float(border["steepest"])
+    worst = min(
+        allowed - _fall(roots, order, sign * steep, float(border["speed"])) for sign in (-1.0, 1.0)
+    )
+    text = "what is left to a start so steep"
+    yield said(f"steepest start of {name}", worst >= -1e-9, border["steepest"], worst, text)
+
+
+def _exact(roots: Sequence[float]) -> list[Fraction]:
+    return [Fraction(str(root)) for root in roots]
+
+
+def _padded(start: Sequence[float], size: int) -> Array:
+    """Return a start as long as the roots; one that is left out is zero."""
+    return np.pad(np.asarray(start, float), (0, size - len(start)))
+
+
+# ---- by modes, in floats -------------------------------------------------------------------------
+
+
+def _residues(roots: Sequence[Fraction]) -> Array:
+    """Return c with h = sum c_i exp(-rho_i t) for k0 / q(s)."""
+    rho = np.array([float(root) for root in roots])
+    apart = [np.prod([b - a for j, b in enumerate(rho) if j != i]) for i, a in enumerate(rho)]
+    return np.prod(rho) / np.array(apart)
+
+
+def _fall(roots: Sequence[Fraction], order: int, start: Array, speed: float) -> float:
+    """Return how far v^(order) falls at most from a start under |w| <= speed, on a fine grid."""
+    free, moved = _followed(roots, order, start[None])
+    return float((speed * moved - free[0]).max())
+
+
+def _length(roots: Sequence[Fraction], order: int, starts: Array, speed: float) -> float:
+    """Return how long v^(order) of some outputs gets, from a start (m, p) each."""
+    free, moved = _followed(roots, order, starts)
+    return float((speed * moved + np.linalg.norm(free, axis=0)).max())
+
+
+def _followed(roots: Sequence[Fraction], order: int, starts: Array) -> tuple[Array, Array]:
+    """Return what starts (m, p) leave of v^(order) on a fine grid, and int |h^(order)| until it."""
+    rho = np.array([float(root) for root in roots])
+    times = np.linspace(0.0, 30.0 / rho.min(), _CELLS)
+    modes = np.linalg.solve(np.vander(-rho, increasing=True).T, starts.T).T
+    free = (modes * (-rho) ** order) @ np.exp(-np.outer(rho, times))
+    kernel = _residues(roots) * (-rho) ** order
+    # Cells with their middle and ends (Simpson's rule).
+    step = times[1]
+    ends = np.abs(kernel @ np.exp(-np.outer(rho, times)))
+    middles = np.abs(kernel @ np.exp(-np.outer(rho, times[:-1] + 0.5 * step)))
+    cells = step / 6.0 * (ends[:-1] + 4.0 * middles + ends[1:])
+    return free, np.concatenate([[0.0], np.cumsum(cells)])
+
+
+def _gain(roots: Sequence[Fraction], order: int) -> float:
+    """Return the integral of |h^(order)| over all time, and k0 more at the highest order."""
+    rho, c = np.array([float(root) for root in roots]), _residues(roots)
+    kernel = c * (-rho) ** order
+    # In s = exp(-unit t): dt = -ds / (unit s), and the powers are whole numbers.
+    unit = _unit(roots)
+    powers = [int(root / unit) for root in roots]
+    exact = _modes(roots, order)
+    cuts = [0.0, *map(float, _sign_changes(dict(zip(powers, exact, strict=True)))), 1.0]
+    total = 0.0
+    for a, b in itertools.pairwise(cuts):
+        s = 0.5 * (b - a) * _NODES + 0.5 * (a + b)
+        values = sum(k * s ** (n - 1) for k, n in zip(kernel, powers, strict=True)) / float(unit)
+        total += abs(float(0.5 * (b - a) * (_WEIGHTS @ values)))
+    return total + (float(np.prod(rho)) if order == len(roots) else 0.0)
+
+
+def _modes(roots: Sequence[Fraction], order: int) -> list[Fraction]:
+    """Return the coefficients of h^(order), exactly."""
+    k0, found = Fraction(1), list[Fraction]()
+    for root in roots:
+        k0 *= root
+    for root in roots:
+        apart = Fraction(1)
+        for other in roots:
+            apart *= other - root if other != root else 1
+        found.append(k0 / apart * (-root) ** order)
+    return found
+
+
+def _unit(roots: Sequence[Fraction]) -> Fraction:
+    """Return the largest number of which all roots are multiples (Euclid)."""
+    unit = roots[0]
+    for root in roots[1:]:
+        a, b = unit, root
+        while b:
+            a, b = b, a % b
+        unit = a
+    return unit
+
+
+# ---- sign changes by Sturm -----------------------------------------------------------------------
+
+
+def _sign_changes(p: Mapping[int, Fraction]) -> list[Fraction]:
+    """Return where a polynomial has roots in (0, 1), each to 2^-50."""
+    low = min(p)
+    dense = [p.get(n, Fraction(0)) for n in range(low, max(p) + 1)]
+    chain = _sturm(dense)
+    found, pieces = list[Fraction](), [(Fraction(0), Fraction(1))]
+    while pieces:
+        a, b = pieces.pop()
+        count = _variations(chain, a) - _variations(chain, b)
+        if not count:
+            continue
+        if b - a <= _FINE:
+            found.append((a + b) / 2)
+            continue
+        middle = (a + b) / 2
+        pieces += [(a, middle), (middle, b)]
+    return sorted(found)
+
+
+def _sturm(p: list[Fraction]) -> list[list[Fraction]]:
+    """Return Sturm's sequence of a polynomial by its coefficients, the lowest first."""
+    chain = [p, [n * c for n, c in enumerate(p)][1:]]
+    while len(chain[-1]) > 1:
+        rest = [-c for c in _remainder(chain[-2], chain[-1])]
+        if not any(rest):
+            break
+        chain.append(rest)
+    return [part for part in chain if part]
+
+
+def _remainder(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
+    a = list(a)
+    while len(a) >= len(b):
+        share, gap = a[-1] / b[-1], len(a) - len(b)
+        for k, c in enumerate(b):
+            a[gap + k] -= share * c
+        a.pop()
+    while a and not a[-1]:
+        a.pop()
+    return a
+
+
+def _variations(chain: list[list[Fraction]], x: Fraction) -> int:
+    """Return how often the signs of the sequence change at a place."""
+    signs = []
+    for part in chain:
+        total = Fraction(0)
+        for c in reversed(part):
+            total = total * x + c
+        if total:
+            signs.append(total > 0)
+    return sum(a != b for a, b in itertools.pairwise(signs))

@@ -1,0 +1,8 @@
+"""Pictures, words, files and pages."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach(
+    __name__,
+    submodules=["archive", "plots", "reports", "viewer"],
+)

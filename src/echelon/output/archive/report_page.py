@@ -1,0 +1,136 @@
+"""A run as one HTML page for people: table and sentences, promise, figures, scenario, versions."""
+
+import base64
+import io
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from echelon import __version__
+from echelon.experiments.results.recording import Recording
+from echelon.experiments.scenario.scenario import KEPT
+from echelon.output.plots.run_figures import USUAL, figures
+
+_STYLE = """
+body { max-width: 62rem; margin: 2rem auto; padding: 0 1.2rem; color: #1c2128; background: #fff;
+  font: 15px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { margin: 0; font-size: 1.7rem; } h2 { margin: 2.4rem 0 .6rem; font-size: 1.15rem; }
+.facts { color: #5c6773; margin: .2rem 0 1.4rem; }
+.promise { border-left: 4px solid #c8322b; background: #f7f8fa; padding: .7rem 1rem; }
+.promise.holds { border-color: #00805c; }
+pre { background: #f7f8fa; padding: .9rem 1rem; overflow-x: auto; font-size: 12px; line-height: 1.4;
+  border-radius: 6px; }
+figure { margin: 0 0 1.4rem; } img { max-width: 100%; height: auto; }
+figcaption { color: #5c6773; font-size: 13px; }
+table { border-collapse: collapse; } td { padding: .15rem 1.2rem .15rem 0; vertical-align: top; }
+.holds-not { color: #c8322b; }
+@media print { h2 { break-after: avoid; } figure { break-inside: avoid; } }
+"""
+_CAPTIONS = {
+    "leader_3d": "The leaders and what they follow.",
+    "trajectories": "All agents, with the graph at a few times.",
+    "tracking": "What the leaders' outputs are off their references.",
+    "formation": "How far followers are from their goals, with what is promised.",
+    "inputs": "What actuators give, with their limits.",
+    "lyapunov": "V and its derivative.",
+}
+
+
+def report_page(run: Recording, folder: Path | None) -> str:
+    """Return the page; texts that lie in the run's folder go into it.
+
+    Args:
+        run: what it shows.
+        folder: of the run; None where there is none, as for a dataset alone.
+    """
+    told = run.attributes
+    scenario = _text(folder, KEPT) or str(told.get("scenario_text", ""))
+    parts = [
+        f"<h1>{escape(run.name)}</h1>",
+        f'<p class="facts">{escape(_facts(run))}</p>',
+        _promise(run),
+        _section("What the run shows", _pre(_text(folder, "report.txt") or str(told["message"]))),
+        _section("Figures", "".join(_figures(run))),
+        _section("What the promise rests on", _hypotheses(run)),
+        _section("Scenario", _pre(scenario)) if scenario else "",
+        _section("Made with", _versions(told)),
+        _section("How to cite", _pre(citation())),
+    ]
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(run.name)}</title>'
+    view = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    return f"{head}{view}<style>{_STYLE}</style><body>{''.join(parts)}</body></html>\n"
+
+
+def citation() -> str:
+    """Return how to cite echelon and the paper that it builds on, as BibTeX."""
+    return (
+        "@software{echelon,\n"
+        "  title = {echelon: leader-follower formation tracking for control-affine nonlinear "
+        "agents},\n"
+        f"  author = {{{{The echelon developers}}}},\n  version = {{{__version__}}}\n}}\n"
+        "@inproceedings{enwerem2023consensus,\n"
+        "  title = {Consensus-Based Leader-Follower Formation Tracking for Control-Affine "
+        "Nonlinear Multiagent Systems},\n"
+        "  author = {Enwerem, Clinton and Baras, John S.},\n"
+        "  booktitle = {9th International Conference on Control, Decision and Information "
+        "Technologies (CoDIT)},\n  year = {2023},\n  note = {arXiv:2309.09156}\n}"
+    )
+
+
+def _facts(run: Recording) -> str:
+    return (
+        f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s; "
+        f"{run.attributes['message']}"
+    )
+
+
+def _promise(run: Recording) -> str:
+    state = " holds" if run.promise["promised"] else ""
+    return f'<p class="promise{state}">{escape(run.promise["sentence"])}</p>'
+
+
+def _section(title: str, content: str) -> str:
+    return f"<h2>{escape(title)}</h2>{content}"
+
+
+def _pre(text: str) -> str:
+    return f"<pre>{escape(text.rstrip())}</pre>"
+
+
+def _text(folder: Path | None, name: str) -> str:
+    file = None if folder is None else folder / name
+    return file.read_text("utf-8", "replace") if file is not None and file.is_file() else ""
+
+
+def _figures(run: Recording) -> list[str]:
+    found = []
+    for name, figure in figures(run, USUAL).items():
+        content = io.BytesIO()
+        figure.savefig(content, format="png", dpi=140)
+        data = base64.b64encode(content.getvalue()).decode("ascii")
+        words = _CAPTIONS[name]
+        image = f'<img alt="{words}" src="data:image/png;base64,{data}">'
+        found.append(f"<figure>{image}<figcaption>{words}</figcaption></figure>")
+    return found
+
+
+def _hypotheses(run: Recording) -> str:
+    rows = [
+        f"<tr><td>{escape(each['statement'])}</td>"
+        f"<td{_marked(each)}>{escape(each['verdict'])}</td><td>{escape(each['text'])}</td></tr>"
+        for each in run.promise["hypotheses"]
+    ]
+    return f"<table>{''.join(rows)}</table>"
+
+
+def _marked(each: dict[str, Any]) -> str:
+    return ' class="holds-not"' if each["verdict"] == "fails" else ""
+
+
+def _versions(told: Any) -> str:
+    rows = [
+        f"<tr><td>{escape(key[8:])}</td><td>{escape(str(text))}</td></tr>"
+        for key, text in told.items()
+        if str(key).startswith("version_")
+    ]
+    return f"<table>{''.join(rows)}</table>"

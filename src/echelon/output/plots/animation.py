@@ -1,0 +1,221 @@
+"""What moves in a video: links, goals, trails and bodies, drawn again for each picture."""
+
+import abc
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.experiments.results.recording import Recording
+from echelon.output.plots.agent_style import pen_of
+from echelon.output.plots.camera import Camera
+from echelon.output.plots.space import Space, body_width
+
+_FEW = 60
+"""Agents that are drawn as vehicles; more are dots, each kind of them one stroke of the pen."""
+_LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
+
+
+def moving_of(ax: Any, run: Recording, space: Space, camera: Camera) -> "Moving":
+    """Return what draws the agents of a run on axes of pixels."""
+    return (_Vehicles if run.agents <= _FEW else _Flock)(ax, run, space, camera)
+
+
+class Moving(abc.ABC):
+    """Draws a moment.
+
+    Attributes:
+        trail: seconds of a trail.
+        points: of it, at most.
+        artists: what is drawn, the first lowest.
+    """
+
+    trail: ClassVar[float]
+    points: ClassVar[int]
+
+    def __init__(self, ax: Any, run: Recording, space: Space, camera: Camera) -> None:
+        """Make the artists."""
+        from matplotlib.colors import to_rgba_array
+
+        self.run, self.space, self.camera, self.ax = run, space, camera, ax
+        # As an array, which no picture need read anew.
+        self.colours: Any = to_rgba_array(
+            [pen_of(run, agent)["color"] for agent in range(run.agents)]
+        )
+        self.size, self.offsets = body_width(run, space), scene_offsets(run, space)
+        thick = 1.1 if run.agents <= _FEW else 0.4
+        self.links = _stroke(ax, color=_LINK, linewidth=thick, alpha=0.8)
+        self.heads = _heads_on(ax) if run.agents <= _FEW and len(run.arrows) else None
+        self.clock = ax.text(14, ax.get_ylim()[1] - 26, "", size=13)
+        self.artists: list[Any] = []
+        self.prepare()
+        self.artists += [self.clock] if self.heads is None else [self.heads, self.clock]
+
+    @abc.abstractmethod
+    def prepare(self) -> None:
+        """Make artists of its own, between them the links."""
+
+    @abc.abstractmethod
+    def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
+        """Put agents (N, 3), their trails (K, N, 3) and goals (N, 3) where they are."""
+
+    def show(self, time: float, now: Array, passed: Array, angles: Array | None) -> None:
+        """Put everything where it is at a time."""
+        self.clock.set_text(f"{time:.2f} s")
+        there = self.run.linked(time)
+        _put(self.links, self.camera.project(now[self.run.edges[there]])[0])
+        if self.heads is not None:
+            self.heads.set_verts(self._heads(now, there))
+        goals = now[self.run.nearest] + self.offsets - self.offsets[self.run.nearest]
+        if self.space.kind == "time":
+            goals[:, 0] = now[:, 0]
+        self.draw(now, passed, goals, angles)
+
+    def _heads(self, now: Array, there: Array) -> list[Array]:
+        """Return the heads of arrows to those who alone hear along a link, off their bodies."""
+        arrows = self.run.arrows[there[self.run.heard.sum(axis=1) == 1]]
+        first, second = (self.camera.project(now[ends])[0] for ends in arrows.T)
+        beside = now[arrows[:, 1]] + 0.6 * self.size * self.camera.axes[0]
+        body = np.linalg.norm(self.camera.project(beside)[0] - second, axis=1)
+        whole = np.maximum(np.linalg.norm(second - first, axis=1), 1e-9)
+        way = ((second - first) / whole[:, None])[:, None]
+        gap, tall = np.minimum(body, 0.5 * whole), np.minimum(11.0, 0.4 * whole)
+        aside = np.stack([-way[..., 1], way[..., 0]], axis=-1)
+        back, out = np.array([[0.0], [1.0], [1.0]]), np.array([[0.0], [0.4], [-0.4]])
+        tip = (second - gap[:, None] * way[:, 0])[:, None]
+        return list(tip + tall[:, None, None] * (out * aside - back * way))
+
+
+@final
+class _Vehicles(Moving):
+    """Agents few enough to be seen one by one."""
+
+    trail, points = 4.0, 60
+
+    def prepare(self) -> None:
+        from matplotlib.collections import LineCollection, PolyCollection
+
+        ring = np.linspace(0.0, 2.0 * np.pi, 33)
+        self.ring = np.column_stack([np.cos(ring), np.sin(ring), 0.0 * ring])
+        self.trails = LineCollection([], linewidths=1.3, alpha=0.75, colors=self.colours)
+        self.goals = PolyCollection([], facecolors="none", edgecolors=_GOAL, linewidths=1.2)
+        self.arms = LineCollection([], linewidths=2.2)
+        self.rotors = PolyCollection([], linewidths=0.4, edgecolors="white")
+        self.shadows = PolyCollection([], facecolors=_SHADOW, edgecolors="none")
+        self.falls = LineCollection([], colors=_SHADOW, linewidths=0.8)
+        for part in (self.shadows, self.falls, self.trails, self.goals, self.arms, self.rotors):
+            self.ax.add_collection(part)
+        ground = [self.shadows, self.falls] if self.space.kind == "space" else []
+        self.artists = [*ground, self.trails, self.links, self.goals, self.arms, self.rotors]
+
+    def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
+        project = self.camera.project
+        self.trails.set_segments(list(project(passed.swapaxes(0, 1))[0]))
+        rings = goals[list(self.run.followers)][:, None] + 0.55 * self.size * self.ring
+        self.goals.set_verts(list(project(rings)[0]))
+        self._shade(now)
+        # Far ones first, so that near ones cover them.
+        order = np.argsort(-project(now)[1], kind="stable")
+        if self.space.shape != "quadrotor" or angles is None:
+            discs = project(now[:, None] + 0.3 * self.size * self._facing())[0]
+            self.rotors.set_verts(list(discs[order]))
+            self.rotors.set_facecolor(self.colours[order])
+            return
+        self._quadrotors(now, angles, order)
+
+    def _shade(self, now: Array) -> None:
+        """Put shadows under the agents: without them no height is told from a distance."""
+        project = self.camera.project
+        below = now * (1.0, 1.0, 0.0) + (0.0, 0.0, self.space.low[2])
+        self.shadows.set_verts(list(project(below[:, None] + 0.35 * self.size * self.ring)[0]))
+        self.falls.set_segments(list(project(np.stack([now, below], axis=1))[0]))
+
+    def _quadrotors(self, now: Array, angles: Array, order: Array) -> None:
+        project, size, turns = self.camera.project, self.size, rotations(angles)
+        hubs = size * 0.34 * np.array([[1, 1, 0], [-1, -1, 0], [1, -1, 0], [-1, 1, 0]], float)
+        placed = now[:, None] + hubs @ turns.swapaxes(1, 2)
+        arms = project(placed.reshape(-1, 2, 2, 3))[0]
+        self.arms.set_segments(list(arms[order].reshape(-1, 2, 2)))
+        pens: Any = np.repeat(self.colours[order], 4, axis=0)
+        self.arms.set_color(pens[::2])
+        discs = (hubs[:, None] + 0.23 * size * self.ring) @ turns[:, None].swapaxes(2, 3)
+        discs = project(now[:, None, None] + discs)[0]
+        self.rotors.set_verts(list(discs[order].reshape(-1, *self.ring.shape[:1], 2)))
+        self.rotors.set_facecolor(pens)
+        self.rotors.set_alpha(0.8)
+
+    def _facing(self) -> Array:
+        """Return a disc that faces the camera."""
+        return self.ring[:, :1] * self.camera.axes[0] + self.ring[:, 1:2] * self.camera.axes[1]
+
+
+@final
+class _Flock(Moving):
+    """So many agents that each is a dot, as large as it is near; leaders lie on top."""
+
+    trail, points = 1.0, 8
+
+    def prepare(self) -> None:
+        self.led, self.leaders = list(self.run.followers), list(self.run.leaders)
+        self.groups = [(who, self.colours[who[0]]) for who in (self.led, self.leaders) if who]
+        pens = [{"color": colour, "linewidth": 0.6, "alpha": 0.6} for _, colour in self.groups]
+        self.trails = [_stroke(self.ax, **pen) for pen in pens]
+        none: dict[str, Any] = {"s": 1.0, "linewidths": 0.5}
+        self.goals = self.ax.scatter([], [], facecolors="none", edgecolors=_GOAL, **none)
+        self.dots = [self.ax.scatter([], [], color=colour, **none) for _, colour in self.groups]
+        self.artists = [*self.trails, self.links, self.goals, *self.dots]
+
+    def draw(self, now: Array, passed: Array, goals: Array, angles: Array | None) -> None:
+        project = self.camera.project
+        self._spread(self.goals, goals[self.led], 0.45)
+        for (who, _), trail, dots in zip(self.groups, self.trails, self.dots, strict=True):
+            _put(trail, project(passed[:, who].swapaxes(0, 1))[0])
+            self._spread(dots, now[who], 0.25)
+
+    def _spread(self, dots: Any, places: Array, part: float) -> None:
+        """Put dots at places (K, 3), of a radius that is this part of a body."""
+        middle = self.camera.project(places)[0]
+        beside = self.camera.project(places + part * self.size * self.camera.axes[0])[0]
+        points = 72.0 / self.ax.figure.dpi
+        dots.set_offsets(middle)
+        # Of a marker the area of the square about it is told, in points.
+        dots.set_sizes((2.0 * points * (beside - middle)[:, 0]) ** 2)
+
+
+def _heads_on(ax: Any) -> Any:
+    """Return what draws heads of arrows."""
+    from matplotlib.collections import PolyCollection
+
+    return ax.add_collection(PolyCollection([], facecolors=_LINK, edgecolors="none", zorder=1.1))
+
+
+def _stroke(ax: Any, **pen: Any) -> Any:
+    """Return many lines of one look, drawn as one with gaps."""
+    return ax.plot([], [], **{"zorder": 1, **pen})[0]
+
+
+def _put(stroke: Any, lines: Array) -> None:
+    """Put lines (K, P, 2) where they are."""
+    gaps = np.full((len(lines), 1, 2), np.nan)
+    stroke.set_data(*np.concatenate([lines, gaps], axis=1).reshape(-1, 2).T)
+
+
+def scene_offsets(run: Recording, space: Space) -> Array:
+    """Return offsets as they are drawn, (N, 3)."""
+    offsets = np.zeros((run.agents, 3))
+    columns = run.offsets[:, list(space.axes)]
+    first = 1 if space.kind == "time" else 0
+    offsets[:, first : first + columns.shape[1]] = columns
+    offsets[:, :2] *= space.stretch
+    return offsets
+
+
+def rotations(angles: Array) -> Array:
+    """Return the matrices (N, 3, 3) of ZYX angles (N, 3)."""
+    (a, b, c), (d, e, f) = np.cos(angles).T, np.sin(angles).T
+    rows = [
+        [b * c, d * e * c - a * f, a * e * c + d * f],
+        [b * f, d * e * f + a * c, a * e * f - d * c],
+        [-e, d * b, a * b],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)

@@ -1,0 +1,319 @@
+"""Who hears whom, and the poles into which the disagreement splits."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.experiments.results.recording import Modes, Recording
+from echelon.output.plots import style as draw
+from echelon.output.plots.agent_style import MOST, pen_of, told_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_NUMBERED = 60
+"""With more agents than this, numbers would cover each other."""
+_STRETCHES = 6
+"""Of a graph that switches, drawn beside each other."""
+
+
+def modes(run: Recording) -> "Figure | None":
+    """Return the poles of every mode looked at; None where laws have no linearization."""
+    return None if run.modes is None else poles(run.modes)
+
+
+def poles(found: Modes) -> "Figure":
+    """Return poles in the complex plane, coloured by the eigenvalue of the graph."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    # Of complex ones the real part, which couplings are chosen by.
+    values, (real, imaginary) = (
+        np.real(found.eigenvalues),
+        (np.real(found.poles), np.imag(found.poles)),
+    )
+    width = draw.page().width
+    figure = Figure((width, 0.6 * width), layout="constrained")
+    ax = figure.add_subplot()
+    colour = np.repeat(values, real.shape[1])
+    norm = LogNorm(values[0], values[-1] if values[-1] > values[0] else 1.01 * values[0])
+    look = {"norm": norm, "cmap": "viridis", "edgecolors": "white", "linewidths": 0.4, "zorder": 3}
+    dots = ax.scatter(real.ravel(), imaginary.ravel(), 34, colour, **look)
+    ax.axvline(0.0, color=draw.EDGE, linewidth=0.9, zorder=2)
+    slowest = float(real.max())
+    ax.axvline(slowest, color=draw.COLOURS[1], linewidth=0.9, linestyle=(0, (4, 2)), zorder=2)
+    _wide_axis(ax, real, imaginary)
+    ax.set_xlabel("real part (1/s)")
+    ax.set_ylabel("imaginary part (rad/s)")
+    _name_slowest(ax, slowest)
+    # One eigenvalue has no scale.
+    if len(np.unique(values)) > 1:
+        bar = figure.colorbar(dots, ax=ax, pad=0.02, aspect=30)
+        bar.set_label("eigenvalue \u03bb of the graph")
+        _label_bar(bar, values)
+    return figure
+
+
+def _name_slowest(ax: Any, slowest: float) -> None:
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
+    near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
+    look = {"va": "bottom", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
+    # Above the poles and the axis, and within the paper on whichever side there is room.
+    place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
+    side = {"ha": "right" if place > 0.5 else "left"}
+    text = f"slowest: {slowest:.3g} 1/s".replace("-", "\u2212")
+    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near, **side)
+
+
+def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
+    """Use scales that show slow and fast poles alike, and end a little right of the axis."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+
+    sizes, heights = np.abs(real), np.abs(imaginary)
+    least, most = max(float(sizes.min()), 1e-6 * float(sizes.max())), float(sizes.max())
+    right = max(0.0, float(real.max()))
+    if most > 30.0 * least:
+        ax.set_xscale("symlog", linthresh=least, linscale=0.6)
+        told = FuncFormatter(lambda x, _: f"{x:g}".replace("-", "\u2212"))
+        ax.xaxis.set_major_formatter(told)
+        powers = 10.0 ** np.arange(np.floor(np.log10(least)), np.ceil(np.log10(most)) + 1.0)
+        # Nearer to 0 their numbers would cover each other.
+        powers = powers[powers > 0.5 * least]
+        ax.xaxis.set_major_locator(FixedLocator([*-powers[::-1], 0.0]))
+        # Between the powers they show that the axis is no straight one.
+        between = np.outer(powers, np.arange(2.0, 10.0)).ravel()
+        ax.xaxis.set_minor_locator(FixedLocator([*-between[between < 1.6 * most]]))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.set_xlim(-1.6 * most, 2.0 * right + 0.3 * least)
+    else:
+        ax.set_xlim(-1.08 * most, 1.1 * right + 0.08 * most)
+    turning = heights[heights > 1e-9 * most]
+    if turning.size and heights.max() > 30.0 * np.median(turning):
+        ax.set_yscale("symlog", linthresh=float(np.median(turning)))
+    if not turning.size:
+        ax.set_ylim(-1.0, 1.0)
+
+
+def _label_bar(bar: Any, values: Array) -> None:
+    """Name each eigenvalue on the colour bar where they are few, else only powers of ten."""
+    from matplotlib.ticker import NullLocator
+
+    if len(values) <= 8:
+        bar.set_ticks(values, labels=[f"{value:.3g}" for value in values])
+        bar.ax.yaxis.set_minor_locator(NullLocator())
+
+
+# ---- the graph --------------------------------------------------------------------------------
+
+
+def network(run: Recording) -> "Figure":
+    """Return who hears whom: agents where the formation puts them, or around a circle.
+
+    An arrow goes to who hears; a line without one is heard both ways, a dotted one by nobody. A
+    graph that switches has a panel for each stretch of time, six at most; of a huge swarm it is
+    those about the leaders.
+    """
+    from matplotlib.figure import Figure
+
+    whole, run = run, _about_leaders(run)
+    places, units = _places(run)
+    stretches = _stretches(run)
+    columns = min(len(stretches), 2 if draw.page().narrow else 3)
+    rows = -(-len(stretches) // columns)
+    width = draw.page().width
+    # A lone panel of a wide page would be needlessly high.
+    room = 0.85 * width / columns * (0.75 if columns == 1 and not draw.page().narrow else 1.0)
+    size = np.ptp(places, axis=0)
+    least = _dot(run, columns) / 144.0 * max(size[0] / room, size[1] / (0.8 * room))
+    lines = curves_of(places, run.edges, least)
+    size = np.ptp(np.concatenate([places, *lines]), axis=0)
+    tall = float(np.clip(size[1] / max(size[0], 1e-9), 0.3, 0.8))
+    figure = Figure((width, rows * (0.75 + room * tall)), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, (title, weights) in zip(panels, stretches, strict=False):
+        _agents_and_links(ax, run, places, lines, weights, columns)
+        _finish_network(ax, np.concatenate([places, *lines]), units)
+        told = ", ".join(filter(None, [title, told_of(whole, run.agents)]))
+        ax.set_title(told, size=draw.page().letters)
+    for ax in panels[len(stretches) :]:
+        ax.axis("off")
+    return figure
+
+
+def _about_leaders(run: Recording) -> Recording:
+    """Return a recording of the agents that the fewest links part from a leader."""
+    if run.agents <= MOST:
+        return run
+    from scipy import sparse
+
+    (i, j), ones = run.edges.T, np.ones(len(run.edges), np.int8)
+    links = sparse.csr_array(sparse.coo_array((ones, (i, j)), (run.agents, run.agents)))
+    far = sparse.csgraph.dijkstra(
+        links, directed=False, indices=run.leaders, unweighted=True, min_only=True
+    )
+    kept = np.sort(np.argsort(far, kind="stable")[:MOST])
+    there = np.isin(run.edges, kept).all(axis=1)
+    schedule = run.schedule and run.schedule._replace(weights=run.schedule.weights[:, there])
+    return dataclasses.replace(
+        run,
+        **{name: getattr(run, name)[:, kept] for name in ("states", "inputs", "errors")},
+        **{name: getattr(run, name)[kept] for name in ("offsets", "limited")},
+        leaders=tuple(np.flatnonzero(np.isin(kept, run.leaders)).tolist()),
+        nearest=np.zeros(len(kept), int),
+        edges=np.searchsorted(kept, run.edges[there]),
+        weights=run.weights[there],
+        heard=run.heard[there],
+        schedule=schedule,
+    )
+
+
+def _stretches(run: Recording) -> list[tuple[str, Array]]:
+    """Return the weights (E,) of each stretch of time, with when that is."""
+    if run.schedule is None:
+        return [("", run.weights)]
+    spans = list(run.schedule.spans())[:_STRETCHES]
+    if len(run.schedule.starts) > _STRETCHES:
+        spans[-1] += f", of {len(run.schedule.starts)} stretches"
+    return list(zip(spans, run.schedule.weights, strict=False))
+
+
+def _dot(run: Recording, columns: int) -> float:
+    """Return the size of an agent's dot, in points."""
+    return 12.0 * draw.crowding(run.agents) ** 0.3 / columns**0.4
+
+
+def _agents_and_links(
+    ax: Any, run: Recording, places: Array, lines: list[Array], weights: Array, columns: int
+) -> None:
+    small = _dot(run, columns) / 12.0
+    _links(ax, run, places, lines, weights, small)
+    for agent in range(run.agents):
+        leads = agent in run.leaders
+        look = draw.dots("s" if leads else "o", pen_of(run, agent)["color"], 12.0 * small)
+        draw.plot(ax, places[agent][None], **look)
+    for agent in range(run.agents if run.agents <= _NUMBERED else 0):
+        text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
+        ax.annotate(str(agent), places[agent], ha="center", va="center", **text)
+
+
+def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
+    """Return where agents are drawn (N, 2), with the axes' texts where these are places."""
+    offsets = run.offsets[:, list(run.position)]
+    spread = np.ptp(offsets, axis=0) if run.position else np.zeros(0)
+    axes = np.argsort(-spread, kind="stable")[:2]
+    apart = len(np.unique(offsets.round(9), axis=0)) == run.agents
+    if len(axes) == 2 and spread[axes[1]] > 1e-9 and apart:
+        axes = np.sort(axes)
+        names = [run.state_names[run.position[k]] for k in axes]
+        return offsets[:, axes], tuple(f"{name} offset (m)" for name in names)
+    turn = 2.0 * np.pi * np.arange(run.agents) / run.agents
+    return np.column_stack([np.sin(turn), np.cos(turn)]), ()
+
+
+_BENDS = tuple(side * height for height in (0.16, 0.24, 0.1, 0.34) for side in (1.0, -1.0))
+"""How far a link may bend aside, in its lengths; those that look best first."""
+_ALONG = np.linspace(0.0, 1.0, 25)[:, None]
+
+
+def curves_of(places: Array, edges: Array, least: float) -> list[Array]:
+    """Return the line (K, 2) of each edge: straight, or bent where it would hide behind an agent.
+
+    A straight one passes no third of the places (N, 2) nearer than `least`; of a link that has to
+    bend it is the first bend that does so, or where none does the one that keeps the farthest off.
+    Of more agents than have numbers all are straight.
+    """
+    straight = list(places[edges])
+    if len(places) > _NUMBERED:
+        return straight
+    return [
+        line if _gap(places, edge, line) > least else _bend(places, edge, least)
+        for edge, line in zip(edges, straight, strict=True)
+    ]
+
+
+def _bend(places: Array, edge: Array, least: float) -> Array:
+    # Links that begin at agents beside each other go to different sides.
+    bends = [bend * (-1.0) ** int(edge.min()) for bend in _BENDS]
+    lines = [_arc(places[edge[0]], places[edge[1]], bend) for bend in bends]
+    gaps = [_gap(places, edge, line) for line in lines]
+    clear = [line for line, gap in zip(lines, gaps, strict=True) if gap > least]
+    return clear[0] if clear else lines[int(np.argmax(gaps))]
+
+
+def _arc(first: Array, second: Array, bend: float) -> Array:
+    """Return a parabola (K, 2) between two places, `bend` of their distance aside in its middle."""
+    way = second - first
+    aside = 4.0 * bend * _ALONG * (1.0 - _ALONG)
+    return first + _ALONG * way + aside * np.array([-way[1], way[0]])
+
+
+def _gap(places: Array, edge: Array, line: Array) -> float:
+    """Return how near a line (K, 2) comes to a place (N, 2) of no end of its edge."""
+    others = np.delete(places, edge, axis=0)[:, None]
+    if not len(others):
+        return np.inf
+    begin, way = line[:-1], np.diff(line, axis=0)
+    share = ((others - begin) * way).sum(axis=2) / np.maximum((way**2).sum(axis=1), 1e-300)
+    nearest = begin + np.clip(share, 0.0, 1.0)[:, :, None] * way
+    return float(np.linalg.norm(others - nearest, axis=2).min())
+
+
+def _links(
+    ax: Any, run: Recording, places: Array, curves: list[Array], weights: Array, small: float
+) -> None:
+    """Draw the edges, thicker where they weigh more."""
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    wide = np.clip(1.6 * np.sqrt(weights / run.weights.max()), 0.3, 1.6) * small
+    there, unheard = weights > 0.0, ~run.heard.any(axis=1)
+    for kept, dash in ((there & ~unheard, "-"), (there & unheard, (0, (1.0, 2.0)))):
+        lines = [curves[k] for k in np.flatnonzero(kept)]
+        look = {"linewidths": wide[kept], "colors": "0.55", "linestyles": [dash], "zorder": 1}
+        ax.add_collection(LineCollection(lines, **look))
+    one = run.heard.sum(axis=1) == 1
+    arrows, pens = run.arrows[there[one]], wide[one & there]
+    ways = [curves[k] for k in np.flatnonzero(one & there)]
+    if run.agents > _NUMBERED:
+        tall = 0.4 * float(np.sqrt(np.ptp(places, axis=0).prod() / run.agents))
+        heads = PolyCollection(_heads(places[arrows], tall), facecolors="0.35", zorder=2)
+        ax.add_collection(heads)
+        return
+    for (first, second), line, way in zip(arrows, pens, ways, strict=True):
+        arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0 * small}
+        arrow["connectionstyle"] = f"arc3,rad={_bulge(places[first], places[second], way)}"
+        ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+
+
+def _bulge(first: Array, second: Array, line: Array) -> float:
+    """Return how far right of its way an arrow's middle handle stands, in lengths of the way."""
+    way, aside = second - first, line.mean(axis=0) - 0.5 * (first + second)
+    whole = float(way @ way)
+    if len(line) == 2 or whole <= 0.0:
+        return 0.0
+    # Samples of 4 s (1 - s) have this mean, and the handle stands twice as far as the middle.
+    mean = float((4.0 * _ALONG * (1.0 - _ALONG)).mean())
+    return 2.0 * float(aside @ [way[1], -way[0]]) / (mean * whole)
+
+
+def _heads(ends: Array, tall: float) -> list[Array]:
+    """Return triangles on the way between ends (K, 2, 2), a little nearer to the second."""
+    way = ends[:, 1] - ends[:, 0]
+    whole = np.maximum(np.linalg.norm(way, axis=1), 1e-12)[:, None]
+    aside = np.stack([-way[:, 1], way[:, 0]], axis=1) / whole
+    tall_each = np.minimum(tall, 0.3 * whole)
+    tip = ends[:, 0] + 0.7 * way
+    back, out = tip - tall_each * way / whole, 0.4 * tall_each * aside
+    return list(np.stack([tip, back + out, back - out], axis=1))
+
+
+def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:
+    low, high = places.min(axis=0), places.max(axis=0)
+    room = 0.08 * float((high - low).max()) or 1.0
+    ax.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+    ax.set_aspect("equal")
+    if units:
+        ax.set(xlabel=units[0], ylabel=units[1])
+    else:
+        ax.axis("off")

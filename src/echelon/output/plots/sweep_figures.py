@@ -1,0 +1,125 @@
+"""The figures of a sweep: how often runs settle, and what follows from one or two keys."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from echelon.core.types import Array
+from echelon.experiments.sweeps.axes import SEED
+from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
+from echelon.output.plots import style as draw
+from echelon.output.plots.figure_files import save
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+_NUMBERS = {
+    "formation_rmse": "formation RMSE",
+    "worst_final_error": "worst final error",
+    "worst_settling_time": "settling time",
+}
+
+
+def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
+    """Return the figures of a sweep, by name.
+
+    `errors` shows how errors and times are distributed, `success` the share of runs that settle
+    over each key of numbers but the seed, with intervals of 95 %, and `region` that share over the
+    first two of them.
+    """
+    keys = [key for key in map(str, data["outcome"].dims) if key != SEED and _is_line(data, key)]
+    with draw.style():
+        made = {"errors": _distributions(data)}
+        if keys:
+            made["success"] = _success(data, keys)
+        if len(keys) > 1:
+            made["region"] = _region(data, keys[0], keys[1])
+    return made
+
+
+def save_sweep_figures(data: "xr.Dataset", folder: Path) -> None:
+    """Write each figure of a sweep as PNG and PDF under `folder`/figures.
+
+    Raises:
+        OSError: the folder or a file cannot be written.
+    """
+    save(sweep_figures(data), folder / "figures")
+
+
+def _is_line(data: "xr.Dataset", key: str) -> bool:
+    """Tell whether a key has several numbers for values."""
+    return data.sizes[key] > 1 and np.issubdtype(data[key].dtype, np.number)
+
+
+def _canvas(columns: int) -> "tuple[Figure, list[Any]]":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
+    axes = figure.subplots(1, columns, squeeze=False)[0]
+    return figure, list(axes)
+
+
+def _distributions(data: "xr.Dataset") -> "Figure":
+    """Return the shares of runs below each value, as lines."""
+    figure, axes = _canvas(len(_NUMBERS))
+    for ax, (name, text) in zip(axes, _NUMBERS.items(), strict=True):
+        values = np.sort(data[name].values.ravel())
+        values = values[np.isfinite(values)]
+        ax.set_xlabel(draw.label(text, data[name].attrs.get("units", "")))
+        ax.set_ylim(0.0, 1.02)
+        if not values.size:
+            continue
+        # Of all runs: those that have no such number are above any.
+        share = np.arange(1, len(values) + 1) / data["outcome"].size
+        keep = draw.thin(len(values))
+        ax.step(values[keep], share[keep], where="post", color=draw.COLOURS[0])
+        _scale(ax, "x", values)
+    axes[0].set_ylabel("share of runs below")
+    return draw.finish(figure)
+
+
+def _share(data: "xr.Dataset", keys: list[str]) -> "tuple[xr.DataArray, xr.DataArray]":
+    """Return how many runs settled over some keys, and of how many."""
+    others = [dim for dim in data["outcome"].dims if dim not in keys]
+    there = data["outcome"] != data["outcome"].attrs["flag_values"][0]
+    return succeeded(data).sum(others), there.sum(others)
+
+
+def _success(data: "xr.Dataset", keys: list[str]) -> "Figure":
+    figure, axes = _canvas(len(keys[:3]))
+    for ax, key in zip(axes, keys, strict=False):
+        settled, runs = (part.sortby(key) for part in _share(data, [key]))
+        values, rate = settled[key].values, settled.values / np.maximum(1, runs.values)
+        low, high = share_bounds(settled.values, np.maximum(1, runs.values))
+        bars = np.abs(np.stack([rate - low, high - rate]))
+        look = {"marker": "o", "markersize": 3, "linestyle": ":", "elinewidth": 0.9, "capsize": 2}
+        ax.errorbar(values, rate, bars, color=draw.COLOURS[0], linewidth=0.7, **look)
+        _scale(ax, "x", values)
+        ax.set_xlabel(key)
+        ax.set_ylim(-0.03, 1.03)
+    axes[0].set_ylabel("share of runs that settle")
+    return draw.finish(figure)
+
+
+def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
+    """Return the share of runs that settle as colours over two keys."""
+    settled, runs = (part.sortby([first, second]) for part in _share(data, [first, second]))
+    rate = (settled / runs.clip(min=1)).transpose(second, first)
+    figure, (ax,) = _canvas(1)
+    x, y = rate[first].values, rate[second].values
+    shown = ax.pcolormesh(x, y, rate.values, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
+    _scale(ax, "x", x)
+    _scale(ax, "y", y)
+    ax.grid(False)
+    ax.set_xlabel(first)
+    ax.set_ylabel(second)
+    figure.colorbar(shown, ax=ax, label="share of runs that settle")
+    return draw.finish(figure)
+
+
+def _scale(ax: Any, which: str, values: Array) -> None:
+    """Choose a logarithmic axis for values that are spread over decades."""
+    if values.min() > 0.0 and values.max() >= 30.0 * values.min():
+        getattr(ax, f"set_{which}scale")("log")

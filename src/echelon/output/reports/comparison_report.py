@@ -1,0 +1,307 @@
+"""A comparison as a table and a paragraph, made from its numbers."""
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from echelon.core.errors import Outcome
+from echelon.experiments.studies.compare import Comparison, Row
+from echelon.guarantees.promises.promise import Promise
+from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
+from echelon.output.reports.run_report import say
+from echelon.simulation.step.solver_stats import SolverStats
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+_NAMED = 4
+"""With more followers than this the table shows the worst one alone."""
+_ROUNDING_LEVEL = 1e-12
+"""Steady errors below this are rounding, and none of them is better than another."""
+
+_ALIKE = 1.5
+"""Computing times within this factor are told as alike: they are measured on a shared machine."""
+
+
+def comparison_report(comparison: Comparison, width: int = 200) -> str:
+    """Return a comparison as plain text."""
+    from rich.console import Console
+
+    text = io.StringIO()
+    console = Console(file=text, width=width, color_system=None)
+    print_comparison(console, comparison)
+    return text.getvalue().rstrip("\n")
+
+
+def print_comparison(console: "Console", comparison: Comparison) -> None:
+    """Print a comparison on a rich console: two tables, then what they show."""
+    printed = _is_papers(comparison)
+    console.print(_errors_table(comparison, printed))
+    console.print(_costs_table(comparison))
+    for row in comparison.rows:
+        for sentence in _remarks(row):
+            say(console, f"{row.label}: {sentence}")
+    say(console, " ".join(verdict(comparison)))
+    if printed:
+        say(console, ROUNDING)
+
+
+def _is_papers(comparison: Comparison) -> bool:
+    flown = [row.flight.result for row in comparison.rows if row.flight is not None]
+    return bool(flown) and is_papers_experiment(
+        comparison.scenario, type(flown[0].model).__name__, flown[0].graph.agents
+    )
+
+
+# ---- tables -------------------------------------------------------------------------------------
+
+
+def _errors_table(comparison: Comparison, printed: bool) -> "Table":
+    """Return the errors, a row a method: the paper's Table II with a steady part."""
+    followers = _followers(comparison)
+    whole, last = f"{comparison.horizon:.3g} s", f"last {comparison.steady_window:.3g} s"
+    heads = ["leader", *(f"F{k}" for k in followers)] if followers else ["leader", "worst F"]
+    title = f"{comparison.scenario}, {whole}: RMSE" + "".join(
+        f", {text}" for text in comparison.conditions
+    )
+    columns = [f"{head}\n{whole}" for head in heads] + [f"{head}\n{last}" for head in heads]
+    table = _table(title, [*columns, "within 1 cm\nfrom, s"])
+    for row in comparison.rows:
+        table.add_row(row.label, *_errors(row, bool(followers)))
+    if printed:
+        table.add_section()
+        for method, values in PRINTED.items():
+            cells = [_number(value) for value in values]
+            table.add_row(f"printed, {method}", *cells, *[""] * (len(columns) - len(cells) + 1))
+    return table
+
+
+def _followers(comparison: Comparison) -> Sequence[int]:
+    flown = [row.flight.result.graph for row in comparison.rows if row.flight is not None]
+    return flown[0].followers if flown and len(flown[0].followers) <= _NAMED else ()
+
+
+def _errors(row: Row, named: bool) -> Iterator[str]:
+    """Yield the cells of one method: whole-run errors, steady errors, settling time."""
+    if row.flight is None or row.numbers is None:
+        return
+    leader, followers = row.numbers.leader, row.numbers.followers
+    yield _number(leader.rmse)
+    yield from [_number(f.rmse) for f in followers] if named else [_number(row.whole)]
+    yield _number(leader.steady_rmse)
+    yield from [_number(f.steady_rmse) for f in followers] if named else [_number(row.steady)]
+    yield "never" if row.settled is None else f"{row.settled:.3g}"
+
+
+def _costs_table(comparison: Comparison) -> "Table":
+    """Return what each method asks for, a row a method."""
+    table = _table(
+        "what it takes",
+        [
+            *("effort", "limited,\n% steps", "least\ndistance", "computing,\nms per agent s"),
+            *("promised,\n1/s", "told"),
+        ],
+    )
+    table.columns[-1].justify = "left"
+    table.columns[-1].no_wrap = False
+    for row in comparison.rows:
+        if row.flight is None or row.numbers is None:
+            table.add_row(row.label)
+            continue
+        table.add_row(
+            row.label,
+            _number(row.effort),
+            f"{100.0 * row.numbers.saturation_fraction:.3g}",
+            _number(row.numbers.minimum_distance),
+            f"{1e3 * row.flight.computing:.3g}",
+            _promised(row.flight.promise),
+            ", ".join(row.flight.told) or "nothing",
+        )
+    return table
+
+
+def _table(title: str, columns: Sequence[str]) -> "Table":
+    """Return a table whose row labels are never cut, however narrow the terminal is."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    width = max(len(f"printed, {method}") for method in PRINTED)
+    table.add_column("method", no_wrap=True, min_width=width)
+    for column in columns:
+        table.add_column(column, justify="right", overflow="fold")
+    return table
+
+
+def _promised(promise: Promise) -> str:
+    """Return the rate that is promised, with its theorem if there is one."""
+    if promise.rate is None:
+        return "nothing"
+    by = "" if promise.theorem is None else f" ({promise.kind}, {promise.theorem})"
+    return f"{promise.rate:.3g}{by}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _remarks(row: Row) -> Iterator[str]:
+    """Yield what a row's numbers cannot say: why it did not fly, how it ended, its solver."""
+    if row.flight is None:
+        yield row.reason
+        return
+    result = row.flight.result
+    if result.outcome is not Outcome.COMPLETED:
+        yield result.message
+    if row.flight.solver is not None:
+        yield _solving(row.flight.solver)
+    yield from row.flight.result.warnings
+
+
+def _solving(figures: SolverStats) -> str:
+    """Return what solving took, in a sentence."""
+    return (
+        f"{figures.solver} made {figures.solves} plans with {figures.failures} failures, in "
+        f"{figures.median_ms:.3g} ms (median; 99th percentile {figures.p99_ms:.3g}, worst "
+        f"{figures.worst_ms:.3g}) each; iterations: median {figures.iterations_median:.3g}, worst "
+        f"{figures.iterations_worst}."
+    )
+
+
+# ---- the paragraph ------------------------------------------------------------------------------
+
+
+def verdict(comparison: Comparison) -> tuple[str, ...]:
+    """Return who wins where, a sentence each, from the numbers alone."""
+    flown = [row for row in comparison.rows if row.flight is not None and row.numbers is not None]
+    stayed = [row for row in flown if row.converged]
+    some = 0 < len(stayed) < len(flown)
+    return tuple(
+        sentence
+        for sentence in (
+            _lost(flown, stayed),
+            _of_those(some, _closest(stayed or flown)),
+            _best(stayed, "settles first", lambda row: row.settled, "s"),
+            _best(flown, "has the smallest error over the whole run", lambda row: row.whole, "m"),
+            _leader(flown),
+            _of_those(some, _best(stayed, "asks the least of the inputs", _effort, "")),
+            _of_those(some, _cheapest(stayed)),
+        )
+        if sentence
+    )
+
+
+def _of_those(some: bool, sentence: str) -> str:
+    """Say of a sentence on those that settle that it is, where others do not."""
+    if not some or not sentence:
+        return sentence
+    return f"Of those that settle, {sentence.replace('All ', 'all ', 1)}"
+
+
+def _effort(row: Row) -> float | None:
+    return row.effort
+
+
+def _lost(flown: Sequence[Row], stayed: Sequence[Row]) -> str:
+    lost = [row.label for row in flown if row not in stayed]
+    if not lost:
+        return f"All {len(flown)} methods bring every follower within 1 cm."
+    verb = "does" if len(lost) == 1 else "do"
+    return f"{_listed(lost)} {verb} not bring every follower within 1 cm."
+
+
+def _closest(rows: Sequence[Row]) -> str:
+    """Tell who ends closest; errors at the level of rounding are a tie."""
+    known = {row.label: row.steady for row in rows if row.steady is not None}
+    if not known:
+        return ""
+    tied = [label for label, value in known.items() if value <= _ROUNDING_LEVEL]
+    if len(tied) > 1:
+        return f"{_listed(tied)} end at the level of rounding."
+    return _best(rows, "ends closest", lambda row: row.steady, "m")
+
+
+def _best(rows: Sequence[Row], what: str, of: Callable[[Row], float | None], unit: str) -> str:
+    """Tell who has the least of a number, and how far the next is behind."""
+    # Of NaN `>=` says no, and it would break the order.
+    known = sorted(
+        (value, row.label) for row in rows if (value := of(row)) is not None and value >= 0.0
+    )
+    if not known:
+        return ""
+    (least, label), *others = known
+    text = f"{label} {what} ({least:.3g}{' ' + unit if unit else ''}"
+    if others:
+        text += f"; next {others[0][1]}, {others[0][0]:.3g}"
+    return text + ")."
+
+
+def _leader(rows: Sequence[Row]) -> str:
+    known = {row.label: row.numbers.leader.rmse for row in rows if row.numbers is not None}
+    values = {label: value for label, value in known.items() if value is not None}
+    if not values:
+        return ""
+    least, most = min(values, key=values.__getitem__), max(values, key=values.__getitem__)
+    # Most methods leave the leader's law as it is, and then rounding alone parts its runs.
+    if values[most] <= 1.001 * values[least]:
+        return f"The leader does alike under all, {values[least]:.3g} m."
+    return (
+        f"The leader does best under {least}, {values[least]:.3g} m against {values[most]:.3g} m "
+        f"under {most}."
+    )
+
+
+def _cheapest(rows: Sequence[Row]) -> str:
+    known = {row.label: row.flight.computing for row in rows if row.flight is not None}
+    if len(known) < 2:
+        return ""
+    least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
+    # A run of one chunk is all compilation to the watch, and its computing time is 0.
+    ratio = known[most] / max(known[least], 1e-12)
+    if ratio < _ALIKE:
+        return "All take about as long to compute."
+    return f"{least} takes the least computing, {most} {ratio:.0f} times as much."
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return labels[0] if len(labels) == 1 else f"{', '.join(labels[:-1])} and {labels[-1]}"
+
+
+# ---- data ---------------------------------------------------------------------------------------
+
+
+def comparison_mapping(comparison: Comparison) -> dict[str, Any]:
+    """Return a comparison ready for JSON; what does not exist is None."""
+    return {
+        "scenario": comparison.scenario,
+        "horizon_s": comparison.horizon,
+        "steady_window_s": comparison.steady_window,
+        "conditions": list(comparison.conditions),
+        "methods": {row.label: _row_mapping(row) for row in comparison.rows},
+        "printed": {name: list(values) for name, values in PRINTED.items()}
+        if _is_papers(comparison)
+        else None,
+        "verdict": " ".join(verdict(comparison)),
+    }
+
+
+def _row_mapping(row: Row) -> dict[str, Any]:
+    if row.flight is None or row.numbers is None:
+        return {"reason": row.reason}
+    result, numbers = row.flight.result, row.numbers
+    return {
+        "outcome": result.outcome.name.lower(),
+        "leader_rmse": numbers.leader.rmse,
+        "leader_steady_rmse": numbers.leader.steady_rmse,
+        "follower_rmse": {str(f.agent): f.rmse for f in numbers.followers},
+        "follower_steady_rmse": {str(f.agent): f.steady_rmse for f in numbers.followers},
+        "settling_time_s": row.settled,
+        "effort": row.effort,
+        "saturation_fraction": numbers.saturation_fraction,
+        "minimum_distance": numbers.minimum_distance,
+        "computing_s_per_agent_s": row.flight.computing,
+        "promise": row.flight.promise.as_mapping(),
+        "told": list(row.flight.told),
+        "solver": None if row.flight.solver is None else row.flight.solver._asdict(),
+    }

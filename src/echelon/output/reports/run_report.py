@@ -1,0 +1,134 @@
+"""The report of a run on the screen.
+
+A table like the paper's Table II, and what it shows, in sentences.
+"""
+
+import io
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
+
+from echelon.experiments.results.metrics import (
+    FollowerMetrics,
+    LeaderMetrics,
+    Metrics,
+    metrics,
+    representatives,
+    steady_error,
+)
+from echelon.output.reports.explanation import explain
+from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
+from echelon.simulation.engine.result import Result
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+# Above this many of a role the table shows the best, the median and the worst instead of all.
+_MANY = 12
+
+
+def report(result: Result) -> str:
+    """Return the report of a run as plain text."""
+    from rich.console import Console
+
+    text = io.StringIO()
+    # Called a terminal so that sentences wrap; without colours it is plain text all the same.
+    console = Console(file=text, width=100, color_system=None, force_terminal=True)
+    print_report(console, result, metrics(result))
+    return text.getvalue().rstrip("\n")
+
+
+def print_report(console: "Console", result: Result, numbers: Metrics) -> None:
+    """Print the report of a run on a rich console."""
+    scenario, model = result.provenance.get("scenario", ""), type(result.model).__name__
+    printed = is_papers_experiment(scenario, model, result.graph.agents)
+    console.print(_table(result, numbers, printed))
+    sentences = [*explain(result, numbers), *(f"Warning: {text}" for text in result.warnings)]
+    for sentence in [*sentences, ROUNDING] if printed else sentences:
+        say(console, sentence)
+
+
+def say(console: "Console", sentence: str) -> None:
+    """Print a sentence as an item of a list, on one line where the output is no terminal."""
+    console.print(f"- {sentence}", highlight=False, markup=False, soft_wrap=not console.is_terminal)
+
+
+def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
+    from rich import box
+    from rich.table import Table
+
+    unit = "" if result.unit == "state" else f", {result.unit}"
+    steady = f"steady{unit}\n(last {numbers.steady_window:.3g} s)"
+    settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
+    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
+    if printed:
+        columns += ["printed,\nconsensus", "printed,\noptimiz."]
+    title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
+    for row in _rows(result, numbers, printed):
+        table.add_row(*row)
+    return table
+
+
+def _length(result: Result) -> str:
+    """Return how long the run was, and how long it should have been where that is not the same."""
+    horizon = f"{result.settings.horizon:g} s"
+    if result.outcome.reached:
+        return horizon
+    return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
+
+
+def _title(result: Result) -> str:
+    return (
+        result.provenance.get("scenario")
+        or f"{result.graph.agents} x {type(result.model).__name__}"
+    )
+
+
+def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
+    leaders, followers = numbers.leaders, numbers.followers
+    # One leader needs no number, and has its name from the paper's table.
+    alone = ["leader"] if len(leaders) == 1 else None
+    rows = [_leader_row(label, each) for label, each in labelled("leader", leaders, alone)]
+    rows += [_follower_row(label, each) for label, each in labelled("follower", followers)]
+    if printed:
+        for k, row in enumerate(rows):
+            row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
+    return rows
+
+
+_Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)
+
+
+def labelled(
+    role: str, each: Sequence[_Row], labels: list[str] | None = None
+) -> Iterator[tuple[str, _Row]]:
+    """Yield all of a role, or of many the best, the median and the worst, each with its label."""
+    kinds, chosen = [""] * len(each), each
+    if len(each) > _MANY:
+        kinds, chosen = ["best ", "median ", "worst "], representatives(each, steady_error)
+    names = labels or [f"{role} {one.agent}" for one in chosen]
+    for kind, name, one in zip(kinds, names, chosen, strict=True):
+        yield (f"{kind}({name})" if kind else name), one
+
+
+def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:
+    errors = [_number(leader.rmse), _number(leader.steady_rmse)]
+    return [label, *errors, "", "", _percent(leader.saturated)]
+
+
+def _follower_row(label: str, each: FollowerMetrics) -> list[str]:
+    settled = "never" if each.settling_time is None else f"{each.settling_time:.4g}"
+    settled = "-" if each.rmse is None else settled
+    errors = [_number(each.rmse), _number(each.steady_rmse)]
+    return [label, *errors, settled, _number(each.effort), _percent(each.saturated)]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _percent(value: float) -> str:
+    return f"{100.0 * value:.3g}"

@@ -1,0 +1,215 @@
+"""A run as the page takes it: where everybody is at every frame, and what to say of it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from echelon.core.errors import OutputError
+from echelon.core.types import Array
+from echelon.experiments.results.recording import Recording
+from echelon.output.plots.space import Space, body_width, clipped_places, space_of
+from echelon.output.plots.style import raised
+from echelon.output.viewer.charts import charts_of
+from echelon.output.viewer.pack import BYTE, COARSE, Group, pack
+from echelon.output.viewer.page import page
+
+FLOCK = 200
+"""With more agents than this, bodies are flat, and what is stored of motors is a byte."""
+_RATE, _FLOCK_RATE = 50.0, 25.0
+"""Frames per second that are stored; the page draws between them."""
+_MOST = 20_000_000
+"""Places, angles and motors in one file: some 25 MB of it."""
+
+
+def replay_page(run: Recording) -> str:
+    """Return a run as one HTML page that needs no other file and no network.
+
+    Raises:
+        OutputError: the run has no frame or is too large, or the page's three.js is not built.
+    """
+    return page(run.name, replay_data(run))
+
+
+def replay_data(run: Recording) -> bytes:
+    """Return a run packed for the page.
+
+    Raises:
+        OutputError: it has no frame, or is too large.
+    """
+    if not len(run.times):
+        raise OutputError("the run has no stored frame, and so nothing to show.")
+    space, charts = space_of(run), charts_of(run)
+    frames = frames_of(run)
+    groups = {"positions": Group(_flat(clipped_places(run, space.axes)[0][frames]))}
+    if space.angles:
+        groups["angles"] = Group(_flat(_turns(run, space)[frames]))
+    loads, many = motor_loads(run, space), run.agents > FLOCK
+    if loads is not None:
+        groups["motors"] = Group(_flat(loads[frames]), BYTE if many else COARSE, (0.0, 1.0))
+    _check_size(run, groups, len(frames))
+    told = {
+        **header(run, space),
+        "frames": len(frames),
+        "clock": _clock(run, frames),
+        "thrust": loads is not None,
+        "charts": charts.told,
+        "chartTimes": charts.times,
+    }
+    return pack(told, {**groups, "series": charts.group})
+
+
+def frames_of(run: Recording) -> Array:
+    """Return the stored frames that are shown: evenly apart, and the last."""
+    times, last = run.times, len(run.times) - 1
+    if last < 1:
+        return np.array([0])
+    rate = _RATE if run.agents <= FLOCK else _FLOCK_RATE
+    # Half a frame of slack, since times are multiples of a step that no float is.
+    stride = max(1, int(1.0 / (rate * (times[1] - times[0])) + 0.5))
+    return np.unique([*range(0, last, stride), last])
+
+
+def _clock(run: Recording, frames: Array) -> dict[str, float]:
+    """Return when frames are: evenly apart but for the last."""
+    times = run.times[frames]
+    step = float(times[1] - times[0]) if len(times) > 1 else 1.0
+    return {"start": float(times[0]), "step": step, "last": float(times[-1])}
+
+
+def _turns(run: Recording, space: Space) -> Array:
+    """Return the angles (T, N, 1 or 3) of bodies, without jumps, so that one can go between."""
+    return space.sign * np.unwrap(run.states[:, :, list(space.angles)], axis=0)
+
+
+def motor_loads(run: Recording, space: Space) -> Array | None:
+    """Return what motors give as parts of their limits, (T, N, k), of bodies that have k motors."""
+    motors = {"quadrotor": 4, "birotor": 2}.get(space.shape)
+    loads = run.loads
+    return None if loads is None or loads.shape[2] != motors else np.clip(loads, 0.0, 1.0)
+
+
+def _flat(values: Array) -> Array:
+    return values.reshape(len(values), -1)
+
+
+def _check_size(run: Recording, groups: Mapping[str, Group], frames: int) -> None:
+    numbers = sum(group.values.size for group in groups.values())
+    if numbers > _MOST:
+        fits = max(1, int(frames * _MOST / numbers))
+        raise OutputError(
+            f"{run.agents} agents at {frames} times are too many for one page, which takes about "
+            f"{fits} times of them; store fewer with `simulation.store_every`."
+        )
+
+
+# ---- what the page is told ----------------------------------------------------------------------
+
+
+def header(run: Recording, space: Space) -> dict[str, Any]:
+    """Return what replay and live page are told of a run, apart from its frames."""
+    size, drawn = _size(run, space)
+    return {
+        "title": run.name,
+        "facts": facts(run),
+        "notes": _notes(run, space),
+        "promise": _badge_of_run(run),
+        "agents": run.agents,
+        "leaders": list(run.leaders),
+        "nearest": run.nearest.tolist(),
+        "edges": run.edges.tolist(),
+        "heard": heard_by(run.heard),
+        "schedule": _schedule(run),
+        "offsets": [[float(f"{x:.7g}") for x in row] for row in run.offsets[:, list(space.axes)]],
+        "space": {
+            "kind": space.kind,
+            "names": list(space.names),
+            "units": [raised(unit) for unit in space.units],
+            "stretch": list(space.stretch),
+        },
+        "box": {"low": space.low.tolist(), "high": space.high.tolist()},
+        "shape": space.shape,
+        "size": size,
+        "drawn": drawn,
+        "thrust": False,
+        "duration": float(run.times[-1]) if len(run.times) else run.horizon,
+    }
+
+
+def heard_by(heard: Array) -> list[int]:
+    """Return who hears along each edge: 1 its second end, 2 its first, 3 both, 0 nobody."""
+    return (heard @ (2, 1)).tolist()
+
+
+def _schedule(run: Recording) -> dict[str, Any] | None:
+    """Return when which edges are there, each stretch as a text of 1 and 0."""
+    if run.schedule is None:
+        return None
+    starts, weights, period = run.schedule
+    rows = ["".join("1" if weight else "0" for weight in row) for row in weights]
+    return {"starts": starts.tolist(), "rows": rows, "period": period}
+
+
+def facts(run: Recording) -> list[str]:
+    """Return what stands beside the title."""
+    leaders = len(run.leaders)
+    told = [f"{run.agents} agents", _spaced(run.model)]
+    told += [f"{leaders} leaders"] if leaders > 1 else []
+    if "coupling" in run.promise and run.promise["coupling"] is not None:
+        told.append(f"coupling {run.promise['coupling']:.3g}")
+    return told
+
+
+def _spaced(name: str) -> str:
+    """Return `PlanarQuadrotor` as `planar quadrotor`."""
+    words = "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in name)
+    return words.strip()
+
+
+def _notes(run: Recording, space: Space) -> list[str]:
+    told = [] if run.attributes.get("outcome") == "completed" else [str(run.attributes["message"])]
+    if space.clipped:
+        told.append("Agents farther off than ten times what the formation reaches stand still.")
+    return told
+
+
+def promise_badge(promise: Mapping[str, Any]) -> dict[str, str]:
+    """Return a promise in a few words, whole, and as a state: `holds` or `lost`."""
+    if not promise["promised"]:
+        return {"state": "lost", "short": "nothing promised", "whole": promise["sentence"]}
+    rate, kind = promise["rate"], promise["kind"]
+    by = promise["theorem"] or kind
+    short = f"promised: {rate:.3g} 1/s, {by}" if rate else f"promised: V does not rise, {by}"
+    whole = f"{promise['sentence']} {_rate_in_words(promise)}".rstrip()
+    return {"state": "holds", "short": short, "whole": whole}
+
+
+def _rate_in_words(promise: Mapping[str, Any]) -> str:
+    """Return which rate stands in the badge; nothing where it stands in the promise's sentence."""
+    rate, slowest = promise["rate"], promise.get("slowest_mode")
+    if not rate or promise["theorem"]:
+        return ""
+    if slowest is None or abs(rate + slowest) <= 1e-6 * rate:
+        return f"The rate {rate:.3g} 1/s is that of the slowest mode."
+    return (
+        f"The rate {rate:.3g} 1/s is kept whichever graph holds and turn is flown; the slowest "
+        f"mode by itself is {slowest:.3g} 1/s."
+    )
+
+
+def _badge_of_run(run: Recording) -> dict[str, str]:
+    """Return the badge of a run, in red where what was promised did not reach it."""
+    badge, ended = promise_badge(run.promise), run.attributes.get("outcome")
+    if badge["state"] != "holds" or ended not in ("left_chart", "diverged"):
+        return badge
+    short, whole = "what is promised does not reach this run", badge["whole"]
+    return {"state": "lost", "short": short, "whole": f"{run.attributes['message']} {whole}"}
+
+
+def _size(run: Recording, space: Space) -> tuple[float, str]:
+    """Return by what bodies are drawn larger than 1, and how that is said."""
+    wide = body_width(run, space)
+    across = {"quadrotor": 1.15, "birotor": 1.35, "car": 0.9, "ball": 0.52, "dot": 0.5}
+    if space.kind in ("phase", "time"):
+        return wide / across["dot"], ""
+    return wide / across[space.shape], f"vehicles drawn {wide:.2g} m wide, not to scale"

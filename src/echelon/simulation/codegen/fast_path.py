@@ -1,0 +1,83 @@
+"""The code of the usual step, and what must hold of it.
+
+Much of a step is written for what seldom happens: an angle beyond 45 degrees, a motor at its limit.
+A truth that is marked as `rare` may be taken to hold always, since what it then chooses is right
+for every number, or never, as long as it does not hold. So a step is written twice: as it usually
+is, without all that, and whole. The first is tried, and left for the second where a lane is not as
+usual. What both make is the same to the bit.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias
+
+from echelon.simulation.codegen.scalar import Graph, Node, needed
+
+Instead: TypeAlias = "Callable[[Node, Sequence[Node]], Node | float | bool | None]"
+
+
+class Usual(NamedTuple):
+    """What usually is.
+
+    Attributes:
+        nodes: a node of the whole step -> what it then is.
+        levels: truths of which none may hold; each level rests on what those before it assume.
+    """
+
+    nodes: Mapping[Node, Node]
+    levels: Sequence[Sequence[Node]]
+
+
+def whole(results: Sequence[Node]) -> Mapping[Node, Node]:
+    """Return what nodes are where everything that is rare is taken to happen."""
+    return rewritten(results, lambda node, args: True if node.op == "rare" else None)
+
+
+def usual(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> Usual:
+    """Return what nodes are where nothing happens that is rare.
+
+    Args:
+        results: what is wanted.
+        choices: truths, and whether each seldom holds or seldom does not.
+    """
+    sides, depths, found = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
+
+    def assume(node: Node, args: Sequence[Node]) -> Node | bool | None:
+        # What is the same for all agents costs next to nothing, and is computed as a whole.
+        depth = max((depths[a] for a in node.args), default=0)
+        depths[node] = depth
+        if node.op == "rare":
+            if node.uniform:
+                return True
+            found.append((depth, args[0]))
+            depths[node] = depth + 1
+            return False
+        if node not in sides:
+            return None
+        made = node.graph.make(node.op, *args)
+        found.append((depth, made if sides[node] else node.graph.make("not", made)))
+        depths[node] = depth + 1
+        return not sides[node]
+
+    made = rewritten(results, assume)
+    levels = [[n for d, n in found if d == depth] for depth in sorted({d for d, _ in found})]
+    return Usual(made, [list(dict.fromkeys(level)) for level in levels])
+
+
+def rewritten(results: Sequence[Node], instead: Instead) -> dict[Node, Node]:
+    """Return what each needed node becomes, folded anew, where some become another."""
+    made = dict[Node, Node]()
+    for node in needed(results):
+        args = [made[a] for a in node.args]
+        other = instead(node, args)
+        if other is not None:
+            made[node] = _node(node.graph, other)
+        elif not args:
+            made[node] = node
+        else:
+            made[node] = node.graph.make(node.op, *args)
+            made[node].kept |= node.kept
+    return made
+
+
+def _node(graph: Graph, entry: Node | float | bool) -> Node:
+    return entry if isinstance(entry, Node) else graph.constant(entry)

@@ -1,0 +1,197 @@
+"""A function written for JAX as scalars of a graph.
+
+JAX traces the function of one agent, and each equation of the trace is evaluated on nodes. What
+cannot be is told with the primitive, and the file and line where the user wrote it.
+"""
+
+import contextlib
+import functools
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from echelon.core.jaxpr import Algebra, Rule, dot, each, entrywise, reduction, walk
+from echelon.core.numerics import precision
+from echelon.core.trace import in_short
+from echelon.simulation.codegen import elementary
+from echelon.simulation.codegen.indexing import PICKED, RUNNING, less, one_of
+from echelon.simulation.codegen.scalar import Graph, Node
+from echelon.simulation.codegen.small_linear_systems import cholesky, factored, solve, triangular
+from echelon.simulation.codegen.traced_entries import (
+    LONGEST,
+    Unsupported,
+    Written,
+    entry,
+    is_truth,
+    missing,
+    node,
+    where,
+)
+
+
+def lower(function: Callable[..., Any], graph: Graph, arguments: Sequence[Any]) -> list[np.ndarray]:
+    """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
+
+    Args:
+        function: takes arrays and returns a tree of arrays.
+        graph: that the nodes belong to.
+        arguments: trees of arrays of nodes (of dtype object), or of plain numbers.
+
+    Raises:
+        Unsupported: a primitive has no scalar operations.
+    """
+    leaves, tree = jax.tree.flatten(list(arguments), is_leaf=lambda a: isinstance(a, np.ndarray))
+    shaped = [_shape(leaf) for leaf in leaves]
+
+    def flat(*given: Any) -> Any:
+        return jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
+
+    with precision("float64"):
+        closed = jax.make_jaxpr(flat)(*shaped)
+        try:
+            return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
+        except (TypeError, ValueError, IndexError, KeyError, AttributeError) as error:
+            # A trace is anyone's: what no rule was written for must end no run that JAX can make.
+            raise Unsupported(f"a trace that no rule fits ({in_short(error)})") from error
+
+
+def _shape(leaf: np.ndarray) -> jax.ShapeDtypeStruct:
+    truths = leaf.dtype == object and leaf.size and all(is_truth(e) for e in leaf.flat)
+    kind = bool if truths else float if leaf.dtype == object else leaf.dtype
+    return jax.ShapeDtypeStruct(leaf.shape, kind)
+
+
+@contextlib.contextmanager
+def _within(equation: Any) -> Iterator[None]:
+    """Say where a call stands if what it calls was traced once for all, far from its caller."""
+    try:
+        yield
+    except Unsupported as error:
+        if ", line " in str(error):
+            raise
+        raise Unsupported(f"{error}{where(equation)}") from None
+
+
+def _algebra(graph: Graph) -> Algebra:
+    def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+        name = equation.primitive.name
+        if name in _WRITTEN:
+            return _WRITTEN[name](graph, algebra, equation, operands)
+        if name in _DETOURS:
+            return missing(equation)
+        raise Unsupported(f"`{name}`{where(equation)}")
+
+    algebra = Algebra(_rules(graph), float, lambda n: n, lambda: float("nan"), unknown, _within)
+    return algebra
+
+
+def _rules(graph: Graph) -> dict[str, Rule]:
+    def op(name: str) -> Callable[..., Node]:
+        return lambda *args: graph.make(name, *map(entry, args))
+
+    def function(of: Callable[..., Node]) -> Callable[..., Node]:
+        def written(*args: Any) -> Node:
+            with graph.as_written():
+                return of(*(node(graph, a) for a in args))
+
+        return written
+
+    own = {name: op(name) for name in _SAME}
+    own |= {name: function(getattr(elementary, name)) for name in _ELEMENTARY}
+    own |= {
+        "gt": lambda a, b: graph.make("lt", entry(b), entry(a)),
+        "ge": lambda a, b: graph.make("le", entry(b), entry(a)),
+        "rem": function(elementary.remainder),
+        "pow": function(elementary.power),
+        "exp2": function(lambda a: elementary.exp(a * float(np.log(2.0)))),
+        "clamp": lambda low, x, high: graph.make(
+            "min", graph.make("max", entry(low), entry(x)), entry(high)
+        ),
+        "is_finite": lambda a: graph.make("lt", graph.make("abs", a), float("inf")),
+        "lt_to": functools.partial(less, graph),
+        "le_to": lambda a, b: graph.make("not", less(graph, b, a)),
+        "select_n": functools.partial(one_of, graph),
+    }
+    written: dict[str, Rule] = {
+        "integer_pow": lambda params, x: each(
+            lambda e: elementary.integer_power(node(graph, e), params["y"]), x
+        ),
+        "round": functools.partial(_round, graph),
+        "dot_general": dot(0.0),
+        "reduce_sum": reduction(operator.add, 0.0),
+        "reduce_prod": reduction(operator.mul, 1.0),
+        "reduce_max": reduction(op("max"), -np.inf),
+        "reduce_min": reduction(op("min"), np.inf),
+        "reduce_and": reduction(op("and"), True),
+        "reduce_or": reduction(op("or"), False),
+        "cholesky": functools.partial(cholesky, graph),
+    }
+    return {name: entrywise(rule) for name, rule in own.items()} | written | RUNNING
+
+
+_SAME = ("abs", "sqrt", "floor", "ceil", "max", "min", "lt", "le", "eq", "ne")
+_ELEMENTARY = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
+_ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "logistic", "erf")
+_ELEMENTARY += ("cbrt", "rsqrt", "sign")
+
+
+def _round(graph: Graph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+    to_even = int(params["rounding_method"]) == 1
+    if to_even:
+        return each(lambda e: graph.make("rint", e), x)
+    return each(lambda e: elementary.round_half_away(node(graph, e)), x)
+
+
+# ---- primitives with functions of their own ------------------------------------------------------
+
+
+def _scan(
+    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+) -> list[np.ndarray]:
+    """Return what a loop of known length makes, written out."""
+    params, body = equation.params, equation.params["jaxpr"]
+    length, fixed, moving = params["length"], params["num_consts"], params["num_carry"]
+    if length > LONGEST:
+        raise Unsupported(f"a loop of {length} rounds{where(equation)}")
+    consts, carry = operands[:fixed], operands[fixed : fixed + moving]
+    rounds, made = range(length), list[list[np.ndarray]]()
+    for k in reversed(rounds) if params["reverse"] else rounds:
+        given = [x[k] for x in operands[fixed + moving :]]
+        given = [np.asarray(x, x.dtype if isinstance(x, np.ndarray) else None) for x in given]
+        results = walk(body.jaxpr, body.consts, [*consts, *carry, *given], algebra)
+        carry = results[:moving]
+        made.append(results[moving:])
+    made = made[::-1] if params["reverse"] else made
+    return [*carry, *(np.stack(column) for column in zip(*made, strict=True))]
+
+
+def _while(
+    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+) -> list[np.ndarray]:
+    """Return what a loop makes whose end does not depend on the agents."""
+    params = equation.params
+    tests, bodies = params["cond_nconsts"], params["body_nconsts"]
+    seen, used = operands[:tests], operands[tests : tests + bodies]
+    carry, test, body = operands[tests + bodies :], params["cond_jaxpr"], params["body_jaxpr"]
+    for _ in range(LONGEST + 1):
+        [more] = walk(test.jaxpr, test.consts, [*seen, *carry], algebra)
+        if more.dtype == object:
+            break
+        if not more:
+            return carry
+        carry = walk(body.jaxpr, body.consts, [*used, *carry], algebra)
+    raise Unsupported(f"a `while` loop whose end depends on the agent, or is far{where(equation)}")
+
+
+_WRITTEN: dict[str, Written] = PICKED | {
+    "scan": _scan,
+    "while": _while,
+    "custom_linear_solve": solve,
+    "lu": factored,
+    "triangular_solve": triangular,
+}
+_DETOURS = {"lu_pivots_to_permutation", "lu_solve"}
+"""What JAX does before it solves; the equations are solved here by themselves."""

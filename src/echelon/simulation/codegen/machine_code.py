@@ -1,0 +1,131 @@
+"""Code for this machine from text for LLVM, kept between processes, and called by address."""
+
+import ctypes
+import hashlib
+import platform
+from functools import cache
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from echelon.core import disk_cache
+from echelon.core.errors import MissingExtraError
+from echelon.core.trace import in_short
+from echelon.simulation.codegen.traced_entries import Unsupported
+
+
+@cache
+def llvm() -> Any:
+    """Return llvmlite's binding, ready for this machine.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    # Here, since it comes with an extra, and takes long to load.
+    try:
+        import llvmlite.binding as binding
+    except ImportError:
+        raise MissingExtraError(
+            "the native engine needs llvmlite; "
+            "install it with `pip install 'echelon-formation[fast]'`."
+        ) from None
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    return binding
+
+
+def is_installed() -> bool:
+    """Tell whether native code can be made here."""
+    try:
+        llvm()
+    except MissingExtraError:
+        return False
+    return True
+
+
+_LINKED = platform.system() != "Windows"
+"""Whether code and constants are laid side by side: elsewhere they may lie anywhere in memory, and
+code that reaches only 2 GiB far, as the small model's does, would end the process."""
+_MODEL = "small" if _LINKED else "jitdefault"
+_WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256}
+
+
+def vectors() -> str:
+    """Return what native code computes with on this machine, in words."""
+    if not is_installed():
+        return "none; install `echelon-formation[fast]`"
+    has = set(features().split(","))
+    width = next((bits for name, bits in _WIDTHS.items() if f"+{name}" in has), 128)
+    fused = "with" if has & {"+fma", "+neon", "+fp-armv8"} else "without"
+    return f"{llvm().get_host_cpu_name()}, vectors of {width} bits, {fused} fused multiply-add"
+
+
+@cache
+def features() -> str:
+    """Return what this machine's processor has, as LLVM writes it."""
+    return llvm().get_host_cpu_features().flatten()
+
+
+@final
+class Code:
+    """A kernel as machine code, which lives as long as this object."""
+
+    def __init__(self, text: str, cache_folder: Path | None = None) -> None:
+        """Compile a text, or take what was compiled of it before."""
+        binding = llvm()
+        target = binding.Target.from_default_triple()
+        # By the small model a constant is an operand, and not an address to be kept first.
+        self._machine = target.create_target_machine(
+            cpu=binding.get_host_cpu_name(),
+            features=features(),
+            opt=3,
+            codemodel=_MODEL,
+            reloc="pic" if _LINKED else "default",
+        )
+        stored = _stored(text, binding, cache_folder)
+        made = None if stored is None else disk_cache.read(stored)
+        if made is None:
+            made = self._compile(binding, text)
+            if stored is not None:
+                disk_cache.write(stored, made)
+        self._jit = binding.create_lljit_compiler(self._machine, use_jit_link=_LINKED)
+        name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+        builder = binding.JITLibraryBuilder().add_object_img(made).export_symbol("run")
+        self._library = builder.link(self._jit, name)
+        self._run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._library["run"])
+
+    def call(self, slots: np.ndarray) -> None:
+        """Run the kernel on what 64-bit slots hold: addresses and whole numbers, as in `SLOTS`."""
+        self._run(slots.ctypes.data)
+
+    def _compile(self, binding: Any, text: str) -> bytes:
+        try:
+            module = binding.parse_assembly(text)
+            module.verify()
+        except RuntimeError as error:
+            raise Unsupported(f"what LLVM refuses ({in_short(error)})") from error
+        options = binding.create_pipeline_tuning_options(speed_level=2)
+        options.loop_vectorization = options.slp_vectorization = False
+        passes = binding.create_pass_builder(self._machine, options)
+        passes.getModulePassManager().run(module, passes)
+        return self._machine.emit_object(module)
+
+
+def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
+    """Return the file that holds what is made of a text on this machine."""
+    if folder is None:
+        return None
+    import llvmlite
+
+    parts = [text, _MODEL, features(), binding.get_host_cpu_name(), llvmlite.__version__]
+    parts += [platform.system(), platform.machine()]
+    return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
+
+
+def aligned(shape: tuple[int, ...], dtype: np.dtype[Any] | type) -> np.ndarray:
+    """Return zeros that begin at a multiple of 64 bytes, as whole vectors are stored."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    room = np.zeros(size + 64, np.uint8)
+    start = -room.ctypes.data % 64
+    return room[start : start + size].view(dtype).reshape(shape)

@@ -1,0 +1,186 @@
+"""One agent in a process of its own: what a vehicle on a network computes in a step."""
+
+from collections.abc import Mapping
+from typing import NamedTuple, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from echelon.core.compiled import program
+from echelon.core.errors import SimulationError, check_kind, listing
+from echelon.core.numerics import precision
+from echelon.core.types import Array, State
+from echelon.core.words import Feedforward
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.simulation.engine.law_drive import Laws
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.step.loop import Loop, act_alone, assemble
+from echelon.simulation.step.settings import Settings
+
+
+class Message(NamedTuple):
+    """What an agent sends.
+
+    Attributes:
+        signal: what its neighbours hear: its state less its offset, unless its law says otherwise.
+        told: what is fed forward of its input, in the same step; None before it has acted.
+    """
+
+    signal: Array
+    told: Array | None = None
+
+
+@final
+class Agent:
+    """One agent of a formation under laws, which knows its own state and what it is sent.
+
+    In every step all say `hello`, and each then takes its `step` with the messages that reached it:
+    leaders first, where something is fed forward, and followers by their distance from them where
+    it is their parents'. So many of these agents do what `simulate` does, to rounding.
+
+    Args:
+        parts: of the whole formation; of the starts nothing is read.
+        agent: its number.
+        dt: how long its inputs are held, s.
+        limits: whether the actuators' limits act on it.
+
+    Raises:
+        EchelonError: the parts do not fit each other, or there is no such agent.
+    """
+
+    def __init__(self, parts: Parts, agent: int, dt: float = 0.005, limits: bool = True) -> None:
+        """Prepare its law."""
+        check_kind("parts", parts, Parts)
+        check_kind("drive", parts.drive, Laws)
+        if not 0 <= agent < parts.graph.agents:
+            raise SimulationError(
+                f"agent {agent} is not in this graph, whose agents are 0 to "
+                f"{parts.graph.agents - 1}."
+            )
+        prepared = prepare(parts, Settings(horizon=dt, dt=dt, limits=limits))
+        drive = prepared.parts.drive
+        assert isinstance(drive, Laws)
+        with precision("float64"):
+            self._loop = assemble(prepared.problem, drive.leader, drive.follower)
+        self.number, graph = agent, parts.graph
+        self.leads = agent in graph.leaders
+        self._law = self._loop.leader if self.leads else self._loop.follower
+        heard = self._loop.exchange
+        mine = np.asarray(heard.receivers) == agent
+        self.neighbours = tuple(np.asarray(heard.senders)[mine].tolist())
+        self._weights = np.atleast_2d(np.asarray(heard.weights))[:, mine]
+        self._schedule = graph.schedule
+        self._source = self._source_in(parts)
+        self._memory: Memory | None = None
+
+    def _source_in(self, parts: Parts) -> int | None:
+        """Return who must tell this agent something of the same step; None for nobody."""
+        silent = self._loop.follower.feedforward is Feedforward.NONE
+        if self.leads or silent and not self._loop.follower.turning:
+            return None
+        if self._loop.parents is not None:
+            return int(self._loop.parents[self.number])
+        return parts.graph.nearest_leader()[self.number]
+
+    def hello(self, x: ArrayLike) -> Message:
+        """Return what neighbours hear of the agent at a state (n,), before it acts."""
+        with precision("float64"):
+            state = self._state(x)
+            return Message(np.asarray(_signal(self._loop, self._law, self._given(state))))
+
+    def step(
+        self, t: float, x: ArrayLike, messages: Mapping[int, Message]
+    ) -> tuple[Array, Message]:
+        """Return the physical input (m,) that is delivered from t (s) on, and the whole message.
+
+        Args:
+            t: time, s.
+            x: own state (n,).
+            messages: of the neighbours, by their numbers; that of the leader or the parent with
+                what it tells, where something is fed forward.
+
+        Raises:
+            SimulationError: one is missing, or the state has another shape.
+        """
+        weights = self._weights[0 if self._schedule is None else self._schedule.row(t)]
+        now = [j for j, weight in zip(self.neighbours, weights, strict=True) if weight > 0.0]
+        weights = weights[weights > 0.0]
+        missing = [j for j in now if j not in messages]
+        told = (
+            None if self._source is None else messages.get(self._source, Message(np.zeros(0))).told
+        )
+        if missing or (told is None and self._source is not None):
+            who = missing[0] if missing else self._source
+            what = "its message" if missing else "what it tells of its input"
+            raise SimulationError(
+                f"agent {self.number} needs {what} of agent {who} at t = {t:g} s, and got messages "
+                f"of {listing(map(str, messages)) or 'nobody'}."
+            )
+        with precision("float64"):
+            given = self._given(self._state(x))
+            heard = jnp.asarray(np.array([messages[j].signal for j in now]))
+            sent = (
+                jnp.zeros(len(self._loop.model.input_names)) if told is None else jnp.asarray(told)
+            )
+            u, memory, signal, tells = _step(
+                self._loop, self.leads, jnp.asarray(float(t)), given, heard, weights, sent
+            )
+        self._memory = memory
+        return np.asarray(u), Message(np.asarray(signal), np.asarray(tells))
+
+    def _state(self, x: ArrayLike) -> State:
+        state, n = jnp.asarray(np.asarray(x, float)), len(self._loop.model.state_names)
+        if state.shape != (n,):
+            raise SimulationError(
+                f"the state of an agent has shape {state.shape}, and needs {(n,)}."
+            )
+        if self._memory is None:
+            self._memory = _begin(self._loop, self._law, state)
+        return state
+
+    def _given(self, state: State) -> "_Given":
+        return _Given(state, jnp.asarray(self._loop.offsets[self.number]), self._memory)
+
+
+class _Given(NamedTuple):
+    """What an agent has of its own: its state (n,), its offset (n,) and its memory."""
+
+    x: State
+    offset: State
+    memory: Memory
+
+
+@program
+def _begin(loop: Loop, law: Law, x: State) -> Memory:
+    return law.begin(loop.model, x)
+
+
+@program
+def _signal(loop: Loop, law: Law, own: _Given) -> jax.Array:
+    """Return what neighbours hear."""
+    said = law.signal(loop.model, *own)
+    return own.x - own.offset if said is None else said
+
+
+@program
+def _step(
+    loop: Loop,
+    leads: bool,
+    t: jax.Array,
+    own: _Given,
+    heard: jax.Array,
+    weights: jax.Array,
+    sent: jax.Array,
+) -> tuple[jax.Array, Memory, jax.Array, jax.Array]:
+    """Return the input, the next memory, the signal, and what is told."""
+    law = loop.leader if leads else loop.follower
+    signal = _signal(loop, law, own)
+    states = law.signal(loop.model, *own) is None
+    apart = loop.model.difference if states else jnp.subtract
+    gaps = jax.vmap(lambda theirs: apart(signal, theirs))(heard.reshape(-1, len(signal)))
+    view = LocalView(t, own.x, own.offset, weights @ gaps, sent, loop.motion.dt)
+    _, got, memory, told = act_alone(loop, law, view, own.memory, leads)
+    return got, memory, signal, told

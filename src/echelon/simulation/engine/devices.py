@@ -1,0 +1,63 @@
+"""Agents spread over the devices that JAX has, of one host or of several.
+
+A chunk begins and ends with the same numbers on every device, so that all else of a run is as on
+one; within it each device moves its own agents, and JAX brings it what they hear of others.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from echelon.core.compiled import program
+from echelon.core.errors import SimulationError
+from echelon.core.types import Array
+from echelon.simulation.step.loop import Loop, Moment, advance
+from echelon.simulation.step.meter import Sums
+
+
+def mesh_of(devices: int, agents: int) -> Mesh:
+    """Return so many devices in a row, among which the agents are parted.
+
+    Raises:
+        SimulationError: there are fewer, or the agents are no multiple of them.
+    """
+    there = jax.devices()
+    if devices > len(there):
+        raise SimulationError(
+            f"`devices` is {devices}, and JAX has {len(there)} ({there[0].platform}); of processors"
+            " it has as many as `JAX_NUM_CPU_DEVICES` says."
+        )
+    if devices < len(there) and jax.process_count() > 1:
+        raise SimulationError(
+            f"`devices` is {devices}, and must be {len(there)}, all of those of the"
+            f" {jax.process_count()} processes."
+        )
+    if agents % devices:
+        raise SimulationError(
+            f"`devices` is {devices}, and {agents} agents cannot be parted among them: their number"
+            " must be a multiple."
+        )
+    return Mesh(np.array(there[:devices]), ("agents",))
+
+
+@program
+def advance_parted(
+    mesh: Mesh, loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
+) -> tuple[Moment, tuple[Any, Any], Sums]:
+    """Do what `advance` does, the agents parted among the devices of a mesh."""
+    agents = len(loop.offsets)
+
+    def part(leaf: jax.Array) -> jax.Array:
+        # What is not of every agent, such as the followers' memories, is on all devices until it
+        # meets something that is.
+        mine = leaf.ndim > 0 and len(leaf) == agents
+        return _place(leaf, mesh, PartitionSpec("agents") if mine else PartitionSpec())
+
+    done = advance(loop, jax.tree.map(part, now), counts, reference)
+    return jax.tree.map(lambda leaf: _place(leaf, mesh, PartitionSpec()), done)
+
+
+def _place(leaf: jax.Array, mesh: Mesh, spec: PartitionSpec) -> jax.Array:
+    return jax.lax.with_sharding_constraint(leaf, NamedSharding(mesh, spec))

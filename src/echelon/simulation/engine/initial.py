@@ -1,0 +1,115 @@
+"""Where the agents start: leaders on their reference, followers about their goals."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.core.errors import SimulationError
+from echelon.simulation.engine.parts import Parts
+
+
+def initial_states(parts: Parts, seed: int) -> np.ndarray:
+    """Return the states (N, n) at time zero.
+
+    A leader starts where its drive says, or in its given state, plus its offset and `start_error`.
+    A follower starts at its goal relative to the leader, plus a uniform random deviation within +-
+    the spread of each state. The same seed draws the same deviations whatever the spreads are.
+
+    Raises:
+        SimulationError: given states have a wrong shape or are not finite; a spread is negative.
+        ModelError: a spread or error names no state or group.
+    """
+    return Starts(parts)(seed)
+
+
+@final
+class Starts:
+    """The states at time zero, for one seed after the other.
+
+    Args:
+        parts: what starts.
+
+    Raises:
+        EchelonError: as in `initial_states`.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        """Compute what no seed changes."""
+        model, graph, initial = parts.model, parts.graph, parts.initial
+        self.graph, self.shape = graph, (graph.agents, len(model.state_names))
+        self.error = _per_state(model, parts.start_error, "start error")
+        self.given: np.ndarray | None = None
+        self.named: dict[Any, Any] = {}
+        if initial is not None and not isinstance(initial, Mapping):
+            self.given = _read_states(
+                initial, self.shape, "initial states have", "(agents, states)"
+            )
+            # Given states are where leaders belong; the error is what they are off from there.
+            self.given[list(graph.leaders)] += self.error
+            return
+        named = dict(initial or {})
+        spreads = {key: value for key, value in named.items() if isinstance(key, str)}
+        self.spread = _per_state(model, spreads, "initial spread")
+        if (self.spread < 0.0).any():
+            least = self.spread.min()
+            raise SimulationError(f"an initial spread is {least}, and must not be negative.")
+        self.named = {key: value for key, value in named.items() if not isinstance(key, str)}
+        leaders = np.asarray(parts.drive.start(model), np.float64) + self.error
+        self.goals = leaders + parts.formation.offsets
+
+    def __call__(self, seed: int) -> np.ndarray:
+        """Return the states (N, n) for a seed."""
+        return self.of([seed])[0]
+
+    def of(self, seeds: Sequence[int]) -> np.ndarray:
+        """Return the states (K, N, n) for some seeds."""
+        if self.given is not None:
+            return np.repeat(self.given[None], len(seeds), axis=0)
+        leaders = list(self.graph.leaders)
+        # Drawn for all agents and scaled afterwards, so that another spread keeps the directions,
+        # and another choice of leaders the followers' draws.
+        draws = [np.random.default_rng(seed).uniform(-1.0, 1.0, self.shape) for seed in seeds]
+        deviations = self.spread * np.reshape(draws, (len(seeds), *self.shape))
+        deviations[:, leaders] = 0.0
+        states = self.goals + deviations
+        _place(states, self.named, self.graph)
+        states[:, [agent for agent in leaders if agent in self.named]] += self.error
+        return states
+
+
+def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:
+    """Put the given agents into their given states, in all of some starts (K, N, n)."""
+    for agent, state in given.items():
+        _check_agent(agent, graph)
+        states[:, agent] = _read_states(
+            state, states.shape[2:], f"the initial state of agent {agent} has", "(states,)"
+        )
+
+
+def _check_agent(agent: int, graph: Graph) -> None:
+    if not 0 <= agent < graph.agents:
+        raise SimulationError(
+            f"an initial state is given for agent {agent}, "
+            f"and agents are numbered from 0 to {graph.agents - 1}."
+        )
+
+
+def _read_states(values: object, shape: tuple[int, ...], what: str, meaning: str) -> np.ndarray:
+    # A copy: the error of the leaders is added to it, and the caller's array stays.
+    array = np.array(values, dtype=np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise SimulationError(
+            f"{what} shape {array.shape}, and must be finite with shape {shape} {meaning}."
+        )
+    return array
+
+
+def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
+    """Return one finite number a state, (n,), from numbers by state or group."""
+    for name, value in named.items():
+        if not np.isfinite(value):
+            raise SimulationError(f"the {what} of `{name}` is {value}, and must be finite.")
+    return model.per_state(named)

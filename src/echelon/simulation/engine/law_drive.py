@@ -1,0 +1,214 @@
+"""Agents that are driven by laws: what each does is a function of what it knows."""
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, TypeVar, final
+
+import jax
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.core.errors import (
+    EchelonError,
+    LawError,
+    MissingExtraError,
+    SimulationError,
+    check_kind,
+)
+from echelon.core.types import Array, Scalar, State
+from echelon.core.words import Feedforward, Frame
+from echelon.laws.law import Law, gain_of
+from echelon.laws.law_check import leader_warnings, prepare_law
+from echelon.simulation.codegen import Unsupported, is_installed
+from echelon.simulation.engine.jax_stepper import JaxStepper
+from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.step.drive import Drive, Information, Problem, Stepper
+from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.settings import Settings
+
+if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+    from echelon.synthesis.gains.gain import Gain
+
+
+@final
+class Laws(Drive):
+    """One law for the leaders, and one for all others.
+
+    Args:
+        leader: law of the leaders.
+        follower: law of all others.
+    """
+
+    leader: Law
+    follower: Law
+
+    def __check_init__(self) -> None:
+        """Refuse what is no law."""
+        for place in ("leader", "follower"):
+            check_kind(place, getattr(self, place), Law)
+
+    @property
+    def information(self) -> Information:
+        """What the two laws must be sent by others."""
+        return Information(self.leader.information, self.follower.information)
+
+    @property
+    def gain(self) -> "Gain | None":
+        """The gain of the followers' law, where it has one."""
+        return gain_of(self.follower)
+
+    @property
+    def feedforward(self) -> Feedforward:
+        """What the followers' law needs of others' inputs."""
+        return self.follower.feedforward
+
+    @property
+    def frame(self) -> Frame:
+        """The axes of the followers' gain, as they are asked for."""
+        # Of another law one for the gain alone is made, which turns where it can.
+        return getattr(self.follower, "frame", Frame.HEADING)
+
+    @property
+    def reacts(self) -> bool:
+        """Whether the leaders' law is given a reaction."""
+        # Not every law has one, and a user's own need not know of this question.
+        return getattr(self.leader, "reaction", None) is not None
+
+    @property
+    def trimmed(self) -> bool:
+        """Whether the followers' law applies the trim input."""
+        return getattr(self.follower, "trim", True)
+
+    def prepare(self, model: ControlAffine, graph: Graph) -> "Laws":
+        """Return both laws completed; the same where they are.
+
+        Raises:
+            LawError: one does not fit the model or the graph.
+        """
+        leader, follower = (prepare_law(law, model, graph) for law in (self.leader, self.follower))
+        follower = follower.following(leader, model)
+        same = leader is self.leader and follower is self.follower
+        return self if same else Laws(leader, follower)
+
+    def accept(self, problem: Problem) -> None:
+        """Check the starts of leaders and followers by their laws.
+
+        Raises:
+            LawError: one is refused.
+        """
+        refused = self.refusals(problem.model, problem.graph, problem.states[None])
+        for _, agent, text in refused:
+            raise LawError(f"agent {agent} starts where its law has no meaning: {text}.")
+
+    def refusals(
+        self, model: ControlAffine, graph: Graph, states: Array
+    ) -> Iterator[tuple[int, int, str]]:
+        """Yield which of many starts (K, N, n) a law cannot take: which, the agent, and why."""
+        for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
+            starts = states[:, list(agents)].reshape(-1, states.shape[2])
+            for place, text in law.refusals(model, starts):
+                yield place // len(agents), agents[place % len(agents)], text
+
+    def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
+        """Return the warnings of both laws, and what of the reference the leaders cannot do."""
+        told = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+        return told + leader_warnings(self.leader, model, settings.horizon, settings.limits)
+
+    def start(self, model: ControlAffine) -> State:
+        """Return where the leaders' law begins."""
+        return self.leader.start(model)
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+        """Return what the leaders' law follows."""
+        return self.leader.reference_states(model, times)
+
+    def with_follower(self, law: Law) -> "Laws":
+        """Return the same law for the leaders, and another one for all others."""
+        return Laws(self.leader, law)
+
+    def metric(self, model: ControlAffine) -> Array | None:
+        """Return the metric of the followers' law."""
+        return self.follower.metric(model)
+
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
+        """Return the heading that a leader at x tells."""
+        return self.leader.heading(model, t, x) if self.follower.turning else None
+
+    def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
+        """Return the drift under the followers' law."""
+        law = self.follower if heading is None else self.follower.facing(heading)
+        return law.drift(model, x)
+
+    def stepper(self, problem: Problem) -> Stepper:
+        """Return what steps the closed loop, by JAX or by native code.
+
+        Raises:
+            SimulationError: native code is asked for, and cannot be made.
+        """
+        loop, settings = assemble(problem, self.leader, self.follower), problem.settings
+        states, devices = problem.states, settings.devices
+
+        def native() -> Stepper:
+            bits = int(settings.precision[5:])
+            return NativeStepper([loop], states, bits, JaxStepper(loop, states))
+
+        return choose_engine(
+            settings, len(states), native, lambda why: JaxStepper(loop, states, why, devices)
+        )
+
+
+_WORTH = 100_000
+"""Steps of one agent from which on native code saves more than the second that it takes to make."""
+_Made = TypeVar("_Made")
+
+
+def choose_engine(
+    settings: Settings,
+    agents: int,
+    native: Callable[[], _Made],
+    by_jax: Callable[[str], _Made],
+    least: int = _WORTH,
+) -> _Made:
+    """Return what one of the engines makes for so many agents.
+
+    Args:
+        settings: of the run.
+        agents: how many.
+        native: makes it by native code.
+        by_jax: takes why there is none, in words; empty where none is wanted.
+        least: from how many steps of one agent on native code pays.
+
+    Raises:
+        SimulationError: native code is asked for, and cannot be made.
+    """
+    if not worth_native(settings, agents, least):
+        return by_jax("")
+    try:
+        return native()
+    except (Unsupported, MissingExtraError) as error:
+        if settings.engine == "native":
+            raise SimulationError(f"`engine` is `native`, and {_in_words(error)}.") from error
+        return by_jax(_in_words(error))
+
+
+def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+    """Tell whether agents are to be stepped by native code: it is asked for, or pays.
+
+    It computes on processors alone, and `least` is from how many steps of one agent on it pays.
+    """
+    if settings.engine != "auto":
+        return settings.engine == "native"
+    if settings.devices > 1 or not is_long(settings, agents, least):
+        return False
+    return is_installed() and jax.default_backend() == "cpu"
+
+
+def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
+    """Tell whether it pays to compile something else than the steps of a run alone."""
+    return settings.engine == "native" or settings.steps * agents >= least
+
+
+def _in_words(error: EchelonError) -> str:
+    """Return why there is no native code."""
+    if isinstance(error, Unsupported):
+        return f"there is no native code for {error}"
+    return str(error).rstrip(".")

@@ -1,0 +1,57 @@
+"""What a run is made of."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias, final
+
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.world.world import World
+from echelon.core.errors import check_kind
+from echelon.simulation.step.drive import Drive
+
+Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.ndarray | None
+"""Spreads by state or group, or states (n,) by agent, or the states (N, n) of all."""
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Parts:
+    """Agents, who hears whom, where each belongs, what drives them, how they start, their world.
+
+    Args:
+        model: the agents, all alike.
+        graph: who hears whom, and who leads.
+        formation: the goal offsets, (N, n).
+        drive: what drives the agents, such as `Laws(leader, follower)`.
+        initial: spread of the followers' starts about their goals, per state or group (uniform
+            within +- the number); or states (n,) by agent, all others on their goals; or all states
+            (N, n).
+        start_error: what is added to the leaders' starts, per state or group.
+        world: what the laws do not know: a plant that differs from the model, wind and noise.
+
+    Raises:
+        SimulationError: a part is not of the kind of its place.
+    """
+
+    model: ControlAffine
+    graph: Graph
+    formation: Formation
+    drive: Drive
+    initial: Initial = None
+    start_error: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    world: World = dataclasses.field(default_factory=World)
+
+    def __post_init__(self) -> None:
+        """Check that each part is of the kind of its place."""
+        # The model is left out: `check_model` says more of what is wrong with one.
+        wanted = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
+        for place, kind in wanted.items():
+            check_kind(place, getattr(self, place), kind)
+
+    def replace(self, **changes: object) -> "Parts":
+        """Return the same with some parts changed."""
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]

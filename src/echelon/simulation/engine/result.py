@@ -1,0 +1,131 @@
+"""What a run leaves behind: everything that metrics, figures and files read, in float64 NumPy."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.world.world import World
+from echelon.core.errors import Outcome
+from echelon.core.pages import page_of
+from echelon.core.types import Array
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.step.drive import Drive
+from echelon.simulation.step.meter import Sums, measured_states
+from echelon.simulation.step.settings import Settings
+from echelon.simulation.step.solver_stats import SolverStats
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
+    """A run: T stored frames of N agents with n states and m inputs.
+
+    Attributes:
+        times: (T,) s.
+        states: (T, N, n).
+        inputs: (T, N, m), physical, as delivered by the actuators from each frame on.
+        reference: (T, n), the leader's reference state, or None where it follows nothing.
+        sums: over all steps, of which means are made.
+        outcome: how the run ended; `message` says it with time and agent.
+        warnings: what is allowed but probably not meant, one sentence each.
+        parts: what ran, with its drive completed.
+        settings: how it was computed.
+        wall_time: seconds of computing, compilation included.
+        work: what solving took; None where laws gave the inputs.
+        engine: what computed the steps, `jax` or `native`.
+        provenance: scenario text, versions and the like, as text.
+    """
+
+    times: Array
+    states: Array
+    inputs: Array
+    reference: Array | None
+    sums: Sums
+    outcome: Outcome
+    message: str
+    warnings: tuple[str, ...]
+    parts: Parts
+    settings: Settings
+    wall_time: float
+    work: SolverStats | None = None
+    engine: str = "jax"
+    provenance: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def model(self) -> ControlAffine:
+        """What the laws know of an agent."""
+        return self.parts.model
+
+    @property
+    def graph(self) -> Graph:
+        """Who hears whom."""
+        return self.parts.graph
+
+    @property
+    def formation(self) -> Formation:
+        """Where each belongs."""
+        return self.parts.formation
+
+    @property
+    def drive(self) -> Drive:
+        """What drove the agents."""
+        return self.parts.drive
+
+    @property
+    def world(self) -> World:
+        """What the laws did not know."""
+        return self.parts.world
+
+    @property
+    def saturated(self) -> Array:
+        """The fraction of steps (N,) in which an actuator limit changed the agent's input."""
+        return self.sums.limited / max(1.0, float(self.sums.steps[0]))
+
+    @property
+    def chatter(self) -> Array:
+        """How many times (N,) an input went from beyond one limit to beyond the other in a step."""
+        return self.sums.chatter
+
+    @property
+    def errors(self) -> Array:
+        """Deviation of each agent from its goal relative to its leader, (T, N, n).
+
+        The leaders' rows are zero.
+        """
+        # delta_i = y_i - y_0 (theory page), which V and the certified set are written in.
+        y = self.states - self.formation.offsets
+        return y - y[:, list(self.graph.nearest_leader())]
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """Indices of the states that errors are measured on: the position if any, else all."""
+        return measured_states(self.model)
+
+    @property
+    def unit(self) -> str:
+        """The unit of errors: m for a position, `state` for abstract states."""
+        return "m" if self.model.position else "state"
+
+    def __repr__(self) -> str:
+        """Return who ran, for how long, and how it ended."""
+        # Arrays would fill the screen, and have names to ask for.
+        who = f"{self.graph.agents} x {type(self.model).__name__}"
+        return f"Result({who}, {len(self.times)} frames, {self.message!r})"
+
+    def _repr_html_(self) -> str:
+        """Return the run as a notebook shows it: a table, with its picture."""
+        return page_of("result", self)
+
+    def with_provenance(self, **texts: str) -> "Result":
+        """Return the same run with more provenance."""
+        return dataclasses.replace(self, provenance={**self.provenance, **texts})
+
+
+def finite_or_none(value: Any) -> float | None:
+    """Return a number as a float, or None where it does not exist or is not finite."""
+    return float(value) if value is not None and np.isfinite(value) else None

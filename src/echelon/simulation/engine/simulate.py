@@ -1,0 +1,233 @@
+"""The closed loop in time: parts in, one `Result` out, whatever drives the agents."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeAlias, final
+
+import jax
+import numpy as np
+
+from echelon.core.errors import Outcome, SimulationError
+from echelon.core.numerics import precision
+from echelon.core.types import Array
+from echelon.simulation.engine.grid import Grid
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import Prepared, prepare
+from echelon.simulation.engine.record import Record, Recorder, Stretch, join
+from echelon.simulation.engine.result import Result
+from echelon.simulation.step.drive import Stepper, Stopped
+from echelon.simulation.step.meter import on_host
+from echelon.simulation.step.settings import Settings
+from echelon.simulation.step.solver_stats import SolverStats
+
+
+@final
+class Underway:
+    """A run on its way, as it is when it tells of itself.
+
+    Attributes:
+        done: steps that were taken.
+        steps: in all.
+    """
+
+    def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
+        """Note how far it has come."""
+        self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
+        self.done, self.steps = recorder.done, recorder.grid.steps
+
+    @property
+    def time(self) -> float:
+        """How far it has come, s."""
+        return self.done * self._prepared.problem.settings.dt
+
+    @property
+    def states(self) -> Array:
+        """The states (N, n) of the newest stored frame."""
+        return next(x.states[-1] for x in reversed(self._recorder.stretches) if len(x.states))
+
+    def result(self) -> Result:
+        """Return all that was computed so far, of which `metrics` takes its numbers."""
+        found = _result(self._prepared, self._recorder, self._stepper, Outcome.INTERRUPTED)
+        told = f"The run goes on, and this is all of it until t = {self.time:.6g} s."
+        under = found.outcome is Outcome.INTERRUPTED
+        return dataclasses.replace(found, message=told) if under else found
+
+
+Progress: TypeAlias = Callable[[Underway], None]
+"""Called between chunks with the run on its way."""
+Keep: TypeAlias = Callable[[Stretch], None]
+"""Called with every stretch of a run while it lasts, each following the one before.
+
+Where it raises `Stopped`, with the reason in words, the run ends there.
+"""
+
+_ROWS = 512
+"""Steps of a reference that cost as much as one."""
+_SECONDS = 2.0
+"""Of wall time that a stretch takes: what is lost at most where a run is killed."""
+
+
+def simulate(
+    parts: Parts,
+    settings: Settings,
+    progress: Progress | None = None,
+    keep: Keep | None = None,
+    before: Sequence[Stretch] = (),
+) -> Result:
+    """Run the closed loop and return what happened.
+
+    Args:
+        parts: agents, graph, formation, what drives them, starts and world.
+        settings: horizon, step and the like.
+        progress: called a hundred times or more with the run on its way: steps, states, and on
+            asking all that is known of it so far.
+        keep: called with what was computed, every two seconds and at the end.
+        before: all that an earlier run of the same parts and settings gave to `keep`; the run goes
+            on from there, to the same bits.
+
+    Raises:
+        EchelonError: a part is malformed or does not fit the others. A run that diverges or is
+            interrupted by Ctrl-C is no error: the result says so and holds what was computed.
+    """
+    began = time.perf_counter()
+    prepared = prepare(parts, settings, to_store=True)
+    with precision("float64"):
+        # Plans and solvers are made in float64, in whatever precision the run then is.
+        stepper = prepared.parts.drive.stepper(prepared.problem)
+    _check_devices(settings, stepper)
+    with precision(settings.precision):
+        recorder = _recorder(prepared, stepper, before)
+        _Flight(stepper, prepared, recorder, began).fly(progress, keep)
+    return _result(prepared, recorder, stepper, Outcome.INTERRUPTED)
+
+
+def _check_devices(settings: Settings, stepper: Stepper) -> None:
+    if settings.devices != stepper.devices:
+        raise SimulationError(
+            f"`devices` is {settings.devices}, and must be 1 where a solver drives the agents."
+        )
+
+
+def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:
+    """Return what a run had computed when it was ended from outside.
+
+    Args:
+        parts: those of the run.
+        settings: those of the run.
+        stretches: all that it gave to `keep`.
+
+    Raises:
+        EchelonError: as in `simulate`.
+    """
+    prepared = prepare(parts, settings)
+    with precision("float64"):
+        stepper = prepared.parts.drive.stepper(prepared.problem)
+    return _result(prepared, _recorder(prepared, stepper, stretches), stepper, Outcome.STOPPED)
+
+
+def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Stretch]) -> Recorder:
+    problem = prepared.problem
+    grid = Grid(problem.settings, stepper.longest)
+    return Recorder(problem, grid, on_host(problem.meter.nothing(np)), before)
+
+
+def _result(
+    prepared: Prepared, recorder: Recorder, stepper: Stepper, unfinished: Outcome
+) -> Result:
+    record = recorder.close(unfinished)
+    return result_of(prepared, record, stepper.engine, stepper.warnings, stepper.work)
+
+
+def result_of(
+    prepared: Prepared,
+    record: Record,
+    engine: str,
+    warnings: tuple[str, ...] = (),
+    work: SolverStats | None = None,
+) -> Result:
+    """Return a run as its result, from what was kept of it."""
+    told = record._asdict()
+    return Result(
+        wall_time=told.pop("seconds"),
+        **told,
+        warnings=prepared.warnings + warnings,
+        engine=engine,
+        parts=prepared.parts,
+        settings=prepared.problem.settings,
+        work=work,
+    )
+
+
+@final
+class _Flight:
+    """A run on its way, chunk by chunk, so that Ctrl-C or a divergence keeps what was computed."""
+
+    def __init__(
+        self, stepper: Stepper, prepared: Prepared, recorder: Recorder, began: float
+    ) -> None:
+        self.stepper, self.prepared, self.recorder = stepper, prepared, recorder
+        self.followed = _Followed(prepared)
+        last = recorder.stretches[-1] if recorder.stretches else None
+        self.now = stepper.start() if last is None else stepper.recall(last.moment)
+        # As if it had begun so much earlier: what was computed before counts too.
+        self.began = began - (0.0 if last is None else last.seconds)
+        self.given, self.gave = len(recorder.stretches), time.perf_counter()
+
+    def fly(self, progress: Progress | None, keep: Keep | None) -> None:
+        """Take all steps that are left, or those that can be taken."""
+        try:
+            # Between chunks, or within one of JAX's: that chunk is lost, the others are kept.
+            with contextlib.suppress(KeyboardInterrupt):
+                while not self.recorder.ended:
+                    self._advance()
+                    if time.perf_counter() - self.gave > _SECONDS:
+                        self._give(keep)
+                    if progress is not None:
+                        progress(Underway(self.prepared, self.recorder, self.stepper))
+            self._give(keep)
+        except Stopped as reason:
+            self.recorder.stop(f"The run was stopped, since {reason}")
+
+    def _advance(self) -> None:
+        first, grid = self.recorder.done, self.recorder.grid
+        # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
+        # last chunks, which have fewer steps, keep them from compiling anew.
+        reference = self.followed.rows(first, grid.longest + 1)
+        made = self.stepper.advance(self.now, grid.counts(first), reference)
+        self.recorder.keep(made, reference, time.perf_counter() - self.began)
+        self.now = made.now
+
+    def _give(self, keep: Keep | None) -> None:
+        """Hand over what was computed since the last time."""
+        new = join(self.recorder.stretches[self.given :])
+        if keep is not None and new is not None:
+            keep(new)
+        self.given, self.gave = len(self.recorder.stretches), time.perf_counter()
+
+
+@final
+class _Followed:
+    """What the leaders follow, of more steps at once than a short chunk has."""
+
+    def __init__(self, prepared: Prepared) -> None:
+        self.prepared, self.first = prepared, 0
+        self.kept: Array | None = None
+
+    def rows(self, first: int, count: int) -> Array | None:
+        """Return what they follow at so many steps from one on; None where they follow nothing."""
+        if self.kept is None or first + count > self.first + len(self.kept):
+            self.first = first
+            self.kept = sample_reference(self.prepared, first, max(count, _ROWS))
+        at = first - self.first
+        return None if self.kept is None else self.kept[at : at + count]
+
+
+def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:
+    """Return what the leaders follow from a step on, (steps, n) in float64."""
+    with precision("float64"):
+        # In float64: after three hours float32 has a millisecond between two times.
+        times = jax.device_put(prepared.problem.settings.dt * np.arange(first, first + steps))
+        reference = prepared.parts.drive.reference_states(prepared.parts.model, times)
+        return None if reference is None else np.asarray(reference, np.float64)

@@ -1,0 +1,1 @@
+"""The step as machine code: memory blocks, schedule, threads, and derivatives."""

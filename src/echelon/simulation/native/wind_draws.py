@@ -1,0 +1,36 @@
+"""Wind and noise for agents that are stepped by native code, drawn for many holds at once."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.world.disturbance import draw
+from echelon.core.types import Array
+from echelon.simulation.step.loop import Loop
+
+_AHEAD, _AT_ONCE = 64, 50_000
+"""Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
+
+
+def holds_at_once(agents: int) -> int:
+    """Return for how many holds is drawn at once."""
+    return max(1, min(_AHEAD, _AT_ONCE // agents))
+
+
+def draw_holds(loops: Sequence[Loop], holds: Array, hold: int) -> list[Array | None]:
+    """Return what wind adds to the rates (T, F, N, n) and noise to the inputs in T holds."""
+    # What is beyond the end of the run may wrap: nobody asks for it.
+    steps, agents = (holds * hold).astype(np.int32), np.arange(len(loops[0].offsets))
+    drawn = _drawn([loop.motion.wind for loop in loops], steps, agents)
+    return [part if part is None else np.asarray(part) for part in drawn]
+
+
+@jax.jit
+def _drawn(winds: Sequence[Any], steps: jax.Array, agents: jax.Array) -> Any:
+    """Return what each wind adds to the rates (T, F, N, n) and noise to the inputs at T steps."""
+    many = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *winds)
+    one = jax.vmap(draw, (None, None, 0))
+    return jax.vmap(jax.vmap(one, (0, None, None)), (None, 0, None))(many, steps, agents)

@@ -1,0 +1,148 @@
+"""A leader that minimizes its tracking error, as the paper's does: a plan, and feedback on it.
+
+The plan is made once, before the run, from where the leader is to start. The feedback keeps wind
+and a false mass from adding up, as they would open loop.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.agents.references.demand import reference_warnings
+from echelon.agents.references.flatness import followed_states, reference_targets
+from echelon.agents.references.guide import Guide
+from echelon.core.errors import LawError
+from echelon.core.numerics import rk4
+from echelon.core.types import Array, Input, Scalar, State
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.tracking import tracking_gain
+from echelon.simulation.optimal.formation_plan import plan_tracking
+from echelon.simulation.optimal.objectives import TrackingOptions, grid
+from echelon.synthesis.gains.gain import Gain
+
+_STEP = 0.005
+"""Runge-Kutta step of the plan, s."""
+_BETWEEN = 4
+"""Runge-Kutta steps from the beginning of an interval of the plan to now."""
+
+
+class OptimalTracking(Law):
+    """u_L = u_p(t) - S R^-1 (g S)'P (x - x_p(t)), with (x_p, u_p) a plan of least tracking error.
+
+    The plan minimizes the integral of the squared error of the outputs, plus a little of the
+    squared input. After its horizon the law follows the reference.
+
+    Args:
+        reference: the path to follow.
+        horizon: of the plan, s.
+        start_error: what is added to the leader's start, per state or group: where the plan begins.
+            A leader that starts elsewhere is brought to the plan by the feedback.
+        limits: whether the plan keeps to the actuators' limits.
+        planning: how the plan is posed.
+        gain: of the feedback, used with coupling 1; the model's Riccati gain when left out.
+    """
+
+    reference: Guide
+    gain: Gain | None
+    states: Array | None
+    inputs: Array | None
+    horizon: float = eqx.field(static=True)
+    start_error: tuple[tuple[str, float], ...] = eqx.field(static=True)
+    limits: bool = eqx.field(static=True)
+    planning: TrackingOptions = eqx.field(static=True)
+
+    def __init__(
+        self,
+        reference: Guide,
+        horizon: float = 10.0,
+        start_error: Mapping[str, float] | None = None,
+        limits: bool = True,
+        planning: TrackingOptions | None = None,
+        gain: Gain | None = None,
+    ) -> None:
+        """Keep the problem; `prepared` solves it."""
+        self.reference, self.gain, self.states, self.inputs = reference, gain, None, None
+        self.horizon, self.limits = horizon, limits
+        self.start_error = tuple((start_error or {}).items())
+        self.planning = TrackingOptions() if planning is None else planning
+
+    @property
+    def information(self) -> tuple[str, ...]:
+        """The whole reference."""
+        return ("the reference, all of it before the start",)
+
+    def prepared(self, model: ControlAffine, graph: Graph) -> "OptimalTracking":
+        """Complete the gain and make the plan, once.
+
+        Raises:
+            PlanError: there is no plan, or the model cannot follow a reference.
+            MissingExtraError: casadi is not installed.
+        """
+        # `simulate` prepares every law, prepared or not, and a plan takes seconds.
+        if self.states is not None:
+            return self
+        gain = tracking_gain(self, model, graph, self.gain)
+        times = grid(self.horizon, _STEP, self.planning.interval)
+        targets = reference_targets(model, self.reference, times.times)
+        start = targets.states[0] + model.per_state(dict(self.start_error))
+        plan = plan_tracking(model, start, targets, times, self.planning, self.limits)
+        return eqx.tree_at(
+            lambda law: (law.gain, law.states, law.inputs),
+            self,
+            (gain, plan.states, plan.inputs),
+            # None is an empty tree to JAX, and could not be replaced.
+            is_leaf=lambda leaf: leaf is None,
+        )
+
+    def warnings(self, model: ControlAffine, graph: Graph) -> tuple[str, ...]:
+        """Tell what of the reference the leader cannot do."""
+        return reference_warnings(model, self.reference, self.horizon, self.limits)
+
+    def target(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
+        """Return (x_p, u_p) at time t, or the reference's (x_r, u_r) after the plan.
+
+        Raises:
+            LawError: there is no plan yet.
+        """
+        if self.states is None or self.inputs is None:
+            raise LawError(
+                "`OptimalTracking` has no plan yet; call `prepared(model, graph)` first."
+            )
+        x_r, u_r = self.reference.follow(model, t)
+        dtype, count = x_r.dtype, len(self.inputs)
+        span = grid(self.horizon, _STEP, self.planning.interval).interval
+        # A time that rounding has left just before an interval belongs to it.
+        k = jnp.floor(t / span + 1e-4).astype(jnp.int32)
+        held = jnp.clip(k, 0, count - 1)
+        u = jnp.asarray(self.inputs, dtype)[held]
+        # The plan has states at the ends of intervals. Between them its held input is integrated,
+        # since interpolation would lose the order of the method.
+        x, step = jnp.asarray(self.states, dtype)[held], jnp.maximum(t - held * span, 0.0)
+        x = jax.lax.fori_loop(
+            0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
+        )
+        # Both are computed and one is taken: in a compiled step there is no other choice.
+        planned = k < count
+        return jnp.where(planned, x, x_r), jnp.where(planned, u, u_r)
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the reference's state at time zero."""
+        return jnp.asarray(reference_targets(model, self.reference, np.zeros(1)).states[0])
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array:
+        """Return the reference's states (T, n), which the plan comes close to."""
+        return followed_states(model, self.reference, times)
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
+        """Return the leader's input."""
+        state, u = self.target(model, view.t)
+        assert self.gain is not None  # `prepared` completes it together with the plan
+        error = model.difference(view.x, state + view.offset)
+        heading = None if model.heading is None else self.heading(model, view.t, view.x)
+        v = self.gain.feedback(model, view.x, error, heading)
+        return u - model.physical(v, trim=False), memory

@@ -1,0 +1,250 @@
+"""What drives the agents, and the small interface behind which a run is stepped.
+
+`simulate` knows nothing else of laws, plans or horizons. A compiled stepper takes the place of
+another one here.
+"""
+
+import abc
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.core.errors import SimulationError
+from echelon.core.types import Array, Scalar, State
+from echelon.core.words import Feedforward, Frame
+from echelon.laws.law import Law
+from echelon.simulation.step.meter import Meter, Sums
+from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.settings import Settings
+from echelon.simulation.step.solver_stats import SolverStats
+
+if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+    from echelon.synthesis.gains.gain import Gain
+
+Moment: TypeAlias = Any
+"""All that changes during a run; each stepper has its own."""
+
+
+class Problem(NamedTuple):
+    """What a stepper is made from: agents, their graph and goals, how they move, how they start.
+
+    Attributes:
+        model: what laws and solvers know of an agent.
+        graph: who hears whom.
+        formation: the goal offsets.
+        motion: the plant in its world, with the integrator.
+        meter: what is measured at each step.
+        settings: horizon, step and the like.
+        states: (N, n) at the beginning.
+    """
+
+    model: ControlAffine
+    graph: Graph
+    formation: Formation
+    motion: Motion
+    meter: Meter
+    settings: Settings
+    states: Array
+
+
+class Chunk(NamedTuple):
+    """A stretch of a run.
+
+    Attributes:
+        now: where it ended.
+        states: (T, N, n) of the stored frames, float64.
+        inputs: (T, N, m) delivered from each of them on, float64.
+        sums: over its steps.
+        stopped: why no further step can be taken, in words; None where one can.
+    """
+
+    now: Moment
+    states: Array
+    inputs: Array
+    sums: Sums
+    stopped: str | None = None
+
+
+def numbers(now: Moment) -> tuple[Array, ...]:
+    """Return the numbers of a moment, in the order of its tree."""
+    leaves = jax.tree.leaves(now)
+    return tuple(np.asarray(jax.random.key_data(x) if _is_key(x) else x) for x in leaves)
+
+
+def _leaf(stored: Array, like: Any) -> Any:
+    """Return one of the numbers as the leaf that it was."""
+    if _is_key(like):
+        return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
+    return jnp.asarray(stored, like.dtype)
+
+
+def _is_key(leaf: Any) -> bool:
+    """Tell whether a law remembers a random key, which is no number to NumPy."""
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+class Stopped(Exception):
+    """Raised by what a run asks on its way, where the run is to end there; the reason in words."""
+
+
+class Stepper(abc.ABC):
+    """Moves all agents from step to step."""
+
+    @property
+    @abc.abstractmethod
+    def longest(self) -> int:
+        """The most steps of a chunk, so that one takes well under two seconds."""
+
+    @abc.abstractmethod
+    def start(self) -> Moment:
+        """Return the moment at which the run begins."""
+
+    @abc.abstractmethod
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+        """Store a frame and take counts[k] steps, for each k.
+
+        `reference` (S, n) is what the leaders follow at this step and the next ones, which the
+        meter measures them against; None where they follow nothing. A chunk that meets a state
+        that is not finite may end early, with that state in its last frame.
+        """
+
+    def recall(self, leaves: Sequence[Array]) -> Moment:
+        """Return the moment of which these are the numbers, in the order of its tree.
+
+        Raises:
+            SimulationError: a moment is not all that decides what comes next, or another run's.
+        """
+        # The moment at the start says of what kind and shape each of the numbers is.
+        wanted, tree = jax.tree.flatten(self.start())
+        if [np.shape(each) for each in numbers(wanted)] != [np.shape(each) for each in leaves]:
+            raise SimulationError("the kept moment has another shape than this run's.")
+        return tree.unflatten(map(_leaf, leaves, wanted))
+
+    @property
+    def work(self) -> SolverStats | None:
+        """What solving took so far; None where nothing is solved."""
+        return None
+
+    @property
+    def devices(self) -> int:
+        """Among how many devices the agents are parted."""
+        return 1
+
+    @property
+    def engine(self) -> str:
+        """What computes the steps."""
+        return "jax"
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is allowed but probably not meant, a sentence each."""
+        return ()
+
+
+class Information(NamedTuple):
+    """What leaders and followers must be sent by others, in words."""
+
+    leader: tuple[str, ...]
+    follower: tuple[str, ...]
+
+
+class Drive(eqx.Module):
+    """What gives the agents their inputs: laws, plans made before, or a receding horizon."""
+
+    @property
+    @abc.abstractmethod
+    def information(self) -> Information:
+        """What the agents must be sent by others."""
+
+    @abc.abstractmethod
+    def stepper(self, problem: Problem) -> Stepper:
+        """Return what moves the agents under a drive that is prepared.
+
+        Raises:
+            EchelonError: there is none, such as a plan that misses a constraint.
+        """
+
+    @property
+    def gain(self) -> "Gain | None":
+        """The gain that the followers run with; None where they have none."""
+        return None
+
+    @property
+    def feedforward(self) -> Feedforward:
+        """What the followers are sent of others' inputs."""
+        return Feedforward.NONE
+
+    @property
+    def frame(self) -> Frame:
+        """The axes of the followers' gain, as they are asked for."""
+        return Frame.WORLD
+
+    @property
+    def reacts(self) -> bool:
+        """Whether the leaders react to their neighbours."""
+        return False
+
+    @property
+    def trimmed(self) -> bool:
+        """Whether the trim input is applied."""
+        return True
+
+    def prepare(self, model: ControlAffine, graph: Graph) -> "Drive":
+        """Return the drive completed with what depends on the model and the graph.
+
+        Raises:
+            LawError: a law does not fit the model or the graph.
+        """
+        return self
+
+    def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
+        """Return what is allowed but probably not meant, a sentence each."""
+        return ()
+
+    def accept(self, problem: Problem) -> None:
+        """Check the starts of a run under a drive that is prepared.
+
+        Raises:
+            LawError: an agent starts where its law has no meaning.
+        """
+
+    def start(self, model: ControlAffine) -> State:
+        """Return the state (n,) in which leaders begin, the trim unless replaced."""
+        # By way of NumPy, so that a trim of whole numbers becomes one of floats.
+        return jnp.asarray(np.asarray(model.trim[0], float))
+
+    def reference_states(self, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+        """Return the states (T, n) that the leaders follow; None where they follow nothing."""
+        return None
+
+    def with_follower(self, law: Law) -> "Drive":
+        """Return a drive under which leaders do the same, and followers obey a law.
+
+        Raises:
+            SimulationError: the leaders have no law of their own.
+        """
+        raise SimulationError(
+            f"the leaders under `{type(self).__name__}` have no law of their own."
+        )
+
+    def metric(self, model: ControlAffine) -> Array | None:
+        """Return P (n, n) of the paper's Lyapunov function; None where there is none."""
+        return None
+
+    def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
+        """Return the heading (rad) in whose axes the metric stands, with a leader at x.
+
+        None where it stands in those of the world.
+        """
+        return None
+
+    def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
+        """Return a follower's xdot (n,) without disagreement and feed-forward, at a heading."""
+        return model.normalized_drift(x)

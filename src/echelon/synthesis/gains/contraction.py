@@ -1,0 +1,49 @@
+"""The weakest feedback that contracts at a wanted rate on a domain, with one constant metric."""
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from echelon.agents.models.linearization import Linearization
+from echelon.agents.models.model import ControlAffine
+from echelon.synthesis.certificates.domain import Bound, Domain
+from echelon.synthesis.certificates.domain_metrics import contracting_region, pairs_on
+from echelon.synthesis.certificates.lmi import contraction
+from echelon.synthesis.gains.gain import Feedback, Method
+
+
+class Contraction(Method):
+    """W = P^-1 with A W + W A' - rho B B' + 2 rate W <= 0 for every Jacobian A, least rho.
+
+    The coupling is rho / (2 lambda_min), and R = I (theory page, T1).
+
+    Args:
+        domain: half-widths, or (lower, upper), by state, group or normalized input.
+        rate: alpha, 1/s.
+        coupling: c > 0; what the inequality needs when left out, 1 where it needs none.
+        exact: whether to prove the rate in exact arithmetic where g is constant (seconds).
+    """
+
+    name = "contraction"
+    needs = ("domain", "rate")
+    usual = {"rate": 0.1}
+    headroom = 1.0  # the least rho is what it is for
+
+    domain: Mapping[str, Bound] | Domain | None = None
+    rate: float = usual["rate"]
+    exact: bool = True
+
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return P and the least rho; needs the extra `certify`.
+
+        Raises:
+            GainError: there is no such metric, or the domain does not fit.
+            MissingExtraError: the solver is not installed.
+        """
+        # The inequality weighs no input against a state, and normalized inputs are of like size.
+        R, B = np.eye(len(model.input_names)), linear.B
+        pairs = pairs_on(model, self.domain, R)
+        # The rate at rho itself is left: the region measures it at the strength chosen.
+        P, rho, *_ = contraction(pairs.A, B, self.rate, W=pairs.W)
+        return Feedback(P, R, rho, partial(contracting_region, pairs, P, B, R, self.exact))

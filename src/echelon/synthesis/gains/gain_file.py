@@ -1,0 +1,324 @@
+"""Gains as files: everything that the law needs to run, and what the gain was made for."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from echelon.agents import models
+from echelon.agents.models.linearization import linearize
+from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.graph import Graph
+from echelon.core.errors import GainError, OutputError
+from echelon.core.files import write_whole
+from echelon.core.types import Array, PathLike
+from echelon.core.words import Kind, Theorem
+from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate
+from echelon.synthesis.certificates.domain import Domain
+from echelon.synthesis.gains.gain import Gain, check_strength
+
+FORMAT = "echelon gain 2"
+_SAME = 1e-9
+"""Relative difference beyond which two models or spectra are not the same."""
+_MOST_EDGES = 2000
+"""The edges of a larger graph are left out; its eigenvalues stand for it."""
+
+_ENDS = {"lower": -np.inf, "upper": np.inf, "input_lower": 0.0, "input_upper": 0.0}
+"""The bounds of a domain, and what None stands for in each."""
+
+
+def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str, Any]:
+    """Return a gain ready for JSON: the law, and all that its certificate rests on.
+
+    That is the model, the graph with its eigenvalues, the domain and the corners of the hull of
+    Jacobians; `verify` recomputes every promise from them. A bound that is infinite is None.
+    """
+    return {
+        "format": FORMAT,
+        "method": gain.method,
+        "coupling": gain.coupling,
+        "P": gain.P.tolist(),
+        "R": gain.R.tolist(),
+        "inner": None if gain.inner is None else gain.inner.tolist(),
+        "model": _model_as_mapping(model),
+        "graph": {
+            "agents": graph.agents,
+            "leaders": list(graph.leaders),
+            "edges": _edges(graph),
+            # Stored beside the edges: the checker compares them, and of a large graph it is all.
+            "directed": graph.directed,
+            "switches": graph.schedule is not None,
+            "spectrum": _reals(graph.spectrum().eigenvalues),
+            "sums": _sums(graph),
+        },
+        "certificate": _certificate_as_mapping(gain.certificate),
+    }
+
+
+def _reals(values: Array) -> list[Any]:
+    """Return numbers as JSON has them; complex ones as pairs."""
+    if not np.iscomplexobj(values):
+        return values.tolist()
+    return [[float(x.real), float(x.imag)] for x in values]
+
+
+def _sums(graph: Graph) -> list[float] | None:
+    """Return the weights of followers in the sum that falls; None where all are 1."""
+    sums = graph.spectrum().sums
+    return None if sums is None else sums.tolist()
+
+
+def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
+    linear = linearize(model)
+    return {
+        "class": _public_path(type(model)),
+        # The checker makes a bundled model again from them; one of the user's own it never imports.
+        "parameters": _parameters(model),
+        "state_names": list(model.state_names),
+        "input_names": list(model.input_names),
+        "trim": [list(part) for part in model.trim],
+        "input_scale": [list(row) for row in model.input_scale],
+        "A": linear.A.tolist(),
+        "B": linear.B.tolist(),
+    }
+
+
+def _public_path(cls: type) -> str:
+    """Return where a class is found: a bundled one by its public name, which no move changes."""
+    if getattr(models, cls.__name__, None) is cls:
+        return f"echelon.models:{cls.__name__}"
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _parameters(model: ControlAffine) -> dict[str, Any] | None:
+    """Return the fields of a model, or None where JSON cannot hold one of them."""
+    fields = [field.name for field in dataclasses.fields(model) if field.init]
+    stored = {name: getattr(model, name) for name in fields}
+    try:
+        return json.loads(
+            # By way of JSON itself, so that what is stored is what will be read.
+            json.dumps(stored, allow_nan=False, default=lambda x: np.asarray(x).tolist())
+        )
+    except (TypeError, ValueError):
+        return None
+
+
+def _edges(graph: Graph) -> list[list[float]] | None:
+    if len(graph.edges) > _MOST_EDGES:
+        return None
+    return [[*map(int, e), float(w)] for e, w in zip(graph.edges, graph.weights, strict=True)]
+
+
+def _certificate_as_mapping(certificate: Certificate) -> dict[str, Any]:
+    region = certificate.region
+    return {
+        "kind": str(certificate.kind),
+        "lambda_min": certificate.lambda_min,
+        "lambda_max": certificate.lambda_max,
+        "abscissa": certificate.abscissa,
+        "modes": certificate.modes,
+        "edge": certificate.edge,
+        "observable": certificate.observable,
+        "region": None if region is None else _region_as_mapping(region),
+    }
+
+
+def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
+    domain = region.domain
+    return {
+        "kind": str(region.kind),
+        "theorem": str(region.theorem),
+        "rate": region.rate,
+        "radius": region.radius,
+        "strength": region.strength,
+        # JSON has no infinity, and a file that only Python can read would be no file for others.
+        "domain": {name: _finite(getattr(domain, name)) for name in _ENDS},
+        "hull": _pack(region.hull),
+        "error": region.error.tolist(),
+    }
+
+
+def _finite(bounds: Array) -> list[float | None]:
+    return [x if np.isfinite(x) else None for x in bounds.tolist()]
+
+
+def _pack(matrices: Array) -> dict[str, Any]:
+    """Return many matrices as one, and what of it changes: most entries are the same in all."""
+    # A vehicle's hull has thousands of corners that differ in a few entries of (n, n) or (n, 2n).
+    places = np.argwhere((matrices != matrices[0]).any(axis=0))
+    values = matrices[:, places[:, 0], places[:, 1]]
+    return {"base": matrices[0].tolist(), "places": places.tolist(), "values": values.tolist()}
+
+
+def _unpack(stored: Mapping[str, Any]) -> Array:
+    values = np.array(stored["values"], float)
+    # A hull of one matrix has no places, and an empty list no second axis.
+    places = np.array(stored["places"], int).reshape(-1, 2)
+    matrices = np.repeat(np.array(stored["base"], float)[None], len(values), axis=0)
+    matrices[:, places[:, 0], places[:, 1]] = values
+    return matrices
+
+
+def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) -> None:
+    """Write a gain as JSON.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    stored = gain_as_mapping(gain, model, graph)
+    # A line a key: a diff then shows what changed. NaN is refused, since no promise rests on one.
+    lines = [f"{json.dumps(key)}: {json.dumps(stored[key], allow_nan=False)}" for key in stored]
+    try:
+        write_whole(Path(path), "{\n" + ",\n".join(lines) + "\n}\n")
+    except OSError as error:
+        raise OutputError(f"`{path}` cannot be written: {error.strerror or error}.") from error
+
+
+def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
+    """Return the gain of a file, for the model and the graph that it was made for.
+
+    Raises:
+        GainError: the file is no gain, holds a number that is not finite, or was made for another
+            model or graph; the message says what differs.
+    """
+    stored = _read(path)
+    try:
+        _check_model(path, stored["model"], model)
+        _check_graph(path, stored["graph"], graph)
+        gain = _gain(stored)
+    # What a hand has changed in the file fails somewhere in here, in one of these ways.
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
+    check_strength(gain.coupling * graph.spectrum().high, linearize(model), gain.P, gain.R)
+    return gain
+
+
+def _read(path: PathLike) -> Mapping[str, Any]:
+    try:
+        stored = json.loads(Path(path).read_text("utf-8"), object_pairs_hook=_mapping)
+    except OSError as error:
+        raise GainError(f"the gain file `{path}` cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise GainError(f"the gain file `{path}` is no JSON: {error}.") from error
+    form = stored.get("format") if isinstance(stored, dict) else None
+    if form != FORMAT:
+        older = isinstance(form, str) and form.startswith("echelon gain ")
+        advice = f"is `{form}`; make it again with `echelon design`" if older else "is missing"
+        raise GainError(
+            f"`{path}` is no gain file that this echelon reads: its `format` must be `{FORMAT}`, "
+            f"and {advice}."
+        )
+    return stored
+
+
+def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping; of two equal keys one reader takes the first and another the last."""
+    told = dict(pairs)
+    if len(told) < len(pairs):
+        names = [key for key, _ in pairs]
+        raise ValueError(f"`{next(k for k in names if names.count(k) > 1)}` stands there twice")
+    return told
+
+
+def _gain(stored: Mapping[str, Any]) -> Gain:
+    # `Gain` and `Certificate` take no words of the file on trust: names become members here.
+    inner, certificate = stored["inner"], stored["certificate"]
+    region = None if certificate["region"] is None else _region(certificate["region"])
+    numbers = {
+        name: _number(certificate, name) for name in ("lambda_min", "lambda_max", "abscissa")
+    }
+    counts = {name: _count(certificate, name) for name in ("modes", "observable")}
+    edge = None if certificate["edge"] is None else _number(certificate, "edge")
+    return Gain(
+        np.array(stored["P"], float),
+        np.array(stored["R"], float),
+        _number(stored, "coupling"),
+        str(stored["method"]),
+        Certificate(
+            kind=Kind.named(certificate["kind"]), edge=edge, region=region, **numbers, **counts
+        ),
+        inner=None if inner is None else np.array(inner, float),
+    )
+
+
+def _number(stored: Mapping[str, Any], name: str) -> float:
+    value = stored[name]
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not np.isfinite(float(value))
+    ):
+        raise ValueError(f"`{name}` is {value!r}, and must be a finite number")
+    return float(value)
+
+
+def _count(stored: Mapping[str, Any], name: str) -> int:
+    value = stored[name]
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ValueError(f"`{name}` is {value!r}, and must be a whole number")
+    return value
+
+
+def _region(stored: Mapping[str, Any]) -> RegionCertificate:
+    bounds = [
+        [end if x is None else x for x in stored["domain"][name]] for name, end in _ENDS.items()
+    ]
+    return RegionCertificate(
+        kind=Kind.named(stored["kind"]),
+        rate=_number(stored, "rate"),
+        theorem=Theorem.named(stored["theorem"]),
+        domain=Domain(*(np.array(some, float) for some in bounds)),
+        radius=None if stored["radius"] is None else _number(stored, "radius"),
+        strength=_number(stored, "strength"),
+        hull=_unpack(stored["hull"]),
+        error=np.array(stored["error"], float),
+    )
+
+
+def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine) -> None:
+    """Check that the model is the one that the gain was made for, near its trim."""
+    linear = linearize(model)
+    name, made_for = f"`{type(model).__name__}`", str(stored["class"]).rpartition(":")[2]
+    for what, ours in (("state_names", model.state_names), ("input_names", model.input_names)):
+        if tuple(stored[what]) != tuple(ours):
+            raise GainError(
+                f"the gain in `{path}` was made for `{made_for}` with {what} "
+                f"{list(stored[what])}, and the model is {name} with {list(ours)}."
+            )
+    # Class and parameters may differ: near the trim a gain knows a model by these numbers alone.
+    compared = {
+        "input_scale": (stored["input_scale"], model.input_scale),
+        "the trim input": (stored["trim"][1], model.trim[1]),
+        "A at the trim": (stored["A"], linear.A),
+        "B at the trim": (stored["B"], linear.B),
+    }
+    for what, (theirs, ours) in compared.items():
+        theirs, ours = np.asarray(theirs, float), np.asarray(ours, float)
+        gap = float(np.abs(theirs - ours).max())
+        # `not <=` instead of `>`: a gap that is not a number must not pass.
+        if not gap <= _SAME * max(1e-12, float(np.abs(ours).max())):
+            raise GainError(
+                f"the gain in `{path}` was made for another {name}: {what} differs by {gap:.3g}; "
+                "make it again for these parameters."
+            )
+
+
+def _check_graph(path: PathLike, stored: Mapping[str, Any], graph: Graph) -> None:
+    """Check that the spectrum is the one that the coupling was chosen for."""
+    values, spectrum = stored["spectrum"], graph.spectrum()
+    sizes = [abs(complex(*x)) if isinstance(x, list) else float(x) for x in values]
+    low = values[0][0] if isinstance(values[0], list) else float(values[0])
+    # Of graphs that take turns it is no eigenvalue.
+    low = spectrum.low if spectrum.weakest is not None else low
+    ends = {"lambda_min": (low, spectrum.low), "lambda_max": (max(sizes), spectrum.high)}
+    # The ends bound every mode, so a coupling fits all networks that share them.
+    for what, (theirs, ours) in ends.items():
+        if not abs(theirs - ours) <= _SAME * ours:
+            raise GainError(
+                f"the gain in `{path}` was made for a graph of {stored['agents']} agents with "
+                f"{what} = {theirs:.6g}, and this graph of {graph.agents} has {ours:.6g}; "
+                "make it again."
+            )

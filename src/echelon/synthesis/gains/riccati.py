@@ -1,0 +1,56 @@
+"""The Riccati gain at the trim (Zhang, Lewis and Das; the linear case of the paper's Remark 2)."""
+
+import itertools
+
+import numpy as np
+
+from echelon.agents.models.linearization import Linearization
+from echelon.agents.models.model import ControlAffine
+from echelon.core.errors import GainError, listing
+from echelon.core.linear import Weight, in_words, riccati, uncontrollable_modes
+from echelon.synthesis.gains.gain import Feedback, Method
+from echelon.synthesis.gains.weights import weights_of
+
+
+class Riccati(Method):
+    """P from A'P + P A + Q - P B R^-1 B'P = 0 at the trim, in normalized inputs.
+
+    Args:
+        Q: state weight, n numbers or (n, n); the model's own when left out.
+        R: weight of the normalized input, m numbers or (m, m); the model's own when left out.
+        coupling: c > 0; 1/lambda_min when left out, twice the edge 1/(2 lambda_min) of the
+            guarantee for linear agents.
+    """
+
+    name = "riccati"
+
+    Q: Weight | None = None
+    R: Weight | None = None
+
+    def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return P, whose equation leaves -Q at strength 1.
+
+        Raises:
+            GainError: a weight is not positive (semi)definite, or a mode cannot be stabilized
+                (named).
+        """
+        Q, R = weights_of(model, self.Q, self.R)
+        _check_stabilizable(model, linear)
+        # P A + A'P - s P B R^-1 B'P = -Q - (s - 1) P B R^-1 B'P, never positive for s >= rho = 1.
+        return Feedback(riccati(*linear, Q, R), R, rho=1.0)
+
+
+def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
+    """Name the first mode that no input can move and that does not decay by itself."""
+    for eigenvalue, direction in uncontrollable_modes(*linear):
+        # A mode that decays by itself needs no input: (A, B) need not be controllable.
+        if eigenvalue.real >= 0.0:
+            # A combination w'x stays unmoved; entries of rounding's size would name every state.
+            used = np.abs(direction) > 0.1 * np.abs(direction).max()
+            states = listing(itertools.compress(model.state_names, used))
+            raise GainError(
+                f"the linearization of `{type(model).__name__}` at its trim cannot be stabilized: "
+                f"no input moves the mode at {in_words(eigenvalue)} 1/s, which lies along "
+                f"{states}; give the gain yourself (method `given`) or choose another model of the "
+                "vehicle."
+            )

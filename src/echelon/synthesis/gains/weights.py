@@ -1,0 +1,42 @@
+"""The weights of states and inputs that quadratic methods share."""
+
+import numpy as np
+
+from echelon.agents.models.model import ControlAffine
+from echelon.core.errors import GainError
+from echelon.core.linear import Weight, as_matrix, check_definite
+from echelon.core.types import Array
+
+
+def weights_of(
+    model: ControlAffine, Q: Weight | None = None, R: Weight | None = None
+) -> tuple[Array, Array]:
+    """Return Q (n, n) of the states and R (m, m) of the normalized inputs.
+
+    Args:
+        model: whose own weights stand for what is left out.
+        Q: n numbers (a diagonal) or (n, n).
+        R: m numbers (a diagonal) or (m, m).
+
+    Raises:
+        GainError: one has another size, Q is not symmetric positive semidefinite, or R is not
+            symmetric positive definite.
+    """
+    own_Q, own_R = model.weights
+    Q = as_matrix("Q", own_Q if Q is None else Q, len(model.state_names))
+    R = as_matrix("R", own_R if R is None else R, len(model.input_names))
+    check_definite("R", R)
+    # R must be inverted and so is definite; Q may leave states free that decay by themselves.
+    _check_semidefinite(Q)
+    return Q, R
+
+
+def _check_semidefinite(Q: Array) -> None:
+    if not np.isfinite(Q).all() or not np.allclose(Q, Q.T, rtol=1e-9, atol=0.0):
+        raise GainError("`Q` must be a symmetric matrix of finite numbers.")
+    least = float(np.linalg.eigvalsh(Q)[0])
+    # A Q of lower rank, such as C'C, has eigenvalues that rounding makes a little negative.
+    if least < -1e-12 * max(1.0, float(np.abs(Q).max())):
+        raise GainError(
+            f"`Q` is not positive semidefinite: its smallest eigenvalue is {least:.6g}."
+        )

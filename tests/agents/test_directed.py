@@ -1,0 +1,525 @@
+"""Directed and switching graphs: spectra, what falls on them, flights by a second way, promises."""
+
+import jax
+import jax.numpy as jnp
+import networkx as nx
+import numpy as np
+import pytest
+import scipy.linalg
+
+import echelon as ech
+from echelon.agents.models.linearization import linearize
+from echelon.agents.models.model import wound
+from echelon.agents.network.eigenvalues import _least
+from echelon.agents.network.hearing import heard_along
+from echelon.core.errors import EchelonError
+from echelon.core.numerics import precision
+from echelon.core.statement import Hypothesis, Line
+from echelon.core.words import Kind, Verdict
+from echelon.experiments.studies.check import check
+from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.guarantees.verifier.verify import verify
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
+from echelon.simulation.engine.agent import Agent
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.step.loop import assemble, begin, control, step
+
+CARTS = ech.models.DoubleIntegrator(2)
+RING = ech.Graph([(0, 1), (1, 2, 2.0), (2, 3), (3, 1, 0.5)], directed=True)
+TURNS = [(0.0, [(0, 1), (1, 2)]), (0.7, [(0, 2), (2, 1, 0.5)])]
+
+
+def arrows(draw, most=8):
+    """Edges of a random directed graph in which agent 0 reaches everybody."""
+    n = int(draw.integers(2, most + 1))
+    pairs = {(int(draw.integers(k)), k) for k in range(1, n)}
+    some = {tuple(map(int, pair)) for pair in draw.integers(0, n, (int(draw.integers(12)), 2))}
+    pairs |= {(i, j) for i, j in some if i != j}
+    order = np.append(0, 1 + draw.permutation(n - 1))
+    return [(int(order[i]), int(order[j]), float(np.exp(draw.normal()))) for i, j in sorted(pairs)]
+
+
+def grounded(edges, agents):
+    """L_g by hand: whoever hears others has their weights on the diagonal."""
+    L = np.zeros((agents, agents))
+    for i, j, w in edges:
+        L[j, j] += w
+        L[j, i] -= w
+    return L[1:, 1:]
+
+
+# ---- spectra -------------------------------------------------------------------------------------
+
+
+def test_spectra_of_arrows_are_those_of_their_matrix_and_a_sum_falls_on_them():
+    draw = np.random.default_rng(0)
+    for _ in range(200):
+        edges = arrows(draw)
+        graph = ech.Graph(edges, directed=True)
+        L, found = grounded(edges, graph.agents), graph.spectrum()
+        np.testing.assert_allclose(graph.grounded_laplacian().toarray(), L, atol=1e-13)
+        values = np.linalg.eigvals(L)
+        # Half the digits where L is defective; the product of all is known to more.
+        assert found.low == pytest.approx(values.real.min(), rel=1e-6)
+        assert np.prod(found.eigenvalues).real == pytest.approx(np.linalg.det(L), rel=1e-9)
+        W = np.diag(found.sums)
+        assert found.proved >= 0.89 * found.low
+        held = W @ L + L.T @ W - 2.0 * found.proved * W
+        assert np.linalg.eigvalsh(held)[0] >= -1e-14 * np.abs(held).max()
+
+
+def test_a_chain_heard_one_way_has_one_eigenvalue_whatever_its_order():
+    order = np.append(0, 1 + np.random.default_rng(1).permutation(30))
+    graph = ech.Graph([(order[k], order[k + 1]) for k in range(30)], directed=True)
+    assert np.array_equal(graph.spectrum().eigenvalues, np.ones(30))
+    assert graph.parents()[order[7]] == order[6] and graph.depths()[order[30]] == 30
+    assert graph.neighbours(int(order[5])) == (order[4],)
+
+
+def test_one_way_everybody_hears_those_that_are_nearer_to_a_leader():
+    drawn = ech.Graph.geometric(30, 0.35, seed=2, leaders=(0, 7))
+    heavy = ech.Graph([(i, j, 1.0 + i + 0.1 * j) for i, j in drawn.edges], drawn.leaders)
+    y = np.random.default_rng(0).normal(size=(30, 2))
+    for graph in (drawn, heavy, ech.Graph.grid(4, 5), ech.Graph.complete(6)):
+        # NetworkX knows how far everybody is, and the sums are written out.
+        far = nx.multi_source_dijkstra_path_length(
+            nx.Graph(graph.edges.tolist()), set(graph.leaders)
+        )
+        wanted = np.zeros((graph.agents, 2))
+        for (i, j), w in zip(graph.edges.tolist(), graph.weights, strict=True):
+            for a, b in ((i, j), (j, i)):
+                wanted[a] += w * (far[b] < far[a]) * (y[a] - y[b])
+        one_way = graph.one_way()
+        assert one_way.directed and one_way.leaders == graph.leaders
+        with precision("float64"):
+            found = one_way.disagreement(jnp.asarray(y[: graph.agents]))
+        np.testing.assert_allclose(found, wanted, atol=1e-13)
+        np.testing.assert_array_equal(one_way.one_way().edges, one_way.edges)
+    scenario = ech.load_scenario(
+        "paper", ["graph={name: grid, rows: 2, columns: 2, directed: true}"]
+    )
+    assert ech.build(scenario)[0].graph == ech.Graph.grid(2, 2).one_way()
+
+
+def test_weights_that_floats_can_hardly_add_keep_their_smallest_eigenvalue():
+    # Of a circle of two, one light way in: the determinant over the trace, to rounding.
+    light = 1e-9
+    dense = np.array([[1.0 + light, -1.0], [-1.0, 1.0]])
+    wanted = light / (2.0 + light)
+    assert _least(dense) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_who_hears_along_an_edge_is_who_has_the_other_as_a_neighbour():
+    pairs = [[0, 1], [1, 2], [2, 1], [3, 2], [1, 3], [0, 4], [4, 3]]
+    for directed, edges in ((True, pairs), (False, [[1, 0], [1, 2], [3, 2], [1, 3], [0, 4]])):
+        graph = ech.Graph(edges, [0, 4], directed=directed)
+        depth = graph.depths()
+        for leaderward, reacts in ((False, True), (False, False), (True, False)):
+            heard = heard_along(graph, leaderward, reacts)
+            for pair, ends in zip(graph.edges.tolist(), heard.tolist(), strict=True):
+                for (me, other), hears in zip((pair, pair[::-1]), ends, strict=True):
+                    told = not directed or [other, me] == pair
+                    near = depth[other] < depth[me] or not leaderward
+                    assert hears == (told and near and (reacts or me not in graph.leaders))
+
+
+def test_networkx_means_the_same_by_arrows():
+    given = nx.DiGraph([(0, 1), (1, 2), (2, 1)])
+    graph = ech.Graph.from_networkx(given)
+    assert graph.directed and np.array_equal(graph.told().toarray(), nx.to_numpy_array(given))
+    assert np.array_equal(graph.adjacency().toarray(), nx.to_numpy_array(given).T)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: ech.Graph([(0, 1), (2, 1)], directed=True), "agent 2 has no path to a leader"),
+        (lambda: ech.Graph([(0, 1), (0, 1)], directed=True), r"edge \[0, 1\] is given twice"),
+        (lambda: ech.Graph([(0, 1, -1.0)], directed=True), "must be positive and finite"),
+        (lambda: ech.Graph([(0, 1)], weights=[1.0, 2.0]), "1 edges and 2 weights"),
+        (lambda: ech.Graph([(0, 1, 1.0)], weights=[1.0]), "weights stand in a list of their own"),
+        (
+            lambda: ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (3.0, [(0, 1)])]),
+            "agent 2 has no path to a leader .leader 0. from 3 s on, after the last switch",
+        ),
+        (
+            lambda: ech.Graph.switching([(0.0, [(0, 1)]), (1.0, [(0, 2)])], agents=4, period=2.0),
+            "agent 3 has no path to a leader .leader 0. in a window of 2 s",
+        ),
+        (lambda: ech.Graph.switching([(0.0, [(0, 1)]), (0.0, [])]), "times must ascend from 0"),
+        (lambda: ech.Graph.switching(TURNS, period=0.5), "must be longer than the last switch"),
+        (lambda: ech.Graph.switching(TURNS).parents(), "no one parent for all times"),
+        (lambda: RING.parents(), "agent 1 has more than one agent to hear"),
+    ],
+)
+def test_graphs_that_leave_agents_behind_are_told_with_what_would_do(make, text):
+    with pytest.raises(EchelonError, match=text):
+        make()
+
+
+# ---- what is proved ------------------------------------------------------------------------------
+
+
+def test_riccati_gains_hold_every_arrow_from_their_edge_on_and_a_weighted_sum_falls():
+    draw = np.random.default_rng(2)
+    for _ in range(40):
+        n, m = int(draw.integers(1, 5)), int(draw.integers(1, 3))
+        A, B = draw.normal(size=(n, n)), draw.normal(size=(n, m))
+        graph = ech.Graph(arrows(draw), directed=True)
+        P = scipy.linalg.solve_continuous_are(A, B, np.eye(n), np.eye(m))
+        L, K, spectrum = graph.grounded_laplacian().toarray(), B.T @ P, graph.spectrum()
+        edge = 0.5 / spectrum.low
+        whole = np.kron(np.eye(len(L)), A) - edge * np.kron(L, B @ K)
+        assert np.linalg.eigvals(whole).real.max() < 0.0
+        # T7: of c with 2 c proved >= 1 the sum with weights falls at any slope of Q's.
+        c = 0.5 / spectrum.proved
+        whole = np.kron(np.eye(len(L)), A) - c * np.kron(L, B @ K)
+        V = np.kron(np.diag(spectrum.sums), P)
+        slope = V @ whole + whole.T @ V + np.kron(np.diag(spectrum.sums), np.eye(n))
+        assert np.linalg.eigvalsh(slope)[-1] <= 1e-8 * np.abs(V).max() * np.abs(whole).max()
+
+
+def test_the_papers_v_may_rise_on_arrows_where_every_mode_decays():
+    L = ech.Graph([(0, 1), (1, 2, 9.0)], directed=True).grounded_laplacian().toarray()
+    # V = d' L d is not even positive, and its slope along d' = -L d is.
+    assert np.linalg.eigvalsh(L + L.T)[0] < 0.0 and np.linalg.eigvals(L).real.min() > 0.0
+
+
+def test_one_p_serves_undirected_graphs_whenever_they_switch():
+    draw = np.random.default_rng(3)
+    gain = ech.synthesize(CARTS, ech.Graph.switching(TURNS), ech.gains.Riccati())
+    A, B = linearize(CARTS)
+    K, P = gain.R_inverse @ B.T @ gain.P, np.kron(np.eye(2), gain.P)
+    parts, settings = flown(ech.Graph.switching(TURNS), gain), ech.Settings(4.0, 0.01)
+    rate = promise(parts, settings).rate
+    assert rate is not None and rate > 0.1
+    x = draw.normal(size=8)
+    for _ in range(30):
+        L, span = parts.graph.stretches()[int(draw.integers(2))].toarray(), draw.exponential(0.5)
+        whole = np.kron(np.eye(2), A) - gain.coupling * np.kron(L, B @ K)
+        before, x = x @ P @ x, scipy.linalg.expm(span * whole) @ x
+        assert x @ P @ x <= np.exp(-2.0 * rate * span) * before * (1.0 + 1e-9)
+
+
+def flown(graph, gain, **more):
+    law = ech.laws.Consensus(gain)
+    drive = ech.Laws(ech.laws.TrimInput(), law)
+    formation = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.5)})
+    return ech.Parts(CARTS, graph, formation, drive, initial={"position": 1.0}, **more)
+
+
+@pytest.mark.parametrize("period", [None, 1.0])
+def test_graphs_take_turns_at_their_times(period):
+    schedule = ech.Graph.switching(TURNS, period=period).schedule
+    steps, rows = schedule.switches(0.1, 3.0)
+    held = rows[np.searchsorted(steps, np.arange(30), side="right") - 1]
+    phase = np.arange(30) % (10 if period else 1000)
+    assert np.array_equal(held, (phase >= 7).astype(int))
+    assert [schedule.row(0.1 * k) for k in range(30)] == held.tolist()
+
+
+# ---- flights -------------------------------------------------------------------------------------
+
+
+def by_hand(parts, gain, horizon, dt):
+    """Followers' deviations behind a leader at rest, by the exact flow of a held input."""
+    A, B = linearize(CARTS)
+    K = gain.coupling * gain.R_inverse @ B.T @ gain.P
+    flow = scipy.linalg.expm(dt * np.block([[A, B], [np.zeros((2, 6))]]))[:4]
+    deviation = ech.simulate(parts, ech.Settings(dt, dt)).errors[0, 1:]
+    for k in range(round(horizon / dt)):
+        schedule = parts.graph.schedule
+        row = 0 if schedule is None else schedule.row(k * dt)
+        u = -parts.graph.stretches()[row] @ deviation @ K.T
+        deviation = np.concatenate([deviation, u], axis=1) @ flow.T
+    return deviation
+
+
+def test_linear_agents_fly_as_their_matrices_say():
+    graph = ech.Graph.switching(TURNS, directed=True, period=1.5)
+    gain = ech.synthesize(CARTS, graph, ech.gains.Riccati())
+    parts = flown(graph, gain)
+    result = ech.simulate(parts, ech.Settings(4.0, 0.05))
+    np.testing.assert_allclose(result.errors[-1, 1:], by_hand(parts, gain, 4.0, 0.05), atol=1e-12)
+
+
+def test_native_steps_are_those_of_jax_however_the_run_is_cut():
+    graph = ech.Graph.switching(TURNS, period=0.93)
+    parts = flown(graph, ech.synthesize(CARTS, graph, ech.gains.Riccati()))
+    settings = ech.Settings(3.0, 0.01, engine="jax", store_every=50)
+    slow = ech.simulate(parts, settings)
+    found = [
+        ech.simulate(parts, settings._replace(engine="native", store_every=every))
+        for every in (50, 1)
+    ]
+    assert found[0].engine == "native"
+    np.testing.assert_allclose(found[0].states, slow.states, atol=1e-12)
+    # To the bit: a stretch that is stored in between is flown as one that is not.
+    assert np.array_equal(found[0].states, found[1].states[::50])
+
+
+@pytest.mark.parametrize("directed", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_agents_by_themselves_are_those_of_the_simulation(directed):
+    turns = [(0.0, [(0, 1), (1, 2)]), (0.05, [(0, 2)]), (0.1, [(0, 1), (2, 1, 0.5), (0, 2)])]
+    graph = ech.Graph.switching(turns, directed=directed)
+    law = StoppingPoint(rate=3.0, observer=False)
+    drive = ech.Laws(StoppingLeader(rate=3.0, observer=False), law)
+    formation = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.5)})
+    parts = ech.Parts(CARTS, graph, formation, drive, initial={"position": 2.0})
+    result = ech.simulate(parts, ech.Settings(0.2, 0.01))
+    agents = [Agent(parts, k, 0.01) for k in range(3)]
+    for k, x in enumerate(result.states[:-1]):
+        said = {a.number: a.hello(x[a.number]) for a in agents}
+        for agent in agents:
+            heard = {j: said[j] for j in (*agent.neighbours, 0) if j != agent.number}
+            u, said[agent.number] = agent.step(0.01 * k, x[agent.number], heard)
+            np.testing.assert_allclose(u, result.inputs[k, agent.number], atol=1e-9)
+
+
+# ---- delays --------------------------------------------------------------------------------------
+
+
+def abscissa(A, F, delay, nodes=24):
+    """The rightmost root of x' = A x - F x(t - delay), by collocation at Chebyshev's points."""
+    n, k = len(A), np.arange(nodes + 1)
+    points = np.cos(np.pi * k / nodes)
+    weights = np.where((k == 0) | (k == nodes), 2.0, 1.0) * (-1.0) ** k
+    D = np.outer(weights, 1.0 / weights) / (points[:, None] - points + np.eye(nodes + 1))
+    D -= np.diag(D.sum(axis=1))
+    whole = np.kron(2.0 / delay * D, np.eye(n))
+    whole[:n], whole[:n, :n], whole[:n, -n:] = 0.0, A, -F
+    return np.linalg.eigvals(whole).real.max()
+
+
+@pytest.mark.parametrize("graph", [RING, ech.Graph([(0, 1), (1, 2), (1, 3)])])
+def test_the_delay_that_is_left_is_that_of_the_delayed_network(graph):
+    gain = ech.synthesize(CARTS, graph, ech.gains.Riccati())
+    parts, settings = flown(graph, gain), ech.Settings(4.0, 0.01)
+    lines = {line.statement: line for line in check(parts, settings).lines}
+    delay = lines[Line.DELAY].number
+    A, B = linearize(CARTS)
+    L = graph.grounded_laplacian().toarray()
+    network = np.kron(np.eye(3), A), np.kron(L, gain.coupling * B @ gain.R_inverse @ B.T @ gain.P)
+    assert abscissa(*network, 0.98 * delay) < 0.0 < abscissa(*network, 1.02 * delay)
+    spread = lines[Line.SPREAD]
+    ratio = np.abs(np.linalg.eigvals(L)).max() / np.linalg.eigvals(L).real.min()
+    assert spread.number == pytest.approx(ratio) and spread.fails and ratio > 4.0
+    assert f"{1e3 * delay:.3g} ms old" in spread.text
+
+
+def test_agreement_bears_the_delay_that_is_told():
+    graph, dt = RING, 0.01
+    parts = stopping(graph)
+    lines = {line.statement: line for line in check(parts, ech.Settings(4.0, dt)).lines}
+    c = float(prepare(parts, ech.Settings(4.0, dt)).parts.drive.follower.strength(dt))
+    L, delay = c * graph.grounded_laplacian().toarray(), lines[Line.DELAY].number
+    still = np.zeros_like(L)
+    assert abscissa(still, L, 0.98 * delay) < 0.0 < abscissa(still, L, 1.02 * delay)
+
+
+def stopping(graph, **law):
+    drive = ech.Laws(StoppingLeader(rate=3.0), StoppingPoint(rate=3.0, **law))
+    formation = ech.Formation.from_offsets(CARTS, graph, {1: (1.0, 0.5)})
+    return ech.Parts(CARTS, graph, formation, drive, initial={"position": 3.0})
+
+
+# ---- promises ------------------------------------------------------------------------------------
+
+
+def test_what_is_promised_of_a_linear_law_on_arrows_is_its_modes():
+    gain = ech.synthesize(CARTS, RING, ech.gains.Riccati())
+    found = promise(flown(RING, gain), ech.Settings(4.0, 0.01))
+    A, B = linearize(CARTS)
+    L = RING.grounded_laplacian().toarray()
+    whole = np.kron(np.eye(3), A) - np.kron(L, gain.coupling * B @ gain.R_inverse @ B.T @ gain.P)
+    assert found.kind is Kind.LINEARIZATION and found.theorem is None
+    assert found.rate == pytest.approx(-np.linalg.eigvals(whole).real.max(), rel=1e-9)
+    assert gain.coupling == pytest.approx(1.0 / np.linalg.eigvals(L).real.min(), rel=1e-9)
+    lines = {
+        line.statement: line for line in check(flown(RING, gain), ech.Settings(4.0, 0.01)).lines
+    }
+    assert lines[Line.GRAPH].fails and Line.PUSHED not in lines
+
+
+def test_a_region_on_arrows_is_smaller_by_their_skew_and_verified(tmp_path):
+    method = ech.gains.RobustLQR(domain={"position": 5.0, "velocity": 5.0}, exact=True)
+    small, whole = (ech.synthesize(CARTS, g, method) for g in (RING, ech.Graph.path(4)))
+    regions = [each.certificate.region for each in (small, whole)]
+    skew = RING.spectrum().sums.max() / RING.spectrum().sums.min()
+    assert regions[0].radius == pytest.approx(regions[1].radius / np.sqrt(skew), rel=1e-9)
+    file = tmp_path / "gain.json"
+    ech.save_gain(small, CARTS, RING, file)
+    assert verify(file).verdict == "verified"
+    text = file.read_text()
+    for old, new in (
+        ('"directed": true', '"directed": false'),
+        ("[3, 1, 0.5]", "[3, 1, 0.6]"),
+        (f'"sums": {RING.spectrum().sums.tolist()}', '"sums": [0.1, 1.0, 0.1]'),
+    ):
+        assert old in text
+        file.write_text(text.replace(old, new))
+        assert verify(file).verdict == "refused", old
+
+
+def test_graphs_that_take_turns_need_one_p_or_stopping_points():
+    settings, turns = ech.Settings(4.0, 0.01), ech.Graph.switching(TURNS)
+    strong = ech.synthesize(CARTS, turns, ech.gains.Riccati())
+    weak = ech.synthesize(CARTS, turns, ech.gains.Riccati(coupling=0.2 * strong.coupling))
+    assert promise(flown(turns, strong), settings).promised
+    found = promise(flown(turns, weak), settings)
+    assert not found.promised and "no one P is known" in found.sentence()
+    # A chain of arrows of 9 holds no sum of squares alone.
+    heavy = ech.Graph.switching([(0.0, [(0, 1), (1, 2, 9.0)])], directed=True)
+    with pytest.raises(EchelonError, match="no sum of errors' squares"):
+        ech.synthesize(CARTS, heavy, ech.gains.Riccati())
+    lost = ech.Graph.switching([(0.0, [(0, 1)]), (1.0, [(1, 2)])], period=2.0)
+    with pytest.raises(EchelonError, match="agent 2 has no path to a leader from 0 to 1 s"):
+        ech.synthesize(CARTS, lost, ech.gains.Riccati())
+
+
+def test_stopping_points_wait_for_links_and_agree_at_the_rate_of_a_period():
+    graph = ech.Graph.switching([(0.0, [(0, 1)]), (0.5, [(1, 2)])], period=1.0)
+    parts, settings = stopping(graph, observer=False), ech.Settings(16.0, 0.01)
+    found = promise(parts, settings)
+    assert found.kind is Kind.PROOF and "in every period" in found.sentence()
+    assert found.hypotheses[Hypothesis.SWITCHING].verdict is Verdict.HOLDS
+    size = np.linalg.norm(ech.simulate(parts, settings).errors[:, 1:], axis=(1, 2))
+    assert np.log(size[900] / size[1500]) / 6.0 == pytest.approx(found.rate, rel=0.05)
+
+
+def test_heard_leaderward_each_stretch_must_reach():
+    turns = [(0.0, [(0, 1), (1, 2)]), (1.0, [(0, 2), (2, 1)])]
+    with pytest.raises(EchelonError, match="from 1 s on where neighbours nearer"):
+        promise(stopping(ech.Graph.switching(turns), hears="leaderward"), ech.Settings(4.0, 0.01))
+
+
+# ---- attack --------------------------------------------------------------------------------------
+
+
+def test_on_random_arrows_that_switch_no_stopping_point_moves_away():
+    draw = np.random.default_rng(5)
+    for _ in range(60):
+        assert stops_rise(draw) <= 1e-12
+
+
+def stops_rise(draw, dt=0.01, steps=400):
+    """By how much the largest |zeta~| rises on random arrows that switch, c d_max dt <= 1."""
+    n, s = int(draw.integers(2, 7)), float(np.exp(draw.normal()))
+    rows = draw.exponential(size=(4, n, n + 1)) * (draw.random((4, n, n + 1)) < 0.4)
+    c = 0.99 / (dt * rows.sum(axis=2).max())
+    zeta, most = draw.normal(scale=5.0, size=n), -np.inf
+    for k in range(steps):
+        W = rows[k // 37 % 4]
+        z = W.sum(axis=1) * zeta - W[:, 1:] @ zeta
+        after = zeta - dt * c * z / np.sqrt(1.0 + (c * z / s) ** 2)
+        most, zeta = max(most, np.abs(after).max() - np.abs(zeta).max()), after
+    return most
+
+
+ALL = [(i, j) for i in range(5) for j in range(1, 5) if i != j]
+
+
+@pytest.mark.slow
+def test_no_arrows_and_no_start_leaves_the_tube():
+    model = ech.models.Quadrotor()
+    drive = ech.Laws(StoppingLeader(observer=False), StoppingPoint(observer=False, coupling=2.0))
+    graph = ech.Graph(ALL, directed=True)
+    formation = ech.Formation.from_offsets(model, graph, {})
+    parts, settings = ech.Parts(model, graph, formation, drive), ech.Settings(1.0, 0.001)
+    with precision("float64"):
+        prepared = prepare(parts, settings)
+        laws = prepared.parts.drive
+        loop = assemble(prepared.problem, laws.leader, laws.follower)
+        draw = np.random.default_rng(6)
+        weights, x = worst(draw, 40, prepared.problem.states)
+        ends = np.asarray(flights(loop, jnp.asarray(weights), jnp.asarray(x), settings.steps))
+        assert np.isfinite(ends).all()
+        left = min(tube_left(prepared.parts, settings, each) for each in x[:4])
+    assert ends.min() + model.gravity >= left >= 0.0
+
+
+def worst(draw, count, states):
+    """Weights of arrows (count, K) along which agent 0 reaches all, and far starts."""
+    weights = draw.exponential(size=(count, len(ALL))) * (draw.random((count, len(ALL))) < 0.3)
+    for row in weights:
+        for j in range(1, 5):
+            row[ALL.index((int(draw.integers(j)), j))] += 0.3
+    x = np.repeat(np.asarray(states)[None], count, axis=0)
+    x[:, 1:, :3] += draw.uniform(-20.0, 20.0, x[:, 1:, :3].shape)
+    x[:, 1:, 5] += draw.uniform(-3.0, 3.0, x[:, 1:, 5].shape)
+    x[:, 1:, 6:8] = draw.uniform(-0.7, 0.7, x[:, 1:, 6:8].shape)
+    return weights, x
+
+
+def tube_left(parts, settings, x):
+    from echelon.guarantees.stopping.tube import tube_of
+
+    tube = tube_of(stopping_of(parts, settings, x)).tube
+    assert tube is not None
+    return tube.left
+
+
+def flights(loop, weights, starts, steps):
+    """The least upward acceleration of any follower in each flight (count,)."""
+    import equinox as eqx
+
+    def one(weights, x):
+        mine = eqx.tree_at(lambda each: each.exchange.weights, loop, weights)
+
+        def on(_, done):
+            now, least = done
+            acted = control(mine, now)
+            tilt = jnp.cos(now.states[1:, 6]) * jnp.cos(now.states[1:, 7])
+            lift = acted.inputs[1:, 0] / loop.model.mass * tilt - loop.model.gravity
+            return step(mine, now, acted), jnp.minimum(least, lift.min())
+
+        return jax.lax.fori_loop(0, steps, on, (begin(mine, x), jnp.inf))[1]
+
+    return jax.jit(jax.vmap(one))(weights, starts)
+
+
+def test_a_pair_in_the_midst_of_a_spectrum_counts_for_the_step():
+    # Sixty agents with real eigenvalues from 1 to 100, and three in a circle: 92 and 52i.
+    star = [(0, i, 1.0 + 99.0 * (i - 1) / 59.0) for i in range(1, 61)]
+    circle = [(61, 62, 60.0), (62, 63, 60.0), (63, 61, 60.0)]
+    graph = ech.Graph([*star, (0, 61, 60.0), *circle], directed=True)
+    gain = ech.synthesize(CARTS, graph, ech.gains.Riccati())
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    offsets = ech.Formation(np.zeros((64, 4)))
+    parts = ech.Parts(CARTS, graph, offsets, drive, initial={"position": 1.0})
+    longest = promise(parts, ech.Settings(1.0, 0.002)).longest_step(ech.Settings(1.0, 0.002))
+    for share, holds in ((0.95, True), (1.2, False)):
+        chosen = ech.Settings(200 * share * longest, share * longest)
+        assert promise(parts, chosen).promised is holds
+        errors = np.linalg.norm(ech.simulate(parts, chosen).errors[:, 61:], axis=(1, 2))
+        assert bool(errors[-1] < errors[0]) is holds
+
+
+class Dial(ech.ControlAffine):
+    """One angle, which winds."""
+
+    state_names, input_names = ("angle",), ("rate",)
+
+    def drift(self, x):
+        return jnp.zeros_like(x)
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+    def difference(self, x, y):
+        return wound(x - y, 0)
+
+
+def test_of_angles_that_wind_no_start_half_a_turn_apart_is_promised():
+    model, graph = Dial(), ech.Graph.ring(8)
+    gain = ech.synthesize(model, graph, ech.gains.RobustLQR(domain={}))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    # Twisted once around: nobody's neighbours pull more one way than the other.
+    starts = 2.0 * np.pi * np.arange(8)[:, None] / 8
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((8, 1))), drive, initial=starts)
+    chosen = ech.Settings(5.0, 0.01)
+    run, found = ech.simulate(parts, chosen), promise(parts, chosen)
+    assert np.abs(run.errors[-1]).max() > 5.0
+    assert found.hypotheses[Hypothesis.STARTS].verdict is Verdict.FAILS
+    assert found.certified.radius < np.pi

@@ -1,0 +1,402 @@
+"""The graph: spectra in closed form, networkx, and the laws of Laplacians."""
+
+from fractions import Fraction
+
+import jax.numpy as jnp
+import networkx as nx
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import adjacency, connected, laplacian, relabelled
+
+from echelon.agents.network.bound import _quotients, rounded_bound
+from echelon.agents.network.graph import Graph
+from echelon.core import errors, numerics
+from echelon.guarantees.verifier.exact_minors import is_positive_definite
+
+
+def graphs(most=9, weighted=True):
+    """A random connected graph with one to three leaders."""
+    return connected(most, weighted).map(lambda parts: Graph.from_edges(*parts))
+
+
+def dense(graph):
+    return laplacian(graph.agents, graph.edges, graph.weights)
+
+
+def disagreement(graph, y):
+    with numerics.precision("float64"):
+        return np.asarray(graph.disagreement(jnp.asarray(y)))
+
+
+# ---- laws of the Laplacian ----
+
+
+@given(graphs())
+def test_laplacian_is_degrees_minus_adjacency_symmetric_with_rows_that_sum_to_zero(graph):
+    A, L = graph.adjacency().toarray(), graph.laplacian().toarray()
+    assert A == pytest.approx(adjacency(graph.agents, graph.edges, graph.weights), abs=0.0)
+    assert L == pytest.approx(dense(graph), abs=1e-13)
+    assert np.array_equal(L, L.T)
+    assert L.sum(axis=1) == pytest.approx(np.zeros(graph.agents), abs=1e-12)
+
+
+@given(graphs())
+def test_grounded_laplacian_is_the_positive_definite_follower_block(graph):
+    rows = [k for k in range(graph.agents) if k not in graph.leaders]
+    assert list(graph.followers) == rows
+    L = graph.grounded_laplacian().toarray()
+    assert L == pytest.approx(dense(graph)[np.ix_(rows, rows)], abs=1e-13)
+    assert np.array_equal(L, L.T)
+    values = np.linalg.eigvalsh(L)
+    assert values[0] > 0.0
+    assert graph.spectrum().eigenvalues == pytest.approx(values, rel=1e-9)
+
+
+@given(graphs())
+def test_the_inverse_of_the_grounded_laplacian_is_the_paper_s_m(graph):
+    M, L = graph.inverse_grounded(), graph.grounded_laplacian().toarray()
+    assert M @ L == pytest.approx(np.eye(len(L)), abs=1e-10)
+    assert np.linalg.eigvalsh(0.5 * (M + M.T))[0] > 0.0
+    # Followers that lean on each other have a non-negative M: L is an M-matrix.
+    assert M.min() >= -1e-12
+
+
+@given(graphs())
+def test_without_a_leader_to_ground_it_the_laplacian_has_no_inverse(graph):
+    assert np.abs(np.linalg.eigvalsh(graph.laplacian().toarray())[0]) < 1e-12 * graph.agents * 100
+
+
+@given(graphs())
+def test_networkx_agrees(graph):
+    other = nx.Graph()
+    other.add_nodes_from(range(graph.agents))
+    other.add_weighted_edges_from(
+        (int(i), int(j), w) for (i, j), w in zip(graph.edges, graph.weights, strict=True)
+    )
+    assert graph.laplacian().toarray() == pytest.approx(
+        nx.laplacian_matrix(other).toarray(), abs=1e-12
+    )
+    for agent in range(graph.agents):
+        assert graph.neighbours(agent) == tuple(sorted(other.neighbors(agent)))
+    hops = [nx.single_source_shortest_path_length(other, k) for k in graph.leaders]
+    nearest = [
+        graph.leaders[int(np.argmin([h[agent] for h in hops]))] for agent in range(graph.agents)
+    ]
+    assert graph.nearest_leader() == tuple(nearest)
+    back = Graph.from_networkx(other, leaders=graph.leaders)
+    assert back.laplacian().toarray() == pytest.approx(graph.laplacian().toarray(), abs=0.0)
+    assert back.leaders == graph.leaders
+
+
+@given(graphs(most=5), st.integers(1, 2), st.integers(0, 10**6))
+@settings(max_examples=20)  # every new shape is compiled
+def test_disagreement_is_the_block_laplacian_times_the_states(graph, n, seed):
+    y = np.random.default_rng(seed).normal(size=(graph.agents, n))
+    block = np.kron(dense(graph), np.eye(n)) @ y.ravel()
+    assert disagreement(graph, y).ravel() == pytest.approx(block, abs=1e-11)
+
+
+@given(graphs(most=5), st.floats(-1e6, 1e6))
+@settings(max_examples=20)
+def test_agents_that_agree_have_no_disagreement_at_all(graph, value):
+    assert not disagreement(graph, np.full((graph.agents, 2), value)).any()
+
+
+@given(graphs(most=5), st.randoms(use_true_random=False), st.integers(0, 10**6))
+@settings(max_examples=30)
+def test_renaming_agents_renames_everything(graph, random, seed):
+    order = random.sample(range(graph.agents), graph.agents)
+    renamed = relabelled(graph, order)
+    places = np.ix_(order, order)
+    assert renamed.laplacian().toarray()[places] == pytest.approx(graph.laplacian().toarray())
+    assert sorted(order[k] for k in graph.leaders) == list(renamed.leaders)
+    assert renamed.spectrum().eigenvalues == pytest.approx(graph.spectrum().eigenvalues, rel=1e-9)
+    y = np.random.default_rng(seed).normal(size=(graph.agents, 3))
+    moved = np.empty_like(y)
+    moved[order] = y
+    assert disagreement(renamed, moved)[order] == pytest.approx(disagreement(graph, y), abs=1e-11)
+    back = relabelled(renamed, np.argsort(order))
+    assert back == graph
+
+
+@given(graphs(weighted=False))
+def test_an_edge_without_a_weight_weighs_one(graph):
+    assert np.array_equal(graph.weights, np.ones(len(graph.edges)))
+    twice = Graph([(i, j, 2.0) for i, j in graph.edges.tolist()], graph.leaders, graph.agents)
+    doubled = 2.0 * graph.spectrum().eigenvalues
+    assert twice.spectrum().eigenvalues == pytest.approx(doubled, rel=1e-9)
+
+
+def test_one_more_edge_never_slows_the_slowest_mode():
+    path = Graph.path(6)
+    low = path.spectrum().low
+    for i in range(6):
+        for j in range(i + 2, 6):
+            more = Graph([*path.edges.tolist(), (i, j)])
+            assert more.spectrum().low >= low - 1e-12
+
+
+# ---- spectra in closed form ----
+
+
+def path_spectrum(followers):
+    """Eigenvalues of a path whose one end is a leader."""
+    k = np.arange(1, followers + 1)
+    return 2.0 - 2.0 * np.cos((2 * k - 1) * np.pi / (2 * followers + 1))
+
+
+@pytest.mark.parametrize(
+    ("edges", "spectrum"),
+    [
+        ([(0, 1), (1, 2), (1, 3)], [2.0 - np.sqrt(3.0), 1.0, 2.0 + np.sqrt(3.0)]),
+        ([(0, 1), (1, 2), (2, 3)], path_spectrum(3)),
+    ],
+    ids=["tree", "line"],
+)
+def test_spectra_of_the_paper_s_two_graphs(edges, spectrum):
+    got = Graph.from_edges(edges).spectrum().eigenvalues
+    assert got == pytest.approx(spectrum, rel=1e-12)
+    printed = {3.732: [0.268, 1.0, 3.732], 3.247: [0.198, 1.555, 3.247]}
+    assert got == pytest.approx(printed[round(float(got[-1]), 3)], abs=5e-4)
+
+
+@pytest.mark.parametrize("followers", [1, 10, 400, 401, 1000])
+def test_long_paths_have_the_spectrum_of_a_chain(followers):
+    spectrum, wanted = Graph.path(followers + 1).spectrum(), path_spectrum(followers)
+    assert spectrum.low == pytest.approx(wanted[0], rel=1e-9)
+    assert spectrum.high == pytest.approx(wanted[-1], rel=1e-9)
+    assert np.all(np.diff(spectrum.eigenvalues) >= 0.0)
+    assert spectrum.total == followers
+    assert len(spectrum.eigenvalues) == (followers if followers <= 400 else 2)
+
+
+def test_parents_make_a_spectrum_of_the_weights_that_followers_feel():
+    edges = [(0, 1, 2.0), (1, 2, 0.5), (1, 3, 2.0), (3, 4, 3.0)]
+    assert Graph(edges).parent_spectrum().eigenvalues.tolist() == [0.5, 2.0, 3.0]
+    led = Graph(edges, leaders=[3, 4]).parent_spectrum()
+    assert (led.eigenvalues.tolist(), led.total) == ([0.5, 2.0], 2)
+
+
+def test_a_star_is_grounded_to_ones_and_a_complete_graph_to_one_and_all():
+    assert Graph.star(6).spectrum().eigenvalues == pytest.approx(np.ones(5))
+    assert Graph.complete(6).spectrum().eigenvalues == pytest.approx([1.0, *[6.0] * 4])
+
+
+def test_two_leaders_at_the_ends_of_a_path_make_a_chain_with_two_fixed_ends():
+    k = np.arange(1, 6)
+    graph = Graph.path(7, leaders=[0, 6])
+    assert graph.spectrum().eigenvalues == pytest.approx(2.0 - 2.0 * np.cos(k * np.pi / 6.0))
+
+
+# ---- Lemma 3 ----
+
+
+@given(graphs(), st.integers(0, 10**6))
+def test_lemma_3_holds_for_the_whole_laplacian(graph, seed):
+    h, k = np.random.default_rng(seed).normal(size=(2, graph.agents, 3))
+    A, L = graph.adjacency().toarray(), graph.laplacian().toarray()
+    left = 2.0 * np.einsum("ia,ij,ja->", h, L, k)
+    right = np.einsum("ij,ija,ija->", A, h[:, None] - h[None], k[:, None] - k[None])
+    assert left == pytest.approx(right, rel=1e-9, abs=1e-8)
+
+
+@given(graphs(), st.integers(0, 10**6))
+def test_lemma_3_fails_for_the_grounded_laplacian_by_the_edges_to_leaders(graph, seed):
+    rows = list(graph.followers)
+    h, k = np.random.default_rng(seed).normal(size=(2, len(rows), 3))
+    A, L = graph.adjacency().toarray(), graph.grounded_laplacian().toarray()
+    left = 2.0 * np.einsum("ia,ij,ja->", h, L, k)
+    among = A[np.ix_(rows, rows)]
+    right = np.einsum("ij,ija,ija->", among, h[:, None] - h[None], k[:, None] - k[None])
+    to_leaders = A[rows][:, list(graph.leaders)].sum(axis=1)
+    assert to_leaders.max() > 0.0
+    missing = 2.0 * np.einsum("i,ia,ia->", to_leaders, h, k)
+    assert left == pytest.approx(right + missing, rel=1e-9, abs=1e-8)
+
+
+# ---- making graphs ----
+
+
+def same_edges(graph, other):
+    ours = {tuple(edge) for edge in graph.edges.tolist()}
+    return ours == {tuple(sorted(edge)) for edge in other.edges}
+
+
+@pytest.mark.parametrize("agents", [3, 4, 9])
+def test_named_graphs_are_those_of_networkx(agents):
+    assert same_edges(Graph.path(agents), nx.path_graph(agents))
+    assert same_edges(Graph.ring(agents), nx.cycle_graph(agents))
+    assert same_edges(Graph.star(agents), nx.star_graph(agents - 1))
+    assert same_edges(Graph.complete(agents), nx.complete_graph(agents))
+
+
+def test_a_grid_is_numbered_row_by_row():
+    other = nx.relabel_nodes(nx.grid_2d_graph(3, 4), lambda place: 4 * place[0] + place[1])
+    graph = Graph.grid(3, 4)
+    assert graph.agents == 12 and same_edges(graph, other)
+
+
+def test_a_geometric_graph_links_exactly_the_points_that_are_near():
+    graph = Graph.geometric(40, 0.3, seed=3)
+    points = np.random.default_rng(3).uniform(size=(40, 2))
+    other = nx.random_geometric_graph(40, 0.3, pos=dict(enumerate(points.tolist())))
+    assert same_edges(graph, other)
+    assert graph == Graph.geometric(40, 0.3, seed=3)
+    assert graph != Graph.geometric(40, 0.3, seed=4)
+    for seed in range(4):
+        with pytest.raises(errors.GraphError, match="another `seed`") as told:
+            Graph.geometric(7, 0.2, seed)
+        advised = float(str(told.value).split("`radius` of ")[1].split()[0])
+        assert Graph.geometric(7, advised, seed).agents == 7
+        with pytest.raises(errors.GraphError, match="disconnected"):
+            Graph.geometric(7, advised - 0.002, seed)
+
+
+def test_edges_are_kept_as_given_with_the_smaller_agent_first():
+    graph = Graph.from_edges([(2, 1, 0.5), (0, 1), (3, 1, 2)], leaders=[3])
+    assert graph.edges.tolist() == [[1, 2], [0, 1], [1, 3]]
+    assert graph.weights.tolist() == [0.5, 1.0, 2.0]
+    assert (graph.agents, graph.leaders, graph.followers) == (4, (3,), (0, 1, 2))
+    assert repr(graph) == "Graph(4 agents, 3 edges, leaders [3])"
+
+
+def test_agents_are_numbered_to_the_largest_in_an_edge_unless_told():
+    assert Graph.from_edges([(0, 5), *[(0, k) for k in range(1, 5)]]).agents == 6
+    assert Graph.from_edges([(0, 1)], agents=2).agents == 2
+
+
+def test_several_leaders_may_stand_in_separate_parts_only_if_the_whole_is_connected():
+    graph = Graph.from_edges([(0, 2), (1, 2), (2, 3)], leaders=[1, 0, 1])
+    assert graph.leaders == (0, 1) and graph.followers == (2, 3)
+    assert graph.nearest_leader() == (0, 1, 0, 0)
+
+
+def test_graphs_are_values_that_cannot_be_changed():
+    graph = Graph.path(3)
+    assert graph == Graph([(1, 0), (1, 2)]) and hash(graph) == hash(Graph.path(3))
+    assert graph != Graph.path(4) and graph != Graph.path(3, leaders=[1]) and graph != "graph"
+    with pytest.raises(ValueError, match="read-only"):
+        graph.edges[0, 0] = 2
+    with pytest.raises(ValueError, match="read-only"):
+        graph.weights[0] = 2.0
+
+
+@given(graphs())
+def test_outward_goes_by_distance_and_lists_the_neighbours_passed_on_the_way(graph):
+    order = [agent for agent, _ in graph.outward()]
+    far = nx.multi_source_dijkstra_path_length(
+        nx.Graph([(int(i), int(j)) for i, j in graph.edges]), set(graph.leaders)
+    )
+    assert [(far[i], i) for i in order] == sorted((far[i], i) for i in range(graph.agents))
+    for place, (agent, earlier) in enumerate(graph.outward()):
+        passed = {j for j in graph.neighbours(agent) if j in order[:place]}
+        assert set(earlier) == (set() if agent in graph.leaders else passed)
+        assert bool(earlier) == (agent not in graph.leaders)
+
+
+# ---- the smallest eigenvalue, proved --------------------------------------------------------
+
+
+def exceeds(graph, bound):
+    """Whether the smallest eigenvalue is above a number: exact signs of leading minors."""
+    place = {agent: k for k, agent in enumerate(graph.followers)}
+    rows = [[Fraction(0)] * len(place) for _ in place]
+    for (i, j), weight in zip(graph.edges.tolist(), graph.weights.tolist(), strict=True):
+        for a, b in ((i, j), (j, i)):
+            if a in place:
+                rows[place[a]][place[a]] += Fraction(weight)
+                if b in place:
+                    rows[place[a]][place[b]] -= Fraction(weight)
+    for k, row in enumerate(rows):
+        row[k] -= Fraction(bound)
+    return is_positive_definite(rows)
+
+
+@settings(max_examples=25)
+@given(
+    parents=st.lists(st.integers(0, 5), min_size=1, max_size=6),
+    decades=st.lists(st.floats(-8, 8), min_size=6, max_size=6),
+)
+def test_the_proved_eigenvalue_is_below_the_exact_one_and_sharp(parents, decades):
+    edges = [(min(p, k), k + 1, 10.0 ** decades[k]) for k, p in enumerate(parents)]
+    graph = Graph.from_edges(edges)
+    spectrum = graph.spectrum()
+    assert exceeds(graph, spectrum.proved * (1 - 1e-15))
+    assert not exceeds(graph, spectrum.proved * (1 + 2e-9))
+    # Floats alone would say more than is true of such weights.
+    assert spectrum.low <= spectrum.proved * (1 + 2e-9)
+
+
+@pytest.mark.parametrize("weights", [(1e-3, 1e13, 1.0), (1e-8, 1e8, 1e8), (1e-3, 1e11, 1.0)])
+def test_heavy_edges_beside_light_ones_take_nothing_from_the_bound(weights):
+    graph = Graph.from_edges([(k, k + 1, w) for k, w in enumerate(weights)])
+    proved = graph.spectrum().proved
+    assert exceeds(graph, proved * (1 - 1e-15)) and not exceeds(graph, proved * (1 + 2e-9))
+
+
+def test_the_bound_of_a_long_line_is_that_of_its_closed_form():
+    n = 460
+    exact = 2.0 - 2.0 * np.cos(np.pi / (2 * (n - 1) + 1))
+    spectrum = Graph.path(n).spectrum()
+    assert exact * (1 - 1e-8) < spectrum.proved <= exact * (1 + 1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("decades", [0.0, 4.0])
+def test_the_bound_in_floats_is_below_the_exact_one_and_near(seed, decades):
+    rng = np.random.default_rng(seed)
+    graph = Graph.grid(9, 14, leaders=[0, 30])
+    weights = 10.0 ** rng.uniform(-decades, decades, len(graph.edges))
+    graph = Graph([(i, j, w) for (i, j), w in zip(graph.edges, weights, strict=True)], [0, 30], 126)
+    L = graph.grounded_laplacian().toarray()
+    # Near the eigenvector, and far from it.
+    vector = np.abs(np.linalg.eigh(L)[1][:, 0]) * rng.uniform(1.0 - 1e-9 * 10.0**seed, 1.0, len(L))
+    found = rounded_bound(graph._grounded(), vector)
+    exact = max(Fraction(0), _quotients(graph._grounded(), list(map(Fraction, vector.tolist())))[0])
+    assert Fraction(found) <= exact
+    slack = 1e-12 * np.abs(weights).max()
+    assert found >= float(exact) - slack
+
+
+def test_both_ends_of_a_line_of_20000_are_those_of_its_closed_form():
+    n = 20_000
+    spectrum = Graph.path(n + 1).spectrum()
+    for k, found in ((1, spectrum.low), (n, spectrum.high)):
+        assert found == pytest.approx(4 * np.sin((2 * k - 1) * np.pi / (4 * n + 2)) ** 2, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("edges", "agents", "said"),
+    [
+        ([("a", 1)], None, "agents are whole numbers from 0 on"),
+        ([(0, 1.5)], None, "agents are whole numbers from 0 on"),
+        ([(0, float("nan"))], None, "agents are whole numbers from 0 on"),
+        ([(0, 1), (1, 5)], 3, "an edge names agent 5, and with 3 agents the last is 2."),
+        ([(0, 1), (1, 3)], 3, "an edge names agent 3, and with 3 agents the last is 2."),
+    ],
+)
+def test_an_edge_is_of_agents_that_there_are(edges, agents, said):
+    with pytest.raises(errors.GraphError) as caught:
+        Graph(edges, agents=agents)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("agents", [3.0, 2.5, "4", None, [3]])
+@pytest.mark.parametrize(
+    "make",
+    [
+        Graph.path,
+        Graph.ring,
+        Graph.star,
+        Graph.complete,
+        lambda n: Graph.grid(n, 2),
+        lambda n: Graph.grid(2, n),
+        lambda n: Graph.geometric(n, 2.0),
+        lambda n: Graph([(0, 1)], agents=2.5 if n is None else n),
+    ],
+)
+def test_a_number_of_agents_is_whole(make, agents):
+    with pytest.raises(errors.GraphError, match="^the number of agents is .*whole number.*4.$"):
+        make(agents)

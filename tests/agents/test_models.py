@@ -1,0 +1,717 @@
+"""Every bundled agent against equations written a second time, and the laws that they share."""
+
+import importlib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from oracles import newton_euler, quadrotor_input_map, rotation
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import echelon.agents.models
+from echelon.agents.models import (
+    ControlAffine,
+    DoubleIntegrator,
+    Heading,
+    Limits,
+    Linear,
+    Pendulum,
+    PlanarQuadrotor,
+    PrintedQuadrotor,
+    Quadrotor,
+    QuadrotorEuler,
+    QuadrotorThrust,
+    SingleIntegrator,
+    Unicycle,
+    UnicyclePoint,
+    VanDerPol,
+)
+from echelon.agents.models.model_check import check_model
+from echelon.agents.models.rigid_body import body_rates, euler_rates, free_spin
+from echelon.core import numerics
+from echelon.core.errors import ModelError
+from echelon.core.numerics import precision
+from echelon.experiments.scenario import registry
+
+rng = np.random.default_rng(7)
+A, B, C = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=(1, 3))
+
+FAMILY = {
+    "line": SingleIntegrator(1),
+    "plane": SingleIntegrator(),
+    "five axes": SingleIntegrator(5),
+    "double": DoubleIntegrator(3),
+    "drag": DoubleIntegrator(2, drag=0.7),
+    "linear": Linear(A, B, C),
+    "van der pol": VanDerPol(1.5),
+    "pendulum": Pendulum(damping=0.3, stiffness=4.0),
+    "unicycle": Unicycle(),
+    "point": UnicyclePoint(ahead=0.3),
+    "planar": PlanarQuadrotor(mass=0.5, inertia=0.002, arm=0.1, motor_thrust=4.0),
+    "planar crazyflie": PlanarQuadrotor(),
+    "crazyflie": Quadrotor.crazyflie(),
+    "big": Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0),
+    "printed": PrintedQuadrotor(),
+    "euler": QuadrotorEuler(gravity=3.7),
+    "thrust": QuadrotorThrust(),
+}
+FLAT = {name: model for name, model in FAMILY.items() if model.flat_outputs}
+
+SPACE = ["crazyflie", "big"]
+
+every_model = pytest.mark.parametrize("model", FAMILY.values(), ids=FAMILY)
+every_flat_model = pytest.mark.parametrize("model", FLAT.values(), ids=FLAT)
+
+
+def numpy(function, *arguments):
+    """The value of a function of echelon in float64, as NumPy."""
+    with numerics.precision("float64"):
+        return np.asarray(eqx.filter_jit(function)(*map(jnp.asarray, arguments)))
+
+
+def state_and_input(model, seed=0):
+    """A random state (angles within +-1 rad) and an input of the size that the model works with."""
+    draw = np.random.default_rng(seed).uniform(-1.0, 1.0, len(model.state_names))
+    size = np.array(model.trim[1]) + np.diag(model.input_scale)
+    return draw, size * np.random.default_rng(seed + 1).uniform(-1.0, 1.0, len(size))
+
+
+# ---- the same equations, written again ----
+
+
+def planar(model, x, u):
+    y, z, roll, vy, vz, rate = x
+    push = u[0] / model.mass
+    return [vy, vz, rate, -push * np.sin(roll), push * np.cos(roll) - 9.81, u[1] / model.inertia]
+
+
+def printed(model, x, u):
+    # Newton-Euler in free space, and then a push of T / m along all three axes alike.
+    turning = newton_euler(x, np.array([0.0, *u[1:]]), model.mass, model.inertia, gravity=0.0)
+    return turning + np.concatenate([np.zeros(3), np.full(3, u[0] / model.mass), np.zeros(6)])
+
+
+EQUATIONS = {
+    SingleIntegrator: lambda m, x, u: u,
+    DoubleIntegrator: lambda m, x, u: [
+        *x[m.dimension :],
+        *(u[k] - m.drag * x[m.dimension + k] for k in range(m.dimension)),
+    ],
+    Linear: lambda m, x, u: A @ x + B @ u,
+    VanDerPol: lambda m, x, u: [x[1], m.damping * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]],
+    Pendulum: lambda m, x, u: [x[1], u[0] - m.stiffness * np.sin(x[0]) - m.damping * x[1]],
+    Unicycle: lambda m, x, u: [u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[1]],
+    UnicyclePoint: lambda m, x, u: [
+        u[0] * np.cos(x[2]) - m.ahead * u[1] * np.sin(x[2]),
+        u[0] * np.sin(x[2]) + m.ahead * u[1] * np.cos(x[2]),
+        u[1],
+    ],
+    PlanarQuadrotor: planar,
+    Quadrotor: lambda m, x, u: newton_euler(x, u, m.mass, m.inertia),
+    PrintedQuadrotor: printed,
+    QuadrotorEuler: lambda m, x, u: [
+        *x[3:6],
+        *((m.gravity + u[0]) * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
+        *x[9:12],
+        *u[1:],
+    ],
+    QuadrotorThrust: lambda m, x, u: [
+        *x[3:6],
+        *((m.gravity + x[12]) * rotation(x[6:9])[:, 2] - [0.0, 0.0, m.gravity]),
+        *x[9:12],
+        *u[1:],
+        u[0],
+    ],
+}
+
+
+@every_model
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_and_input_map_are_the_textbook_equations(model, seed):
+    x, u = state_and_input(model, seed)
+    wanted = np.array(EQUATIONS[type(model)](model, x, u))
+    got = numpy(model.drift, x) + numpy(model.input_map, x) @ u
+    assert got == pytest.approx(wanted, rel=1e-12, abs=1e-12)
+    assert numpy(model.velocity, x, u) == pytest.approx(wanted, rel=1e-12, abs=1e-12)
+
+
+def test_the_family_of_these_tests_is_the_whole_family():
+    members = {getattr(echelon.agents.models, name) for name in echelon.agents.models.__all__}
+    members -= {Limits, Heading}
+    assert {type(model) for model in FAMILY.values()} == members - {ControlAffine}
+    registered = set()
+    for entry in registry.MODELS.values():
+        module, _, name = entry.target.partition(":")
+        registered.add(getattr(importlib.import_module(module), name))
+    assert registered == members - {ControlAffine}
+
+
+positive = st.floats(0.05, 5.0)
+entries = st.lists(st.floats(-1.0, 1.0), min_size=12, max_size=12).map(np.array)
+inputs = st.lists(st.floats(-5.0, 5.0), min_size=4, max_size=4).map(np.array)
+
+
+@given(entries, inputs, positive, st.tuples(positive, positive, positive), st.floats(0.5, 20.0))
+@settings(max_examples=40)
+def test_quadrotor_is_newton_euler_for_any_parameters(x, u, mass, sides, gravity):
+    # A box of any sides has an inertia that a rigid body can have.
+    a, b, c = (side**2 for side in sides)
+    inertia = (b + c, a + c, a + b)
+    model = Quadrotor(mass=mass, inertia=inertia, gravity=gravity)
+    got = numpy(model.velocity, x, u)
+    assert got == pytest.approx(newton_euler(x, u, mass, inertia, gravity), rel=1e-10, abs=1e-10)
+    columns = quadrotor_input_map(x, mass, inertia)
+    assert numpy(model.input_map, x) == pytest.approx(columns, rel=1e-9, abs=1e-9)
+
+
+# ---- what every agent promises ----
+
+
+@every_model
+def test_shapes_names_and_units_belong_together(model):
+    n, m, q = len(model.state_names), len(model.input_names), len(model.output_names)
+    x, u = state_and_input(model)
+    assert numpy(model.drift, x).shape == (n,) == numpy(model.difference, x, x).shape
+    assert numpy(model.input_map, x).shape == (n, m) == numpy(model.normalized_input_map, x).shape
+    assert numpy(model.output, x).shape == (q,)
+    assert numpy(model.limit, u).shape == (m,)
+    assert len(set(model.state_names)) == len(model.state_units) == n
+    assert len(set(model.input_names)) == len(model.input_units) == m
+    assert np.shape(model.trim[0]) == (n,) == np.shape(model.weights[0])
+    assert np.shape(model.trim[1]) == (m,) == np.shape(model.weights[1])
+    assert np.shape(model.input_scale) == (m, m)
+    assert min(*model.weights[0], *model.weights[1]) > 0.0
+    assert {name for group in model.state_groups.values() for name in group} <= {*model.state_names}
+    assert [model.state_names[k] for k in model.position_indices()] == [*model.position]
+    places = model.position_indices()
+    assert all(model.state_units[k] == "m" for k in places)
+
+
+@every_model
+def test_the_trim_is_an_equilibrium_within_the_limits(model):
+    x, u = map(np.array, model.trim)
+    assert np.abs(numpy(model.velocity, x, u)).max() <= 1e-12
+    assert numpy(model.limit, u).tobytes() == u.tobytes()
+
+
+@given(
+    matrix=hnp.arrays(float, (2, 2), elements=st.floats(-2.0, 2.0)),
+    wanted=hnp.arrays(float, (2,), elements=st.floats(-9.0, 9.0)),
+)
+def test_limits_alone_say_what_is_delivered(matrix, wanted):
+    assume(np.linalg.cond(matrix) < 1e3 and np.abs(matrix).max() > 1e-300)
+
+    class Pushed(ControlAffine):
+        state_names, input_names = ("x", "y"), ("a", "b")
+        input_limits = Limits(tuple(map(tuple, matrix.tolist())), (-1.0, -2.0), (3.0, 0.5))
+
+        def drift(self, x):
+            return -x
+
+        def input_map(self, x):
+            return jnp.eye(2, dtype=x.dtype)
+
+    delivered, rows = numpy(Pushed().limit, wanted), matrix @ wanted
+    nearest = np.clip(rows, [-1.0, -2.0], [3.0, 0.5])
+    np.testing.assert_allclose(matrix @ delivered, nearest, rtol=0, atol=1e-9)
+    if (rows == nearest).all():
+        assert delivered.tobytes() == wanted.tobytes()
+
+
+@pytest.mark.parametrize("size", [1e-313, 1e-310])
+def test_limits_that_floats_cannot_invert_are_refused(size):
+    class Tiny(ControlAffine):
+        state_names, input_names = ("x",), ("a", "b")
+        input_limits = Limits(((size, size), (size, 0.0)), (-1.0, -1.0), (1.0, 1.0))
+
+        def drift(self, x):
+            return -x
+
+        def input_map(self, x):
+            return jnp.ones((1, 2), x.dtype)
+
+    with pytest.raises(ModelError, match="do not say what is delivered"):
+        check_model(Tiny())
+
+
+@every_model
+def test_the_limits_for_solvers_are_those_of_the_actuators(model):
+    limits = model.input_limits
+    u0, size = np.array(model.trim[1]), np.array(model.input_scale)
+    draws = np.stack(
+        [u0 + size @ (4.0 ** rng.uniform(-2.0, 5.0) * rng.normal(size=len(u0))) for _ in range(300)]
+    )
+    limited = numpy(jax.vmap(model.limit), draws)
+    kept = [a.tobytes() == u.tobytes() for a, u in zip(limited, draws, strict=True)]
+    if limits is None:
+        assert all(kept)
+        return
+    matrix, low, high = map(np.array, limits)
+    within = [bool(((low <= matrix @ u) & (matrix @ u <= high)).all()) for u in draws]
+    assert within == kept
+    assert 30 < sum(within) < 270
+
+
+@every_model
+def test_normalized_inputs_are_deviations_from_the_trim(model):
+    x, u = state_and_input(model)
+    S, trim = np.array(model.input_scale), np.array(model.trim[1])
+    v = np.linalg.solve(S, u - trim)
+    assert numpy(model.physical, v) == pytest.approx(u, rel=1e-12, abs=1e-18)
+    without = numpy(lambda v: model.physical(v, trim=False), v)
+    assert without == pytest.approx(u - trim, rel=1e-12, abs=1e-18)
+    assert numpy(model.normalized, u) == pytest.approx(v, rel=1e-12, abs=1e-12)
+    about = numpy(model.normalized_drift, x) + numpy(model.normalized_input_map, x) @ v
+    assert about == pytest.approx(numpy(model.velocity, x, u), rel=1e-12, abs=1e-11)
+
+
+@every_model
+def test_many_inputs_change_as_one_does_in_numpy_and_in_jax(model):
+    v = np.random.default_rng(3).normal(size=(2, 5, len(model.input_names)))
+    for change in (model.physical, model.normalized, lambda v: model.physical(v, trim=False)):
+        one_by_one = [[numpy(change, row) for row in rows] for rows in v]
+        assert isinstance(change(v), np.ndarray)
+        assert change(v) == pytest.approx(np.array(one_by_one), rel=1e-14)
+        assert numpy(change, v) == pytest.approx(change(v), rel=1e-14)
+    assert model.physical(v[0].astype(np.float32)).dtype == np.float32
+
+
+def test_a_scale_that_depends_on_an_array_is_traced_with_it():
+    class Weighed(ControlAffine):
+        mass: np.ndarray
+        state_names, input_names = ("speed",), ("push",)
+        drift, input_map = SingleIntegrator.drift, SingleIntegrator.input_map
+
+        @property
+        def input_scale(self):
+            return ((self.mass[0],),)
+
+    change = eqx.filter_jit(lambda model, u: model.normalized(u))
+    for mass in (2.0, 4.0):
+        assert change(Weighed(np.array([mass])), jnp.array([8.0])) == 8.0 / mass
+
+
+@every_model
+@pytest.mark.parametrize("name", ["float64", "float32"])
+def test_agents_compute_in_the_precision_that_is_asked_for(model, name):
+    x, u = state_and_input(model)
+    with numerics.precision(name):
+        a, b = jnp.asarray(x), jnp.asarray(u)
+        values = [model.drift(a), model.input_map(a), model.output(a), model.limit(b)]
+        values += [
+            model.physical(b),
+            model.normalized(b),
+            model.normalized_input_map(a),
+            model.difference(a, a),
+        ]
+        assert {str(value.dtype) for value in values} == {name}
+
+
+@every_model
+def test_states_are_found_by_name_and_by_group(model):
+    for k, name in enumerate(model.state_names):
+        if name not in model.state_groups:
+            assert model.states_called(name) == (k,)
+    for group, members in model.state_groups.items():
+        assert tuple(model.state_names[k] for k in model.states_called(group)) == tuple(members)
+
+
+@every_model
+@settings(max_examples=20)
+@given(data=st.data())
+def test_a_state_has_its_own_number_else_its_group_s_else_the_default(model, data):
+    names = sorted({*model.state_names, *model.state_groups})
+    named = data.draw(st.dictionaries(st.sampled_from(names), st.floats(-9, 9)))
+    named = dict(data.draw(st.permutations(list(named.items()))))
+    for name, value in zip(model.state_names, model.per_state(named, np.inf), strict=True):
+        groups = [group for group, members in model.state_groups.items() if name in members]
+        own = [named[name]] if name in named else [named[g] for g in groups if g in named]
+        assert value in (own or [np.inf])
+    with pytest.raises(ModelError, match="`nothing` is no state or group"):
+        model.per_state({"nothing": 1.0})
+
+
+@every_model
+def test_one_agent_and_a_batch_of_agents_move_alike(model):
+    pairs = [state_and_input(model, seed) for seed in range(4)]
+    x, u = map(np.stack, zip(*pairs, strict=True))
+    together = numpy(jax.vmap(model.velocity), x, u)
+    alone = np.stack([numpy(model.velocity, *pair) for pair in pairs])
+    assert together == pytest.approx(alone, rel=1e-13, abs=1e-13)
+
+
+@pytest.mark.parametrize("model", [Unicycle(), UnicyclePoint()], ids=["axle", "point"])
+@given(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0))
+@settings(max_examples=30)
+def test_headings_differ_by_the_shorter_way_round(model, a, b):
+    x, y = np.array([1.0, 2.0, a]), np.array([0.5, -1.0, b])
+    gap = numpy(model.difference, x, y)
+    assert gap[:2] == pytest.approx([0.5, 3.0])
+    assert abs(gap[2]) <= np.pi + 1e-12
+    assert np.exp(1j * gap[2]) == pytest.approx(np.exp(1j * (a - b)), abs=1e-12)
+
+
+# ---- flatness ----
+
+
+class Smooth:
+    """A random sum of sines in each coordinate, with derivatives of any order in closed form."""
+
+    def __init__(self, coordinates, seed, drift=2.0):
+        rng = np.random.default_rng(seed)
+        self.amplitude = rng.uniform(0.1, 0.5, (3, coordinates))
+        self.rate = rng.uniform(0.3, 1.2, (3, coordinates))
+        self.phase = rng.uniform(-np.pi, np.pi, (3, coordinates))
+        # A steady speed keeps vehicles that cannot stand moving.
+        self.drift = drift * np.arange(1, coordinates + 1)
+
+    def derivatives(self, t, order):
+        rows = [
+            jnp.sum(
+                self.amplitude
+                * self.rate**k
+                * jnp.sin(self.rate * t + self.phase + k * np.pi / 2.0),
+                axis=0,
+            )
+            for k in range(order + 1)
+        ]
+        rows[0], rows[1] = rows[0] + self.drift * t, rows[1] + self.drift
+        return jnp.stack(rows)
+
+
+@every_flat_model
+@pytest.mark.parametrize("seed", range(4))
+def test_the_flat_state_moves_as_its_flat_input_makes_it(model, seed):
+    path = Smooth(len(model.flat_outputs), seed)
+
+    def fly(t):
+        return model.flat(path.derivatives(t, model.flat_order))
+
+    with numerics.precision("float64"):
+        (x, u), (rate, _) = jax.jvp(fly, (jnp.asarray(0.3),), (jnp.asarray(1.0),))
+        assert np.asarray(rate) == pytest.approx(
+            np.asarray(model.velocity(x, u)), rel=1e-10, abs=1e-10
+        )
+
+
+@every_flat_model
+def test_the_flat_state_contains_the_path_and_its_speed(model):
+    path = Smooth(len(model.flat_outputs), 5)
+    with numerics.precision("float64"):
+        rows = path.derivatives(jnp.asarray(0.3), model.flat_order)
+        x = np.asarray(model.flat(rows)[0])
+    ahead = getattr(model, "ahead", 0.0)
+    for k, name in enumerate(model.flat_outputs):
+        # The flat output of the point ahead of an axle is the axle.
+        axle = ahead * {"x": np.cos, "y": np.sin}.get(name, np.sin)(x[2]) if ahead else 0.0
+        assert x[model.state_names.index(name)] - axle == pytest.approx(float(rows[0, k]))
+        if f"v{name}" in model.state_names:
+            assert x[model.state_names.index(f"v{name}")] == pytest.approx(float(rows[1, k]))
+
+
+@pytest.mark.parametrize("name", [*SPACE, "planar", "planar crazyflie", "euler", "thrust"])
+def test_standing_still_is_flown_by_the_trim(name):
+    model = FAMILY[name]
+    rows = np.zeros((model.flat_order + 1, len(model.flat_outputs)))
+    rows[0] = 1.0 + np.arange(len(model.flat_outputs))
+    with numerics.precision("float64"):
+        x, u = map(np.asarray, model.flat(jnp.asarray(rows)))
+    wanted = np.zeros(len(x))
+    wanted[[model.state_names.index(name) for name in model.flat_outputs]] = rows[0]
+    assert x == pytest.approx(wanted, abs=1e-15)
+    assert u == pytest.approx(np.array(model.trim[1]), abs=1e-15)
+
+
+def attitude_by_rotations(path, gravity, t):
+    """ZYX angles, rates and accelerations on a path by SciPy and central differences of 1 ms."""
+
+    def angles(t):
+        rows = np.asarray(path.derivatives(t, 2))
+        z = rows[2, :3] + np.array([0.0, 0.0, gravity])
+        z /= np.linalg.norm(z)
+        # The body x axis has no part to the left of the heading.
+        x = np.cross([-np.sin(rows[0, 3]), np.cos(rows[0, 3]), 0.0], z)
+        x /= np.linalg.norm(x)
+        yaw, pitch, roll = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], 1)).as_euler("ZYX")
+        return np.array([roll, pitch, yaw])
+
+    h, around = 1e-3, [angles(t + k * 1e-3) for k in range(-2, 3)]
+    rate = np.array([1.0, -8.0, 0.0, 8.0, -1.0]) / (12.0 * h) @ around
+    bend = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / (12.0 * h**2) @ around
+    return around[2], rate, bend
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_under_computed_torque_quadrotors_fly_what_rotations_and_differences_say(seed):
+    euler, thrust, t = FAMILY["euler"], QuadrotorThrust(gravity=3.7), 0.4
+    # A yaw that keeps below half a turn, where a rotation has one name.
+    path = Smooth(4, seed, drift=0.3)
+    with precision("float64"):
+        rows = path.derivatives(t, 4)
+        lift = [
+            np.linalg.norm(np.asarray(path.derivatives(t + d, 2))[2, :3] + [0.0, 0.0, 3.7])
+            for d in (-1e-5, 0.0, 1e-5)
+        ]
+        zeta, rate, bend = attitude_by_rotations(path, 3.7, t)
+        rows = jnp.asarray(rows)
+        (x, u), (y, v) = (map(np.asarray, model.flat(rows)) for model in (euler, thrust))
+    assert x[6:9] == pytest.approx(zeta, abs=1e-12) and x[9:12] == pytest.approx(rate, abs=1e-8)
+    assert u[1:] == pytest.approx(bend, abs=1e-6) and u[0] == pytest.approx(lift[1] - 3.7, abs=1e-9)
+    assert (y[:12] == x).all() and y[12] == u[0] and (v[1:] == u[1:]).all()
+    assert v[0] == pytest.approx((lift[2] - lift[0]) / 2e-5, abs=1e-6)
+
+
+# ---- physics ----
+
+
+def mechanical_energy(model, x):
+    spin = 0.5 * jnp.sum(jnp.asarray(model.inertia) * x[9:12] ** 2)
+    return model.mass * (0.5 * x[3:6] @ x[3:6] + model.gravity * x[2]) + spin
+
+
+@pytest.mark.parametrize("name", ["crazyflie", "big"])
+@pytest.mark.parametrize("seed", range(3))
+def test_power_is_thrust_times_climb_and_torque_times_spin(name, seed):
+    model = FAMILY[name]
+    x, u = state_and_input(model, seed)
+
+    def power(x, u):
+        return jax.jvp(lambda x: mechanical_energy(model, x), (x,), (model.velocity(x, u),))[1]
+
+    wanted = u[0] * rotation(x[6:9])[:, 2] @ x[3:6] + u[1:] @ x[9:12]
+    assert numpy(power, x, u) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_a_tumbling_body_keeps_energy_and_angular_momentum_in_free_fall():
+    model = FAMILY["big"]
+    x0, _ = state_and_input(model, 3)
+    x0[9:12] = [0.9, 2.0, -1.1]
+    with numerics.precision("float64"):
+        fall = jax.jit(lambda x: model.velocity(x, jnp.zeros(4)))
+        solved = solve_ivp(
+            lambda t, x: np.asarray(fall(jnp.asarray(x))),
+            (0.0, 1.0),
+            x0,
+            "DOP853",
+            rtol=1e-12,
+            atol=1e-12,
+        )
+
+        def conserved(x):
+            spin = rotation(x[6:9]) @ (np.array(model.inertia) * x[9:12])
+            return [float(mechanical_energy(model, jnp.asarray(x))), *spin, *x[3:5]]
+
+        first, *rest = [conserved(x) for x in solved.y.T]
+    # It does turn, and far; the angles do not come near their singularity.
+    assert np.ptp(solved.y[6:9], axis=1).max() > 1.0
+    assert np.abs(solved.y[7]).max() < 1.4
+    assert np.array(rest) == pytest.approx(np.tile(first, (len(rest), 1)), rel=1e-9, abs=1e-11)
+
+
+def test_a_damped_pendulum_loses_energy_by_damping_and_gains_it_by_torque():
+    model = FAMILY["pendulum"]
+    x, u = state_and_input(model, 2)
+
+    def energy(x):
+        return 0.5 * x[1] ** 2 - model.stiffness * jnp.cos(x[0])
+
+    def power(x, u):
+        return jax.jvp(energy, (x,), (model.velocity(x, u),))[1]
+
+    wanted = u[0] * x[1] - model.damping * x[1] ** 2
+    assert numpy(power, x, u) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_the_planar_quadrotor_is_the_spatial_one_in_its_plane():
+    flat = PlanarQuadrotor(mass=1.2, inertia=0.011, arm=0.17, motor_thrust=12.0)
+    space = Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0)
+    places = [space.state_names.index(name) for name in ("y", "z", "roll", "vy", "vz", "p")]
+    for seed in range(3):
+        x, u = state_and_input(flat, seed)
+        full = np.zeros(12)
+        full[places] = x
+        got = numpy(space.velocity, full, np.array([u[0], u[1], 0.0, 0.0]))
+        assert got[places] == pytest.approx(numpy(flat.velocity, x, u), rel=1e-13, abs=1e-13)
+        assert np.delete(got, places) == pytest.approx(np.zeros(6), abs=1e-13)
+
+
+def test_the_planar_limits_are_the_spatial_ones_in_their_plane():
+    flat = PlanarQuadrotor(mass=1.2, inertia=0.011, arm=0.17, motor_thrust=12.0)
+    space = Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0)
+    for thrust in (-5.0, 3.0, 12.0, 30.0):
+        for torque in (-3.0, -1.0, 0.0, 0.5, 2.5):
+            small = numpy(flat.limit, np.array([thrust, torque]))
+            large = numpy(space.limit, np.array([thrust, torque, 0.0, 0.0]))
+            assert large == pytest.approx([*small, 0.0, 0.0], abs=1e-12)
+
+
+def test_the_point_ahead_of_a_unicycle_moves_as_its_axle_carries_it():
+    axle, point = Unicycle(), UnicyclePoint(ahead=0.3)
+
+    def seen_ahead(x):
+        return x + 0.3 * jnp.stack([jnp.cos(x[2]), jnp.sin(x[2]), jnp.zeros(())])
+
+    def carried(x, u):
+        return jax.jvp(seen_ahead, (x,), (axle.velocity(x, u),))[1]
+
+    for seed in range(3):
+        x, u = state_and_input(axle, seed)
+        wanted = numpy(carried, x, u)
+        assert numpy(point.velocity, numpy(seen_ahead, x), u) == pytest.approx(wanted, abs=1e-14)
+
+
+def test_normalized_inputs_move_the_point_of_a_unicycle_alike_in_every_heading():
+    model = UnicyclePoint(ahead=0.3)
+    for heading in (0.0, 1.0, 2.5):
+        g = numpy(model.normalized_input_map, np.array([1.0, 2.0, heading]))
+        assert (g @ g.T)[:2, :2] == pytest.approx(np.eye(2), abs=1e-15)
+
+
+@pytest.mark.parametrize("model", [Quadrotor(), Unicycle()], ids=["quadrotor", "unicycle"])
+def test_the_world_has_no_preferred_compass_direction(model):
+    turn = 0.7
+    x, u = state_and_input(model)
+    last = {"Quadrotor": "yaw", "Unicycle": "heading"}[type(model).__name__]
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+    def turned(x):
+        y = x.copy()
+        y[:2] = R @ x[:2]
+        if "vx" in model.state_names:
+            y[3:5] = R @ x[3:5]
+        return y
+
+    y = turned(x)
+    y[model.state_names.index(last)] += turn
+    assert numpy(model.velocity, y, u) == pytest.approx(
+        turned(numpy(model.velocity, x, u)), rel=1e-12, abs=1e-12
+    )
+
+
+# ---- named quadrotors, and an agent of one's own ----
+
+
+def test_the_crazyflie_carries_the_identified_numbers():
+    model = Quadrotor.named("crazyflie")
+    assert model == Quadrotor.crazyflie() == Quadrotor()
+    assert model.mass == 0.028
+    assert model.inertia == (16.571710e-6, 16.655602e-6, 29.261652e-6)
+    assert np.hypot(model.arm, model.arm) == pytest.approx(0.046, abs=5e-5)
+    assert 4 * model.motor_thrust == pytest.approx(0.639, abs=1e-12)
+    assert model.torque_per_thrust == 0.005964552
+
+
+@pytest.mark.parametrize(
+    ("name", "grams", "newtons", "metres"),
+    [
+        ("crazyflie-2.1+", 29.0, 0.12, 0.006993),
+        ("crazyflie-legacy", 29.0, 0.12, 0.00735),
+        ("crazyflie-thrust-kit", 32.5, 0.18, 0.00516),
+    ],
+)
+def test_the_crazyflies_of_today_carry_the_firmware_s_numbers(name, grams, newtons, metres):
+    model = Quadrotor.named(name)
+    assert (model.mass, model.motor_thrust) == (grams / 1000, newtons)
+    assert model.torque_per_thrust == metres
+    assert model.inertia == Quadrotor.crazyflie().inertia
+    with numerics.precision("float64"):
+        assert check_model(model) == ()  # hovering is within reach
+        # Full yaw: the collective gives way, so two motors give all and two give nothing.
+        most = np.asarray(model.limit(jnp.asarray([model.mass * 9.81, 0.0, 0.0, 1.0])))[3]
+    assert most == pytest.approx(2.0 * metres * newtons)
+
+
+def test_a_named_quadrotor_takes_changes():
+    model = Quadrotor.named("paper", allow_unphysical=True, mass=0.03)
+    assert model.mass == 0.03
+    assert model.inertia == (6.4893e-6, 16.4562e-6, 29.5435e-6)
+
+
+class Tank(ControlAffine):
+    """Two tanks in a row: two methods and two tuples of names."""
+
+    outflow: float = 0.4
+
+    state_names = ("upper", "lower")
+    input_names = ("inflow",)
+
+    def drift(self, x):
+        return jnp.stack([-self.outflow * x[0], self.outflow * (x[0] - x[1])])
+
+    def input_map(self, x):
+        return jnp.array([[1.0], [0.0]])
+
+
+def test_an_agent_of_ones_own_is_two_methods_and_two_tuples_of_names():
+    model = Tank(outflow=2.0)
+    x = np.array([0.5, 0.25])
+    assert numpy(model.velocity, x, np.array([3.0])) == pytest.approx([2.0, 0.5])
+    assert numpy(model.output, x) == pytest.approx(x)
+    assert model.output_names == model.state_names
+    assert model.state_units == ("", "") and model.input_units == ("",)
+    assert model.trim == ((0.0, 0.0), (0.0,))
+    assert model.weights == ((1.0, 1.0), (1.0,))
+    assert model.input_scale == ((1.0,),)
+    assert (model.position, model.flat_outputs, dict(model.state_groups)) == ((), (), {})
+
+
+def test_an_agent_of_ones_own_may_replace_any_default_by_attribute_property_or_method():
+    class Warm(Tank):
+        trim = ((1.0, 1.0), (0.4,))
+        state_units = ("K", "K")
+        weights = ((2.0, 3.0), (4.0,))
+
+        @property
+        def input_scale(self):
+            return ((self.outflow,),)
+
+        def difference(self, x, y):
+            return 2.0 * (x - y)
+
+    model = Warm()
+    assert model.trim == ((1.0, 1.0), (0.4,)) and model.weights == ((2.0, 3.0), (4.0,))
+    assert model.input_scale == ((0.4,),) and model.state_units == ("K", "K")
+    assert numpy(model.difference, np.ones(2), np.zeros(2)) == pytest.approx([2.0, 2.0])
+    assert numpy(model.physical, np.array([2.0])) == pytest.approx([1.2])
+
+
+def computed_torque(model, x, v):
+    """The thrust and torques of a quadrotor that realize an input of `QuadrotorEuler`."""
+    zeta, omega = x[6:9], x[9:12]
+    zeta_dot = euler_rates(zeta, omega)
+    # omega = W(zeta)^-1 zetadot, differentiated along (zetadot, zetaddot).
+    _, omega_dot = jax.jvp(body_rates, (zeta, zeta_dot), (zeta_dot, v[1:]))
+    torque = jnp.asarray(model.inertia) * (omega_dot - free_spin(model.inertia, omega))
+    return jnp.append(model.mass * (model.gravity + v[0]), torque)
+
+
+def test_computed_torque_turns_the_quadrotor_into_its_euler_form():
+    model, euler = FAMILY["big"], QuadrotorEuler()
+    for _ in range(20):
+        x = rng.uniform(-1.0, 1.0, 12)
+        v = rng.uniform(-3.0, 3.0, 4)
+        with precision("float64"):
+            u = computed_torque(model, jnp.asarray(x), jnp.asarray(v))
+            xdot = model.velocity(jnp.asarray(x), u)
+            # The Euler-angle rates of the vehicle, and how they change along its motion.
+            rates, accelerations = jax.jvp(
+                lambda y: euler_rates(y[6:9], y[9:12]), (jnp.asarray(x),), (xdot,)
+            )
+            seen = euler.velocity(jnp.concatenate([jnp.asarray(x)[:9], rates]), jnp.asarray(v))
+        assert np.asarray(seen[:9]) == pytest.approx(np.asarray(xdot[:9]), abs=1e-12)
+        assert np.asarray(accelerations) == pytest.approx(v[1:], abs=1e-10)
+
+
+def test_a_thrust_that_is_a_state_changes_nothing_but_its_lag():
+    euler, thrust = QuadrotorEuler(), QuadrotorThrust()
+    for _ in range(20):
+        x, v = rng.uniform(-1.0, 1.0, 12), rng.uniform(-3.0, 3.0, 4)
+        slow = numpy(thrust.velocity, np.append(x, v[0]), np.append(0.5, v[1:]))
+        assert slow[:12] == pytest.approx(numpy(euler.velocity, x, v), abs=1e-12)
+        assert slow[12] == 0.5

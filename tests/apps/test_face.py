@@ -1,0 +1,256 @@
+"""What the command line makes of a run for people and other programs; a folder to begin with."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from recordings import flown
+from runs import made_up
+from test_figures import stored
+
+import echelon as ech
+from echelon.core.errors import MissingExtraError
+from echelon.experiments.results.labelled import Labelled
+from echelon.experiments.results.recording import FORMAT, read_recording
+from echelon.output.archive.export import table
+from echelon.output.plots import animation, video
+from echelon.output.plots.camera import camera_for
+from echelon.output.plots.space import space_of
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """A stored run of four quadrotors."""
+    path = tmp_path_factory.mktemp("stored") / "run.nc"
+    run = dataclasses.replace(flown(seconds=1.0, rate=25.0), bounds=None)
+    path.write_bytes(stored(run, FORMAT))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(file):
+    return read_recording(file)
+
+
+# ---- numbers ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("variables", "attributes"),
+    [({"a": ("x", [True, False])}, {}), ({}, {"a": ["one", "two"]}), ({}, {"a": True})],
+)
+def test_only_what_a_file_holds_as_it_is_is_written_without_xarray(variables, attributes):
+    with pytest.raises(AssertionError, match="`a` is of"):
+        Labelled(variables, {}, attributes).netcdf()
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npz", "mat"])
+def test_other_programs_read_the_very_numbers(echelon, here, file, run, kind):
+    code, told, _ = echelon("export", file, "--to", kind)
+    assert code == 0 and told.startswith(f"- Written to run.{kind}: ")
+    read = READERS[kind](here / f"run.{kind}")
+    for k, name in enumerate(("x", "vz", "yaw")):
+        place = run.state_names.index(name)
+        np.testing.assert_array_equal(read(name, place), run.states[:, :, place], err_msg=str(k))
+    code, _, fault = echelon("export", file, "--to", kind)
+    assert code == 2 and "exists; choose another, or `--force`" in fault
+
+
+def by_column(frame):
+    return lambda name, _: frame[name].to_numpy().reshape(-1, 4)
+
+
+def read_csv(path):
+    import csv
+
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    return lambda name, _: np.array([float(row[name]) for row in rows]).reshape(-1, 4)
+
+
+def read_parquet(path):
+    import pandas as pd
+
+    return by_column(pd.read_parquet(path))
+
+
+def read_npz(path):
+    with np.load(path) as data:
+        states, names = data["states"], data["state_names"].tolist()
+    return lambda name, _: states[:, :, names.index(name)]
+
+
+def read_mat(path):
+    from scipy.io import loadmat
+
+    data = loadmat(path, squeeze_me=True)
+    names = [str(name) for name in data["state_names"]]
+    return lambda name, _: data["states"][:, :, names.index(name)]
+
+
+READERS = {"csv": read_csv, "parquet": read_parquet, "npz": read_npz, "mat": read_mat}
+
+
+def test_a_row_is_of_an_agent_at_a_time(run):
+    rows = table(run)
+    assert len(rows) == run.states.shape[0] * 4
+    row = rows[(rows.agent == 2) & (rows.time == run.times[7])]
+    assert float(row.formation_error.iloc[0]) == run.formation_errors[7, 2]
+    assert rows[rows.leader].agent.unique().tolist() == [0]
+
+
+def test_an_unknown_format_is_refused_with_those_there_are(echelon, file):
+    code, _, fault = echelon("export", file, "--to", "xls")
+    assert code == 2
+    assert fault == "echelon: `--to` is `xls`, and must be one of `csv`, `parquet`, `npz`, `mat`.\n"
+
+
+# ---- pages and videos -------------------------------------------------------------------------
+
+
+def test_the_report_is_one_page_with_promise_figures_and_how_to_cite(echelon, here, file, run):
+    (here / "first").mkdir()
+    shutil.copy(file, here / "first" / "run.nc")
+    (here / "first" / "report.txt").write_text("a <table> & more\n")
+    (here / "first" / "scenario.yaml").write_text("name: mine\n")
+    assert echelon("report", "first")[0] == 0
+    page = (here / "report.html").read_text()
+    assert "a &lt;table&gt; &amp; more" in page and "name: mine" in page
+    assert run.promise["sentence"] in page and "@inproceedings" in page
+    assert page.count("data:image/png;base64,") >= 3
+    assert "http" not in page.replace("https://", "http") or 'src="http' not in page
+
+
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+def test_a_video_has_its_pictures_in_its_size(echelon, here, file, kind):
+    code, told, _ = echelon("video", file, f"run.{kind}", "--speed", "2.5")
+    assert code == 0 and told.startswith(f"- Written to run.{kind}: 11 pictures, ")
+    said = subprocess.run(
+        [video.encoder(), "-i", f"run.{kind}", "-f", "null", "-"], capture_output=True, text=True
+    ).stderr
+    assert ("960x540" if kind == "mp4" else "640x360") in said
+
+
+def test_a_moving_agent_moves_in_the_pictures(run):
+    film = video._Film(run)
+    first, last = film.pictures(np.array([0.0, 1.0]))
+    one, two = (np.frombuffer(each, np.uint8).reshape(540, 960, 4) for each in (first, last))
+    assert (one[:, :600] != two[:, :600]).any()
+    # The curves stay, but for their cursors.
+    assert (one[:, 700:] == two[:, 700:]).mean() > 0.97
+
+
+def test_the_camera_holds_the_whole_box_and_shows_near_things_larger(run):
+    space = space_of(run)
+    camera = camera_for(space, 600, 500, 10)
+    low, high = space.low, space.high
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+    pixels, depth = camera.project(corners)
+    assert (depth > 0).all()
+    assert (pixels[:, 0] >= 10).all() and (pixels[:, 0] <= 610).all()
+    assert (pixels[:, 1] >= 0).all() and (pixels[:, 1] <= 500).all()
+    up = np.array([0.0, 0.0, 0.1])
+    tall = np.linalg.norm(camera.project(corners + up)[0] - pixels, axis=1)
+    assert tall[depth.argmin()] > tall[depth.argmax()]
+
+
+def test_rotations_are_those_of_roll_pitch_and_yaw():
+    from test_view import about
+
+    for angles in np.random.default_rng(0).uniform(-3, 3, (5, 3)):
+        roll, pitch, yaw = angles
+        wanted = about(2, yaw) @ about(1, pitch) @ about(0, roll)
+        np.testing.assert_allclose(animation.rotations(angles[None])[0], wanted, atol=1e-12)
+
+
+def test_without_ffmpeg_a_sentence_says_how_to_get_it(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtraError, match="needs ffmpeg, and none is on the PATH"):
+        video.encoder()
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        (("run.avi",), "`run.avi` ends in `.avi`, and must end in .mp4 or .gif."),
+        (("run.mp4", "--speed", "0"), "`--speed` is 0, and must be from 0.01 to 100."),
+        (("none/run.mp4",), "`none` is no folder to write `run.mp4` into."),
+    ],
+)
+def test_a_video_that_cannot_be_is_refused(echelon, file, name, sentence):
+    code, _, fault = echelon("video", file, *name)
+    assert (code, fault) == (2, f"echelon: {sentence}\n")
+
+
+# ---- a folder to begin with -------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_all_that_init_writes_runs(echelon, here, monkeypatch):
+    assert echelon("init", "my-swarm")[0] == 0
+    monkeypatch.chdir(here / "my-swarm")
+    short = ("--set", "simulation.horizon=2", "--no-figures")
+    assert echelon("run", "scenario.yaml", "--out", "first", *short)[0] == 0
+    own = 'follower={law: {python: "law.py:Spring", stiffness: 2.0}}'
+    assert echelon("run", "scenario.yaml", "--out", "second", "--set", own, *short)[0] == 0
+    assert json.loads((here / "my-swarm/first/summary.json").read_text())["scenario"] == "my-swarm"
+    book = json.loads((here / "my-swarm" / "tour.ipynb").read_text())
+    code = ["".join(cell["source"]) for cell in book["cells"] if cell["cell_type"] == "code"]
+    exec("\n".join(code), {})  # noqa: S102 - the notebook's own cells
+
+
+def test_init_takes_a_new_folder_and_no_other(echelon, here):
+    (here / "full").mkdir()
+    (here / "full" / "mine.txt").write_text("mine")
+    code, _, fault = echelon("init", "full")
+    assert code == 2 and fault == (
+        "echelon: `full` exists and is not empty; choose another name.\n"
+    )
+    code, _, fault = echelon("init", "my swarm")
+    assert code == 2 and "`my swarm` is no name for a scenario" in fault
+    assert not (here / "my swarm").exists()
+
+
+# ---- words ------------------------------------------------------------------------------------
+
+
+def test_explain_says_what_a_word_means(echelon):
+    code, told, _ = echelon("explain", "Gain Margin")
+    assert code == 0 and "between which every mode decays" in " ".join(told.split())
+    code, told, _ = echelon("explain", "margin", "--json")
+    assert {"gain margin", "delay margin"} <= {name.lower() for name in json.loads(told)}
+    code, _, fault = echelon("explain", "gain marign")
+    assert code == 2 and "(did you mean `gain margin`?)" in fault
+    code, told, _ = echelon("explain")
+    assert code == 0 and len(told.splitlines()) > 20
+
+
+def test_quiet_prints_nothing_and_does_the_same(echelon, here, file):
+    assert echelon("-q", "export", file) == (0, "", "")
+    assert (here / "run.csv").is_file()
+    code, told, fault = echelon("-q", "export", file)
+    assert code == 2 and told == "" and fault
+
+
+def test_a_result_is_a_table_in_a_notebook_with_its_pictures():
+    model, graph = ech.models.SingleIntegrator(dimension=1), ech.Graph.path(3)
+    states = np.array([[[0.0], [2.0], [4.0]], [[0.0], [0.5], [0.25]]])
+    page = made_up(states, model, graph)._repr_html_()
+    assert page.count("<tr>") == 4 and page.count('src="data:image/png;base64,') == 2
+    assert "<td>follower 1</td><td>2</td><td>0.5</td>" in page
+    assert "<td>leader 0</td><td></td><td></td>" in page
+    assert repr(made_up(states, model, graph)).startswith("Result(3 x SingleIntegrator, 2 frames, ")
+
+
+def test_of_a_flock_a_notebook_shows_the_best_the_median_and_the_worst_and_why_it_failed():
+    model, graph = ech.models.SingleIntegrator(dimension=1), ech.Graph.path(30)
+    away = np.arange(30.0)[:, None]
+    page = made_up(np.stack([away, 3.0 * away]), model, graph)._repr_html_()
+    assert page.count("<tr>") == 5 and "<td>worst (follower 29)</td><td>29</td><td>87</td>" in page
+    assert "<td>best (follower 1)</td>" in page and "<td>median (follower 15)</td>" in page
+    assert (
+        "<li>" in page and "<li>" not in made_up(np.stack([away, away]), model, graph)._repr_html_()
+    )

@@ -1,0 +1,522 @@
+"""The loop that runs live: it is the loop of a run, its knobs are keys, and the page shows it."""
+
+import copy
+import json
+import threading
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from browser import chromium, opened, until
+
+import echelon as ech
+from echelon.apps.live import live_stepper
+from echelon.apps.live import server as served
+from echelon.apps.live import swarm as looked
+from echelon.apps.live.guarantee_status import Reach
+from echelon.apps.live.knobs import Panel
+from echelon.apps.live.promiser import badge_of, first_look
+from echelon.apps.live.server import live, serve_live
+from echelon.apps.live.session import Session
+from echelon.apps.live.swarm import Picture, Swarm
+from echelon.core.errors import SimulationError
+from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.scenario.build import build
+from echelon.experiments.scenario.scenario import scenario_from_mapping
+from echelon.experiments.scenario.yaml import dump_yaml, read_yaml
+from echelon.output.viewer.serve import serving
+from echelon.simulation.native import kernel_cache
+
+GIVEN = {
+    "name": "own",
+    "model": {"name": "double-integrator", "parameters": {"dimension": 2}},
+    "graph": {"edges": [[0, 1], [1, 2], [1, 3], [0, 3]], "leaders": [0]},
+    "formation": {"offsets": {1: [1, 0], 2: [1, 1], 3: [0, 1]}},
+    "reference": {"name": "circle", "radius": 1.0, "rate": 0.5},
+    "follower": {"law": "consensus", "gain": {"method": "riccati"}},
+    "initial": {"spread": {"position": 0.5}},
+    "simulation": {"horizon": 0.4, "dt": 0.01, "store_every": 4, "engine": "jax"},
+}
+
+
+def scenario(**changes):
+    return scenario_from_mapping(copy.deepcopy(GIVEN) | changes)
+
+
+@pytest.fixture(scope="module")
+def panel():
+    own = scenario()
+    return Panel(own, build(own))
+
+
+@pytest.fixture(scope="module")
+def swarm(panel):
+    return Swarm(*panel.built, panel)
+
+
+@pytest.fixture(scope="module")
+def native(panel):
+    """The same loop by code for this machine."""
+    parts, settings = panel.built
+    made = Swarm(parts, settings._replace(engine="native"), panel)
+    assert (made.engine, Swarm(parts, settings, panel).engine) == ("native", "jax")
+    return made
+
+
+@pytest.fixture
+def session(panel, swarm):
+    swarm.turn(panel.start)
+    swarm.restart()
+    made = Session(panel.scenario, panel, swarm)
+    yield made
+    made.promiser.end()
+
+
+def flown(swarm, pictures=10):
+    """The states after each of some pictures from the start."""
+    swarm.restart()
+    return np.stack([swarm.advance().states for _ in range(pictures)])
+
+
+# ---- the loop ---------------------------------------------------------------------------------
+
+
+def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
+    whole = ech.run(panel.scenario)
+    for each in (swarm, native):
+        each.turn(panel.start)
+        np.testing.assert_allclose(flown(each), whole.states[1:], atol=1e-12)
+    assert swarm.advance(still=True).lyapunov == pytest.approx(lyapunov(whole).value[-1], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_law_that_remembers_and_signals_is_live_too():
+    own = ech.load_scenario("paper-global", ["simulation.horizon=0.4", "simulation.engine=jax"])
+    found = Panel(own, build(own))
+    swarm, wanted = Swarm(*found.built, found), ech.run(own).states
+    shown = flown(swarm, 10)
+    # Pictures are 8 steps apart, stored frames 10.
+    np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
+    np.testing.assert_allclose(shown[9], wanted[8], atol=1e-9)
+    assert found.start.coupling == pytest.approx(ech.run(own).drive.follower.strength(0.005))
+
+
+KNOBS = {
+    "coupling": {"coupling": 3.0},
+    "weight": {"weight": 4.0},
+    "feedforward": {"feedforward": 0.0},
+    "size": {"size": 2.0},
+    "turn": {"turn": 30.0},
+    "wind": {"wind": 1.5},
+    "cut": {"cut": frozenset({3})},
+    "method": {"method": "inner-loop", "coupling": 1.0},
+    "shape": {"shape": "wedge"},
+}
+
+
+@pytest.mark.parametrize("name", KNOBS)
+def test_a_knob_does_what_its_key_in_the_scenario_does(panel, swarm, native, name):
+    """The scenario that `standing` writes is run by the engine from the live loop's start."""
+    knobs = panel.start._replace(**KNOBS[name])
+    parts, settings = build(panel.standing(knobs))
+    wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+    for each in (swarm, native):
+        each.turn(knobs)
+        np.testing.assert_allclose(flown(each), wanted.states[1:], atol=1e-11)
+    V = swarm.advance(still=True).lyapunov
+    assert V == pytest.approx(lyapunov(wanted).value[-1], rel=1e-9)
+    assert np.abs(wanted.states[1:] - ech.run(panel.scenario).states[1:]).max() > 1e-3
+
+
+def test_no_knob_compiles_anything_again(panel, swarm, native, monkeypatch):
+    for each in (swarm, native):
+        each.turn(panel.start)
+        each.advance()
+        traced = []
+        monkeypatch.setattr(live_stepper, "control", lambda *_: traced.append(1))
+        monkeypatch.setattr(kernel_cache, "program", lambda *_: traced.append(1))
+        for change in KNOBS.values():
+            each.turn(panel.start._replace(**change))
+            each.advance()
+        each.kick(1, np.ones(4))
+        each.advance(still=True)
+        assert traced == []
+
+
+def test_another_law_takes_over_where_the_agents_are_and_is_the_loop_of_a_run(session, swarm):
+    swarm.advance()
+    places = np.asarray(swarm.now.states)
+    session.ask({"name": "size", "value": 2.0})
+    session.ask({"name": "law", "value": "passive"})
+    session.settle()
+    assert session.swarm is not swarm and session.knobs == session.panel.start._replace(size=2.0)
+    np.testing.assert_array_equal(session.swarm.now.states, places)
+    assert session.swarm.steps == swarm.steps and "coupling" not in session.panel.ranges
+    session.ask({"name": "reset"})
+    session.settle()
+    parts, settings = build(session.panel.standing(session.knobs))
+    wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+    shown = np.stack([session.swarm.advance().states for _ in range(10)])
+    np.testing.assert_allclose(shown, wanted.states[1:], atol=1e-11)
+    assert session.events[0] == {"at": 0.0, "law": "passive", "size": 2.0}
+    told = session.ask({"name": "law", "value": "agreement"})
+    assert told["fault"].startswith("follower: the law `agreement` is made for `SingleIntegrator`")
+    assert "there is no law `best` here" in session.ask({"name": "law", "value": "best"})["fault"]
+
+
+SWITCHING = {
+    "edges": [[0, 1], [1, 2], [1, 3], [0, 3]],
+    "schedule": [{"at": 0.09, "edges": [[0, 3], [2, 3], [1, 2]]}],
+    "period": 0.15,
+}
+
+
+def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
+    own = scenario(graph=SWITCHING)
+    panel = Panel(own, build(own))
+    # Few periods are foreseen at a time, so that the loop must look ahead again.
+    monkeypatch.setattr(looked, "_AHEAD", 0.2)
+    swarm = Swarm(*panel.built, panel)
+    assert len(swarm.loop.switches.steps) == 10 and panel.slowest(panel.start) is None
+    for knobs in (panel.start, panel.start._replace(cut=frozenset({2}))):
+        parts, settings = build(panel.standing(knobs))
+        settings = settings._replace(horizon=1.2)
+        wanted = ech.simulate(parts.replace(initial=swarm.states, start_error={}), settings)
+        swarm.turn(knobs)
+        np.testing.assert_allclose(flown(swarm, 30), wanted.states[1:], atol=1e-11)
+
+
+def test_a_page_that_comes_before_the_first_picture_is_sent_none(session):
+    sent = []
+
+    def send(block):
+        sent.append(block)
+        session.ended = True
+
+    session.watch(send)
+    assert sent and all(len(block) > 4 for block in sent)
+
+
+def test_another_method_brings_its_gain_and_its_coupling(session):
+    session.ask({"name": "method", "value": "inner-loop"})
+    session.settle()
+    found = build(scenario(follower={"gain": {"method": "inner-loop"}})).parts.drive.gain
+    own = session.swarm.loop.follower.law.gain
+    np.testing.assert_array_equal(own.P, found.P)
+    np.testing.assert_array_equal(own.inner, found.inner)
+    assert session.knobs.coupling == pytest.approx(found.coupling, abs=1e-9)
+    with pytest.raises(SimulationError, match="no method `best` here"):
+        session.ask({"name": "method", "value": "best"})
+    session.ask({"name": "method", "value": "scenario"})
+    session.settle()
+    assert session.knobs == session.panel.start
+
+
+def test_the_error_is_the_distance_from_the_goal_of_the_turned_formation(panel, swarm):
+    knobs = panel.start._replace(size=2.0, turn=90.0)
+    swarm.turn(knobs)
+    swarm.restart()
+    picture = swarm.advance()
+    # Twice as large and a quarter to the left: (1, 0) goes to (0, 2), (1, 1) to (-2, 2).
+    goal = picture.states[0, :2] + np.array([-2.0, 2.0])
+    away = np.linalg.norm(picture.states[2, :2] - goal)
+    assert picture.errors[2] == pytest.approx(away, rel=1e-12)
+
+
+def test_a_kick_moves_one_agent_and_all_ways_in_turn(session):
+    before = session.swarm.advance(still=True).states
+    first, second = (session.ask({"name": "kick", "value": 2}) for _ in range(2))
+    session.settle()
+    moved = session.swarm.advance(still=True).states - before
+    np.testing.assert_allclose(moved[2], np.array(first["kick"][2]) + second["kick"][2])
+    assert not np.delete(moved, 2, axis=0).any()
+    assert np.hypot(*first["kick"][2][2:]) == pytest.approx(2.0, rel=1e-5)
+    third = session.ask({"name": "kick", "value": 2})
+    assert third["kick"] != first["kick"]
+
+
+def test_a_knob_is_clamped_and_nonsense_is_refused_in_a_sentence(session):
+    assert session.ask({"name": "size", "value": 1e9}) == {"size": 3.0}
+    said = json.loads(session.words[-1][4:])["note"]
+    assert said == "`size` got 1e+09, and stands at 3, the end of its range."
+    assert session.ask({"name": "wind", "value": -1e300}) == {"wind": -3.0}
+    for told, sentence in {
+        ("colour", 1.0): "there is no knob `colour`; this scenario has `coupling`",
+        ("turn", "a lot"): "`turn` got `a lot`, and must be a number.",
+        ("turn", float("nan")): "`turn` got `nan`, and must be a number.",
+        ("turn", True): "`turn` got `True`, and must be a number.",
+        ("kick", 9): "`kick` got `9`, and must be the number of an agent.",
+        ("cut", (0, 2)): "`[0, 2]` is no link of the graph.",
+        ("cut", 7): "`7` is no link of the graph.",
+    }.items():
+        with pytest.raises(SimulationError) as fault:
+            session.ask({"name": told[0], "value": told[1]})
+        assert str(fault.value).startswith(sentence)
+
+
+def test_what_was_done_is_saved_and_repeats_to_the_bit(session, swarm):
+    done = {
+        2: [("coupling", 2.5), ("cut", [3, 0])],
+        4: [("kick", 1), ("wind", 0.7)],
+        6: [("restore", [0, 3]), ("size", 1.5), ("turn", -20.0), ("feedforward", 0)],
+        7: [("law", "passive"), ("shape", "line")],
+        8: [("law", "consensus"), ("kick", 3)],
+    }
+    shown = []
+    for k in range(9):
+        for name, value in done.get(k, ()):
+            session.ask({"name": name, "value": value})
+        session.settle()
+        shown.append(session.swarm.advance().states)
+    text = session.ask({"name": "save"})["text"]
+    again = scenario_from_mapping(read_yaml(text, "saved").data)
+    ats = [0.08, 0.08, 0.16, 0.16, 0.24, 0.24, 0.24, 0.24, 0.28, 0.28, 0.32, 0.32]
+    assert [event.at for event in again.live] == ats
+    panel = Panel(again, build(again))
+    other = Session(again, panel, Swarm(*panel.built, panel))
+    for states in shown:
+        other.settle()
+        np.testing.assert_array_equal(other.swarm.advance().states, states)
+    other.promiser.end()
+    # And what it saves is the same again.
+    assert other.ask({"name": "save"})["text"] == text
+
+
+def test_a_run_refuses_what_was_done_live(echelon, here):
+    (here / "live.yaml").write_text(dump_yaml(GIVEN | {"live": [{"at": 1.0, "coupling": 2.0}]}))
+    code, _, fault = echelon("run", "live.yaml", "--out", "out")
+    assert code == 2 and "live: got 1 events, allowed is none in a run" in fault
+    assert not (here / "out").exists()
+
+
+def test_reset_begins_again_with_the_knobs_as_they_are(session, swarm):
+    session.ask({"name": "coupling", "value": 3.0})
+    session.settle()
+    swarm.advance()
+    session.ask({"name": "kick", "value": 1})
+    session.ask({"name": "reset"})
+    session.settle()
+    assert swarm.steps == 0 and session.knobs.coupling == 3.0
+    assert session.events == [{"at": 0.0, "coupling": 3.0}]
+
+
+# ---- the promise ------------------------------------------------------------------------------
+
+
+def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
+    strong = badge_of(panel, panel.start)
+    assert strong["state"] == "holds" and strong["short"].startswith("promised: ")
+    edge = strong["edge"]
+    near = badge_of(panel, panel.start._replace(coupling=1.05 * edge))
+    assert near["state"] == "edge" and near["short"].endswith(", at its edge")
+    parted = badge_of(panel, panel.start._replace(cut=frozenset({0, 3})))
+    assert parted["state"] == "lost" and "disconnected" in parted["causes"][0]
+
+
+LOOKS = [
+    {"coupling": 0.3},
+    pytest.param({}, marks=pytest.mark.slow),
+    pytest.param({"cut": frozenset({3})}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("change", LOOKS)
+def test_the_first_look_is_the_slowest_mode_that_the_promise_then_tells(panel, change):
+    knobs = panel.start._replace(**change)
+    found = ech.promise(*build(panel.standing(knobs)))
+    assert panel.slowest(knobs) == pytest.approx(found.slowest, rel=1e-9)
+    assert first_look(panel, knobs)["state"] == "asking"
+
+
+def test_a_growing_mode_is_told_at_once(panel):
+    oscillator = scenario(
+        model={"name": "van-der-pol"},
+        formation={},
+        reference=None,
+        follower={"law": "consensus"},
+        initial={"spread": {"position": 0.1}},
+    )
+    own = Panel(oscillator, build(oscillator))
+    weak = own.start._replace(coupling=0.02 * own.start.coupling)
+    look, found = first_look(own, weak), badge_of(own, weak)
+    assert look["state"] == found["state"] == "lost"
+    assert look["short"] == found["short"] and "a mode grows, +" in look["short"]
+    assert any("raise `coupling`" in cause for cause in found["causes"])
+
+
+HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0, "causes": []}
+
+
+def badges_of(model, errors, pitch=None, begins=None):
+    """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
+    told, names = [], model.state_names
+    reach = Reach(model, ech.Graph.path(2), told.append)
+    reach.hear(HELD | {"beyond": ["what is promised does not reach this run: far"]})
+    for second, error in enumerate(errors):
+        if second == begins:
+            reach.begin()
+        states = np.zeros((2, len(names)))
+        if pitch is not None:
+            states[1, names.index("pitch")] = pitch[second]
+        size, none = np.array([0.0, error]), np.zeros(2, bool)
+        reach.look(Picture(float(second), states, states, size, states, np.nan, none))
+    return told
+
+
+def test_the_badge_is_green_only_where_what_is_promised_reaches():
+    grown = badges_of(
+        ech.models.DoubleIntegrator(), [1.0, 1.5, 1.0, 2.9, 3.1, 4.0, 3.0, 2.1, 2.0, 1.0]
+    )
+    assert [each["state"] for each in grown] == ["holds", "lost", "holds"]
+    assert "does not reach this run" in grown[1]["causes"][0]
+    out = badges_of(
+        ech.models.Quadrotor(), [2.0, 8.0, 8.0, 5.0, 4.0], pitch=[0.0, 1.6, 0.0, 0.0, 0.0]
+    )
+    assert [each["state"] for each in out] == ["holds", "lost", "holds"]
+    assert "Agent 1 left the chart of its equations at t = 1.00 s: `pitch`" in out[1]["causes"][1]
+
+
+def test_a_first_swing_and_errors_of_no_size_take_no_promise_back():
+    for errors in ([0.0, 0.5, 1.0, 1.9, 1.0], [1e-9, 1e-9, 1e-9, 1e-3, 9e-3]):
+        assert len(badges_of(ech.models.DoubleIntegrator(), errors)) == 1
+    # What is done has a swing of its own, and errors without equal are doubted until they halve.
+    model = ech.models.DoubleIntegrator()
+    assert len(badges_of(model, [0.5, 1e-9, 1e-9, 1e-9, 0.5, 0.9], begins=4)) == 1
+    fallen = badges_of(model, [0.5, 0.1, 0.1, 1.1, 9.0, 9.5, 4.7, 2.0], begins=4)
+    assert [each["state"] for each in fallen] == ["holds", "lost", "edge", "holds"]
+
+
+# ---- the server and the page ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def page():
+    """A session that runs, and where its page is."""
+    # A quick loop, since it is watched in real time.
+    follower = {"law": "consensus", "gain": {"method": "riccati", "R": [0.02, 0.02]}}
+    session, html = live(scenario(follower=follower))
+    session.start()
+    with serving(serve_live(session, html, 0)) as address:
+        yield session, address
+    session.end()
+
+
+def post(address, told, **headers):
+    data = told if isinstance(told, bytes) else json.dumps(told).encode()
+    request = urllib.request.Request(address + "knob", data, headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, json.loads(answer.read())
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def test_pages_of_others_may_neither_turn_a_knob_nor_read_the_stream(page):
+    session, address = page
+    knob = {"name": "wind", "value": 1.0}
+    for headers in ({"Origin": "http://example.org"}, {"Host": "example.org"}, {"Origin": "null"}):
+        assert post(address, knob, **headers)[0] == 403
+        request = urllib.request.Request(address + "stream", headers=headers)
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=10)
+    assert session.knobs.wind == 0.0
+    assert post(address, knob, Origin=address[:-1]) == (200, {"wind": 1.0})
+    assert post(address, {"name": "wind", "value": 0.0})[0] == 200
+
+
+@pytest.mark.parametrize("told", [b"{", b"[1]", b"x" * 200_000, b"null", {"name": None}])
+def test_a_question_that_is_none_is_answered_and_nothing_ends(page, told):
+    assert post(page[1], told)[0] == 400
+    assert post(page[1], {"name": "pause", "value": False})[0] == 200
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+def test_a_cut_link_disappears_the_error_reacts_and_the_page_says_why(browser, page):
+    _, address = page
+    with opened(browser, address) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 20)
+        until(lambda: shown.evaluate("echelon.promise && echelon.promise.state") == "holds")
+        until(lambda: shown.evaluate("echelon.numbers.worst") < 0.05)
+        # With both links to the leader gone nobody hears it.
+        click_link(shown, 0, 1)
+        until(lambda: [0, 1] not in shown.evaluate("echelon.links"))
+        shown.evaluate("echelon.ask('cut', [0, 3])")
+        until(lambda: shown.evaluate("echelon.promise.state") == "lost")
+        until(lambda: "disconnected" in shown.locator(".notes").inner_text())
+        shown.evaluate("echelon.ask('kick', 1)")
+        until(lambda: shown.evaluate("echelon.numbers.worst") > 0.3)
+        for pair in ([0, 1], [0, 3]):
+            shown.evaluate("(pair) => echelon.ask('restore', pair)", pair)
+        until(lambda: len(shown.evaluate("echelon.links")) == 4)
+        until(lambda: shown.evaluate("echelon.numbers.worst") < 0.05)
+
+
+def click_link(shown, i, j):
+    """Click the middle of a link, wherever it is now."""
+    shown.evaluate("echelon.ask('pause', true)")
+    until(lambda: shown.evaluate("echelon.apps.live.paused"))
+    ends = np.array([shown.evaluate(f"echelon.whereOnScreen({k})") for k in (i, j)])
+    box = shown.locator("#scene").bounding_box()
+    shown.mouse.click(box["x"] + ends[:, 0].mean(), box["y"] + ends[:, 1].mean())
+    shown.evaluate("echelon.ask('pause', false)")
+
+
+def test_a_slider_turns_its_knob_and_the_page_shows_places_that_are_the_loops(browser, page):
+    session, address = page
+    with opened(browser, address, 420, 800) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 3)
+        assert shown.evaluate("document.documentElement.scrollWidth") <= 420
+        shown.get_by_role("slider", name="formation size").fill("900")
+        until(lambda: session.knobs.size > 2.0)
+        shown.evaluate("echelon.ask('pause', true)")
+        until(lambda: shown.evaluate("echelon.apps.live.paused"))
+        time = shown.evaluate("echelon.time")
+        until(lambda: shown.evaluate("echelon.time") == time and session.paused)
+        states = session.swarm.advance(still=True).states
+        for agent in range(4):
+            place = shown.evaluate(f"echelon.position({agent})")
+            assert place[:2] == pytest.approx(states[agent, :2], abs=1e-5)
+        shown.evaluate("echelon.ask('pause', false)")
+        shown.evaluate("echelon.ask('size', 1.0)")
+        until(lambda: session.knobs.size == 1.0)
+
+
+def test_a_page_that_is_closed_ends_nothing_and_nobody_watching_stops_the_clock(browser, page):
+    session, address = page
+    with opened(browser, address) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 3)
+    until(lambda: session.watchers == 0)
+    steps = session.swarm.steps
+    threading.Event().wait(0.3)
+    assert session.swarm.steps <= steps + 2 * session.swarm.count
+    with opened(browser, address) as shown:
+        until(lambda: shown.evaluate("echelon.pictures") > 3)
+
+
+@pytest.mark.parametrize(
+    ("event", "sentence"),
+    [
+        ({"cut": [0, 2]}, "`live` at 1 s: `[0, 2]` is no link of the graph."),
+        ({"law": "best"}, "`live` at 1 s: there is no law `best` here; there are `consensus`"),
+        ({"shape": "star"}, "`live` at 1 s: there is no shape `star` here; there are"),
+        ({"law": "passive", "coupling": 2.0}, "`live` at 1 s: there is no knob `coupling`"),
+        ({"kick": {4: [1.0, 0, 0, 0]}}, "`live` at 1 s: `kick` got agent 4 with 4 numbers"),
+    ],
+)
+def test_what_a_scenario_cannot_do_live_is_told_before_it_begins(panel, swarm, event, sentence):
+    own = scenario(live=[{"at": 1.0, **event}])
+    with pytest.raises(SimulationError) as fault:
+        Session(own, panel, swarm)
+    assert str(fault.value).startswith(sentence)
+
+
+def test_what_is_too_large_to_be_live_is_refused_with_what_would_be(monkeypatch):
+    monkeypatch.setattr(served, "_SLOWEST", 0.0)
+    with pytest.raises(SimulationError, match="4 agents are too many to be live here: 0.04 s take"):
+        live(scenario())

@@ -1,0 +1,526 @@
+"""The page of a run, in a real browser: it shows what the data says, and asks for nothing else."""
+
+import dataclasses
+import itertools
+import json
+import struct
+import urllib.error
+import urllib.request
+import zlib
+
+import numpy as np
+import pytest
+from browser import chromium, opened, until
+from recordings import flown, recorded
+
+from echelon.agents.network.switching import Schedule
+from echelon.core.errors import OutputError
+from echelon.experiments.results.dataset import dataset
+from echelon.experiments.results.recording import recording
+from echelon.output.plots.space import space_of
+from echelon.output.viewer.growing import Growing, serve_growing
+from echelon.output.viewer.pack import Group, pack
+from echelon.output.viewer.replay import frames_of, header, promise_badge, replay_data, replay_page
+from echelon.output.viewer.serve import Handler, serve, serving
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def run():
+    return flown()
+
+
+@pytest.fixture(scope="module")
+def file(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "run.html"
+    path.write_text(replay_page(run), "utf-8")
+    return path.as_uri()
+
+
+def rotation(q):
+    """The matrix of a quaternion (x, y, z, w)."""
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def about(axis, angle):
+    """The matrix of a turn about an axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    made = np.eye(3)
+    made[i, i], made[i, j], made[j, i], made[j, j] = c, -s, s, c
+    return made
+
+
+def seek(page, frame):
+    page.evaluate(f"echelon.seek({frame})")
+    assert page.evaluate("echelon.frame") == frame
+
+
+# ---- what is shown ----------------------------------------------------------------------------
+
+
+def test_scrubbing_shows_the_places_and_attitudes_that_the_data_says(browser, run, file):
+    with opened(browser, file) as page:
+        for frame in (0, 37, 150, 300):
+            seek(page, frame)
+            for agent in range(4):
+                place = run.states[frame, agent, :3]
+                # Half a step of 16 bits over some 4 m, and the float32 of the page.
+                assert page.evaluate(f"echelon.position({agent})") == pytest.approx(place, abs=6e-5)
+                roll, pitch, yaw = run.states[frame, agent, 6:9]
+                wanted = about(2, yaw) @ about(1, pitch) @ about(0, roll)
+                shown = rotation(page.evaluate(f"echelon.turn({agent})"))
+                np.testing.assert_allclose(shown, wanted, atol=1e-4)
+
+
+def test_goals_stand_where_the_offsets_put_them_beside_the_leader(browser, run, file):
+    with opened(browser, file) as page:
+        seek(page, 80)
+        for agent in range(4):
+            goal = run.states[80, 0, :3] + run.offsets[agent, :3] - run.offsets[0, :3]
+            assert page.evaluate(f"echelon.goal({agent})") == pytest.approx(goal, abs=1e-4)
+
+
+def test_every_link_shown_is_a_link_of_the_graph_and_is_drawn_between_its_agents(
+    browser, run, file
+):
+    with opened(browser, file, color_scheme="light") as page:
+        # In formation, so that no body is in front of a link.
+        seek(page, 300)
+        assert page.evaluate("echelon.links") == run.edges.tolist()
+        ends = [page.evaluate(f"echelon.whereOnScreen({k})") for k in run.edges[0]]
+        x, y = np.mean(ends, axis=0)
+        assert darkest(page, x, y) < 140
+        page.get_by_role("button", name="links").click()
+        assert darkest(page, x, y) > 140
+
+
+ARROWS = {
+    "edges": np.array([[0, 1], [1, 2], [3, 2], [0, 3]]),
+    "heard": np.array([[False, True], [False, True], [True, True], [False, False]]),
+    "schedule": Schedule(
+        np.array([0.0, 2.0]), np.array([[1.0, 1.0, 0.0, 1.0], [0.0, 1.0, 2.0, 1.0]]), 3.0
+    ),
+}
+
+
+def test_arrows_go_to_who_hears_and_a_graph_that_switches_has_the_links_of_the_time(
+    browser, tmp_path
+):
+    run = flown(**ARROWS)
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(run), "utf-8")
+    with opened(browser, path.as_uri(), color_scheme="light") as page:
+        for time in (0.0, 1.98, 2.0, 2.98, 3.0, 5.5):
+            seek(page, round(50 * time))
+            assert page.evaluate("echelon.links") == run.edges[run.linked(time)].tolist()
+        seek(page, 275)
+        heard = [page.evaluate(f"echelon.player.view.heardBy({k})") for k in range(4)]
+        assert heard == [[], [], [1, 3], [2]]
+        # The head of the arrow from 1 to 2 is wide where its line is not.
+        first, second = (np.array(page.evaluate(f"echelon.whereOnScreen({k})")) for k in (1, 2))
+        way = second - first
+        aside = 4.0 * np.array([-way[1], way[0]]) / np.linalg.norm(way)
+        parts = {k: darkest(page, *(first + k * way + aside), 1) for k in np.arange(0.4, 0.9, 0.04)}
+        assert min(x for k, x in parts.items() if k > 0.55) < 140
+        assert all(x > 140 for k, x in parts.items() if k < 0.5)
+
+
+def darkest(page, x, y, reach=4):
+    """The darkest grey near a place of the scene, with nothing but links in sight."""
+    page.evaluate("""for (const button of document.querySelectorAll('.toggle[aria-pressed=true]'))
+        if (button.textContent !== 'links') button.click()""")
+    return page.evaluate(
+        """([x, y, r]) => new Promise((done) => requestAnimationFrame(() => {
+        const view = echelon.player.view;
+        view.render();
+        const flat = document.createElement('canvas');
+        const from = view.renderer.domElement, scale = from.width / from.clientWidth;
+        const n = 2 * r + 1;
+        Object.assign(flat, { width: n, height: n });
+        const pen = flat.getContext('2d');
+        pen.fillStyle = 'white';
+        pen.fillRect(0, 0, n, n);
+        pen.drawImage(from, x * scale - r, y * scale - r, n, n, 0, 0, n, n);
+        done(Math.min(...pen.getImageData(0, 0, n, n).data.filter((_, k) => k % 4 === 1)));
+    }))""",
+        [x, y, reach],
+    )
+
+
+def test_the_charts_tell_the_error_and_v_at_the_cursor(browser, run, file):
+    with opened(browser, file) as page:
+        seek(page, 100)
+        errors = run.formation_errors[100]
+        told = page.evaluate("[...document.querySelectorAll('.chart')].map((c) => c.innerText)")
+        assert [f"{errors[k]:.3g}" in told[0].replace("\n", " ") for k in (1, 2, 3)] == [True] * 3
+        assert f"V {run.lyapunov[100]:.3g}" in told[1].replace("\n", " ")
+        assert "slope promised, \u22120.5 1/s" in told[0]
+        assert "slope promised, \u22121 1/s" in told[1]
+
+
+def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser, run, file):
+    with opened(browser, file) as page:
+        seek(page, 60)
+        x, y = page.evaluate("echelon.whereOnScreen(2)")
+        box = page.locator("#scene").bounding_box()
+        page.mouse.click(box["x"] + x, box["y"] + y)
+        until(lambda: page.locator(".card").is_visible())
+        card = page.locator(".card").inner_text()
+        assert card.startswith("follower 2\n") and "hears 0" in card
+        error = run.formation_errors[60, 2]
+        assert f"{error:.3g}"[:4] in card
+
+
+# ---- how it is used ---------------------------------------------------------------------------
+
+
+def test_keys_the_slider_and_a_chart_move_the_time_and_play_lets_it_run(browser, file):
+    with opened(browser, file) as page:
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate("echelon.run.moment.time") == pytest.approx(0.1, abs=1e-6)
+        page.keyboard.press("End")
+        assert page.evaluate("echelon.frame") == 300
+        area = page.locator(".chart .area").first.bounding_box()
+        page.mouse.click(area["x"] + 46, area["y"] + 20)
+        assert page.evaluate("echelon.frame") == pytest.approx(0.0, abs=2.0)
+        page.keyboard.press(" ")
+        until(lambda: page.evaluate("echelon.frame") > 10)
+        page.keyboard.press(" ")
+        stopped = page.evaluate("echelon.frame")
+        assert not page.evaluate("echelon.player.playing") and stopped < 300
+
+
+def test_the_camera_follows_an_agent(browser, file):
+    with opened(browser, file) as page:
+        page.get_by_label("what the camera follows").select_option("3")
+        places = []
+        for frame in (0, 120):
+            seek(page, frame)
+            page.evaluate("echelon.player.view.render()")
+            places.append(page.evaluate("echelon.whereOnScreen(3)"))
+        assert places[0] == pytest.approx(places[1], abs=0.5)
+
+
+@pytest.mark.parametrize(("width", "height"), [(420, 800), (1600, 900)])
+def test_nothing_is_cut_off_on_narrow_and_wide_screens(browser, file, width, height):
+    with opened(browser, file, width, height) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for name in ("header", "#scene", "#play", "#scrub"):
+            box = page.locator(name).bounding_box()
+            assert box["x"] >= 0 and box["x"] + box["width"] <= width + 0.5
+            assert box["width"] > 10 and box["height"] > 10
+
+
+def test_a_name_cannot_become_code(browser, run, tmp_path):
+    name = "</title><script>window.broken = 1</script><b>&amp;"
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(dataclasses.replace(run, name=name)), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        assert page.locator("h1").inner_text() == name
+        assert not page.evaluate("window.broken")
+
+
+# ---- a run that is being computed ----
+
+
+def parts_of(run, cuts):
+    """The stretches of a run between frames."""
+    names = ("times", "states", "inputs", "errors", "lyapunov")
+    for a, b in itertools.pairwise(cuts):
+        yield dataclasses.replace(run, **{name: getattr(run, name)[a:b] for name in names})
+
+
+def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_end(browser, run):
+    growing = Growing(run)
+    first, second, third = parts_of(run, (0, 90, 91, 301))
+    with serving(serve_growing(growing, 0)) as address, opened(browser, address) as page:
+        assert page.evaluate("echelon.run.growing") and page.evaluate("echelon.last") == 0
+        growing.add(first)
+        until(lambda: page.evaluate("echelon.last") == 89)
+        # Who looks at the newest frame goes on to.
+        assert page.evaluate("echelon.frame") == 89
+        assert f"Computed until {run.times[89]:.1f} of" in page.locator(".notes").inner_text()
+        growing.add(second)
+        until(lambda: page.evaluate("echelon.last") == 90)
+        seek(page, 40)
+        growing.add(third)
+        until(lambda: page.evaluate("echelon.last") == 300)
+        assert page.evaluate("echelon.frame") == 40
+        for frame in (0, 40, 89, 90, 91, 300):
+            seek(page, frame)
+            assert page.evaluate("echelon.run.moment.time") == pytest.approx(run.times[frame])
+            for agent in (0, 3):
+                place = run.states[frame, agent, :3]
+                assert page.evaluate(f"echelon.position({agent})") == pytest.approx(place, abs=6e-5)
+        seek(page, 120)
+        chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
+        assert f"V {run.lyapunov[120]:.3g}" in chart and "slope promised, −1 1/s" in chart
+        with page.expect_navigation():
+            growing.finish(run)
+        # A time in between, so that the frame is rounded.
+        shown = "Math.round(window.echelon?.frame) === 120 && !echelon.run.growing"
+        until(lambda: page.evaluate(shown))
+
+
+# ---- other models -----------------------------------------------------------------------------
+
+
+def line(names, position, agents=3, n=2):
+    """Agents whose states swing, and settle, for spaces without three axes."""
+    times = np.linspace(0.0, 4.0, 101)
+    states = np.exp(-times)[:, None, None] * np.ones((1, agents, n))
+    states = states * np.arange(1, agents + 1)[None, :, None] + np.sin(times)[:, None, None]
+    return recorded(
+        states,
+        np.zeros((101, agents, 1)),
+        times,
+        np.zeros((agents, n)),
+        names=names,
+        position=position,
+        bounds=None,
+        model="Own",
+    )
+
+
+OTHERS = {
+    "plane": (line(("x", "y", "heading"), (0, 1), n=3), "plane", "car"),
+    "side": (line(("y", "z", "roll"), (0, 1), n=3), "plane", "birotor"),
+    "phase": (line(("angle", "rate"), ()), "phase", "dot"),
+    "time": (line(("x", "vx"), (0,)), "time", "dot"),
+    "point": (line(("x", "y", "z"), (0, 1, 2), n=3), "space", "ball"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_models_are_drawn_in_their_own_space(browser, name, tmp_path):
+    run, kind, shape = OTHERS[name]
+    space = space_of(run)
+    assert (space.kind, space.shape) == (kind, shape)
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(run), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        seek(page, 40)
+        shown = np.array([page.evaluate(f"echelon.position({k})") for k in range(3)])
+        wanted = run.states[40][:, list(space.axes)]
+        if kind == "time":
+            wanted = np.column_stack([np.full(3, run.times[40]), wanted])
+        k = min(2, wanted.shape[1])
+        stretched = wanted[:, :k] * space.stretch
+        np.testing.assert_allclose(shown[:, :k], stretched, atol=2e-4)
+        for agent in range(3):
+            x, y = page.evaluate(f"echelon.whereOnScreen({agent})")
+            box = page.locator("#scene").bounding_box()
+            assert 0 <= x <= box["width"] and 0 <= y <= box["height"]
+
+
+def test_a_turn_in_the_plane_goes_from_the_first_axis_to_the_second(browser, tmp_path):
+    run = OTHERS["side"][0]
+    path = tmp_path / "run.html"
+    path.write_text(replay_page(run), "utf-8")
+    with opened(browser, path.as_uri()) as page:
+        seek(page, 20)
+        angle = run.states[20, 1, 2]
+        np.testing.assert_allclose(
+            rotation(page.evaluate("echelon.turn(1)")), about(2, angle), atol=1e-3
+        )
+
+
+# ---- data -------------------------------------------------------------------------------------
+
+
+def unpacked(block):
+    """What `pack` made, read by a second implementation."""
+    raw = zlib.decompress(block)
+    (length,) = struct.unpack("<I", raw[:4])
+    header, at, found = json.loads(raw[4 : 4 + length]), 4 + length, {}
+    for name, group in header["groups"].items():
+        shape = (len(group["low"]), group["frames"])
+        size = shape[0] * shape[1]
+        d = np.frombuffer(raw, np.uint8, size * group["bytes"], at).astype(np.int64)
+        at += size * group["bytes"]
+        d = d[:size] + (d[size:] << 8 if group["bytes"] == 2 else 0)
+        q = np.cumsum(d.reshape(shape), axis=1) % 256 ** group["bytes"]
+        found[name] = np.array(group["low"]) + q.T * np.array(group["step"])
+    assert at == len(raw)
+    return header, found
+
+
+def test_numbers_come_back_within_half_a_step_of_their_own_range():
+    rng = np.random.default_rng(1)
+    values = np.cumsum(rng.normal(size=(200, 5)), axis=0) * np.geomspace(1e-6, 1e6, 5)
+    values[:, 4] = 3.0
+    _, found = unpacked(pack({}, {"fine": Group(values), "byte": Group(values, 255)}))
+    reach = np.ptp(values, axis=0)
+    for name, levels in (("fine", 65535), ("byte", 255)):
+        off = np.abs(found[name] - values).max(axis=0)
+        assert (off <= 0.5001 * reach / levels + 1e-8 * np.abs(values).max(axis=0)).all()
+
+
+def test_frames_are_at_most_50_a_second_and_end_with_the_last(run):
+    fast = flown(seconds=1.005, rate=200.0)
+    frames = frames_of(fast)
+    assert fast.times[frames[1]] == pytest.approx(0.02)
+    assert frames[-1] == len(fast.times) - 1
+    assert list(frames_of(run)) == list(range(301))
+
+
+def test_four_agents_for_a_minute_take_less_than_half_a_megabyte():
+    assert len(replay_page(flown(seconds=60.0))) <= 0.5e6
+
+
+@pytest.mark.slow
+def test_a_thousand_agents_for_20_s_take_less_than_three_megabytes():
+    assert len(replay_page(flown(1000, 20.0, leaders=tuple(range(0, 1000, 25))))) <= 3e6
+
+
+def test_agents_that_fly_away_spoil_neither_the_scale_nor_the_rest():
+    run = flown()
+    states = run.states.copy()
+    states[200:, 3] *= 1e200
+    gone = dataclasses.replace(run, states=states)
+    space = space_of(gone)
+    assert space.clipped and (space.high - space.low).max() < 20.0
+    header, found = unpacked(replay_data(gone))
+    assert "stand still" in " ".join(header["notes"])
+    places = found["positions"].reshape(-1, 4, 3)
+    np.testing.assert_allclose(places[:200], run.states[:200, :, :3], atol=1e-3)
+
+
+def test_a_run_without_frames_is_refused(run):
+    empty = {name: getattr(run, name)[:0] for name in ("times", "states", "inputs", "errors")}
+    with pytest.raises(OutputError, match="no stored frame"):
+        replay_data(dataclasses.replace(run, **empty))
+
+
+# ---- the command and the server ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """A run on disk, of one second."""
+    from runs import simulate
+
+    import echelon as ech
+
+    graph = ech.Graph.path(3)
+    model = ech.models.SingleIntegrator(dimension=2)
+    gain = ech.gains.FixedGain("identity", coupling=2.0)
+    result = simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {1: [1, 0], 2: [2, 0]}),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(ech.synthesize(model, graph, gain), "relay"),
+        initial={"position": 1.0},
+        horizon=1.0,
+        dt=0.01,
+    )
+    path = tmp_path_factory.mktemp("stored") / "run.nc"
+    ech.save_dataset(result, path)
+    return result, path
+
+
+def test_what_is_read_from_a_file_is_what_ran(stored):
+    result, _ = stored
+    run = recording(dataset(result))
+    np.testing.assert_array_equal(run.states, result.states)
+    np.testing.assert_array_equal(run.errors, result.errors)
+    assert run.position == (0, 1) and run.unit == "m"
+    assert run.heard.tolist() == [[False, True], [True, True]] and run.schedule is None
+    assert run.nearest.tolist() == list(result.graph.nearest_leader())
+    assert run.modes is not None and run.modes.poles.real.max() < 0.0
+
+
+def test_view_writes_one_file_and_replaces_none_unasked(echelon, stored):
+    code, told, _ = echelon("view", stored[1], "--html", "out.html")
+    assert code == 0 and told.startswith("- Written to out.html: 0.2")
+    code, _, fault = echelon("view", stored[1].parent, "--html", "out.html")
+    assert code == 2
+    assert fault == (
+        "echelon: the file `out.html` exists; choose another, or `--force` to replace it.\n"
+    )
+    assert echelon("view", stored[1].parent, "--html", "out.html", "--force")[0] == 0
+
+
+BAD = {
+    "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
+    "no run": (".", "the folder `.` holds no `run.nc`, and so no run."),
+    "damaged": ("junk.nc", "`junk.nc` cannot be read as a run: it is damaged, or was not written"),
+    "older": ("old.nc", "`old.nc`: the run was written in format 1 by echelon "),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_run_is_refused_in_a_sentence(echelon, here, stored, name):
+    import xarray as xr
+
+    (here / "junk.nc").write_bytes(stored[1].read_bytes()[:3000])
+    with xr.open_dataset(stored[1], engine="h5netcdf") as data:
+        old = data.load()
+    del old.attrs["format"]
+    old.to_netcdf(here / "old.nc", engine="h5netcdf")
+    given, sentence = BAD[name]
+    code, _, fault = echelon("view", given, "--html", "out.html")
+    assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1
+    assert not (here / "out.html").exists()
+
+
+class Shown(Handler):
+    page = b"<html>"
+
+
+def answer(address, **headers):
+    request = urllib.request.Request(address, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as got:
+            return got.status, got.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def test_only_pages_of_this_server_are_answered_and_a_port_in_use_is_left(browser):
+    first = serve(Shown, 0)
+    port = first.server_address[1]
+    with serving(first) as address, serving(serve(Shown, port)) as other:
+        assert other != address
+        assert answer(address) == (200, b"<html>")
+        own = address.rstrip("/")
+        assert answer(address, Origin=own)[0] == 200
+        assert answer(address, Origin="http://example.org")[0] == 403
+        assert answer(address, Host="example.org")[0] == 403
+        assert answer(address, Host=f"example.org:{port}")[0] == 403
+        assert answer(address + "else")[0] == 404
+
+
+def test_a_page_that_is_served_is_drawn_too(browser, run):
+    class Page(Handler):
+        page = replay_page(run).encode()
+
+    with serving(serve(Page, 0)) as address, opened(browser, address) as page:
+        assert page.evaluate("echelon.last") == 300
+
+
+def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_lost(run):
+    told = {"promised": True, "sentence": "Promised.", "theorem": None, "kind": "linearization"}
+    slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
+    assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
+    turns = promise_badge(told | {"rate": 0.452, "slowest_mode": -1.32})
+    assert "0.452 1/s is kept whichever graph holds" in turns["whole"]
+    promise = dict(run.promise) | told | {"rate": 0.5, "slowest_mode": -0.5}
+    for outcome, state in (("completed", "holds"), ("left_chart", "lost"), ("diverged", "lost")):
+        ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}
+        drawn = dataclasses.replace(run, promise=promise, attributes=ended)
+        assert header(drawn, space_of(run))["promise"]["state"] == state

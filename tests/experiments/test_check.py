@@ -1,0 +1,511 @@
+"""`check`: the finite condition, the region's lines, and a promise no larger than its argument."""
+
+import dataclasses
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import echelon as ech
+from echelon.core.linear import longest_step
+from echelon.core.numerics import precision
+from echelon.core.statement import Hypothesis
+from echelon.core.words import Kind, Theorem, Verdict
+from echelon.experiments.studies.finite_condition import pair_values
+from echelon.experiments.studies.killing_residual import killing_residual
+
+PATH = ech.Graph.path(4)
+LOW, _, HIGH = PATH.spectrum().eigenvalues
+
+
+class Line1(ech.ControlAffine):
+    """x' = slope x + u."""
+
+    slope: float = -1.0
+    state_names = ("x",)
+    input_names = ("u",)
+
+    def drift(self, x):
+        return self.slope * x
+
+    def input_map(self, x):
+        return jnp.ones((1, 1), x.dtype)
+
+
+class Weakening(ech.models.Pendulum):
+    """A pendulum whose input loses strength away from the trim."""
+
+    def input_map(self, x):
+        return jnp.stack([0.0 * x[0], jnp.cos(x[0])])[:, None]
+
+
+def scenario(follower, **sections):
+    told = {
+        "name": "mine",
+        "model": {"name": "pendulum"},
+        "graph": {"name": "path", "agents": 4},
+        "leader": {"law": "passive"},
+        "follower": follower,
+        "simulation": {"horizon": 2.0, "dt": 0.01},
+    }
+    return ech.scenario_from_mapping(told | sections)
+
+
+def checked(follower, **sections):
+    return lines_of(ech.build(scenario(follower, **sections)))
+
+
+ROBUST = {"gain": {"method": "robust-lqr", "domain": {"angle": 0.5}}}
+
+
+@pytest.fixture(scope="module")
+def robust():
+    """The parts of a pendulum with a region, its leader at rest, and their settings."""
+    return ech.build(scenario(ROBUST))
+
+
+def lines_of(built):
+    found = ech.check(*built)
+    return {line.name: line for line in found.lines}, found.promise
+
+
+def with_gain(built, gain, **changes):
+    """The same under another gain, perhaps with another model."""
+    parts = built.parts
+    follower = dataclasses.replace(parts.drive.follower, gain=gain)
+    drive = dataclasses.replace(parts.drive, follower=follower)
+    return built._replace(parts=parts.replace(drive=drive, **changes))
+
+
+def with_claim(built, **changes):
+    """The same under a gain that says something else of its region."""
+    gain = built.parts.drive.gain
+    region = dataclasses.replace(gain.certificate.region, **changes)
+    certificate = dataclasses.replace(gain.certificate, region=region)
+    return with_gain(
+        built, ech.Gain(gain.P, gain.R, gain.coupling, gain.method, certificate, gain.inner)
+    )
+
+
+# ---- the finite condition ----
+
+
+def goals(*offsets):
+    return ech.Formation([[offset] for offset in offsets])
+
+
+def test_the_sign_is_that_of_goals_that_pull_together():
+    # f = -x: (1 - 0) P (-1 - 0) = -P; the paper's d_ij = xi_j - xi_i would turn it.
+    good = ech.finite_condition(np.eye(1) * 2.0, Line1(-1.0), goals(0.0, 1.0))
+    assert (good.verdict, good.largest, good.least) == (Verdict.HOLDS, pytest.approx(-2.0), 2.0)
+    bad = ech.finite_condition(np.eye(1) * 2.0, Line1(0.5), goals(0.0, 1.0, 3.0))
+    assert (bad.verdict, bad.largest) == (Verdict.FAILS, pytest.approx(9.0))
+    assert set(bad.pair) == {0, 2} and bad.agents == 3
+
+
+def test_goals_that_f_does_not_tell_apart_make_it_empty():
+    agent = ech.models.Quadrotor()
+    formation = ech.Formation.from_offsets(agent, PATH, {1: (1, 0, 0), 2: (0, 3, 0)})
+    assert ech.finite_condition(np.eye(12), agent, formation).verdict is Verdict.VACUOUS
+    # Smaller than I it is refused even then, and a multiple of it is not.
+    assert ech.finite_condition(0.5 * np.eye(12), agent, formation).verdict is Verdict.FAILS
+
+
+@given(st.integers(0, 10**6), st.floats(0.1, 10.0))
+@settings(max_examples=20, deadline=None)
+def test_the_condition_is_linear_in_p(seed, factor):
+    rng = np.random.default_rng(seed)
+    A, d = rng.normal(size=(3, 3)), rng.normal(size=(5, 5, 3))
+    f = d @ A.T
+    P, Q = ((M @ M.T) + np.eye(3) for M in rng.normal(size=(2, 3, 3)))
+    both = pair_values(P, d, f) + factor * pair_values(Q, d, f)
+    assert pair_values(P + factor * Q, d, f) == pytest.approx(both, rel=1e-9, abs=1e-9)
+    model = ech.models.Linear(A=A.tolist(), B=np.eye(3).tolist())
+    formation = ech.Formation(rng.normal(size=(5, 3)))
+    verdicts = [ech.finite_condition(M, model, formation).verdict for M in (P, Q, P + Q)]
+    # What two pass, their sum passes.
+    assert verdicts[:2] != [Verdict.HOLDS] * 2 or verdicts[2] is Verdict.HOLDS
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=10, deadline=None)
+def test_the_largest_pair_is_the_largest(seed):
+    rng = np.random.default_rng(seed)
+    A, xi = rng.normal(size=(2, 2)), rng.normal(size=(150, 2))
+    found = ech.finite_condition(
+        np.eye(2), ech.models.Linear(A=A.tolist(), B=[[0.0], [1.0]]), ech.Formation(xi)
+    )
+    pairs = [(xi[i] - xi[j]) @ A @ (xi[i] - xi[j]) for i in range(150) for j in range(i)]
+    assert found.largest == pytest.approx(max(pairs), rel=1e-9)
+    i, j = found.pair
+    assert (xi[i] - xi[j]) @ A @ (xi[i] - xi[j]) == pytest.approx(max(pairs), rel=1e-9)
+
+
+def test_a_swarm_is_compared_by_a_thousand_of_its_agents():
+    found = ech.finite_condition(np.eye(1), Line1(-1.0), goals(*np.linspace(0.0, 1.0, 5000)))
+    assert (found.verdict, found.agents) == (Verdict.HOLDS, 1000)
+
+
+def test_a_p_of_another_size_or_sign_is_refused():
+    with pytest.raises(ech.EchelonError, match=r"^`P` has shape \(2, 2\), and `Line1` needs"):
+        ech.finite_condition(np.eye(2), Line1(), goals(0.0, 1.0))
+    with pytest.raises(ech.EchelonError, match="not positive definite"):
+        ech.finite_condition(-np.eye(1), Line1(), goals(0.0, 1.0))
+
+
+# ---- the region and the set ----
+
+
+def test_the_region_is_told_and_the_promise_says_it(robust):
+    lines, found = lines_of(robust)
+    region = robust.parts.drive.gain.certificate.region
+    assert lines["region of the gain"].verdict is Verdict.HOLDS
+    assert lines["region of the gain"].kind is region.kind is Kind.VERTICES
+    assert lines["region of the gain"].number == region.rate
+    assert lines["region of the gain"].shown == f"{region.rate:.3g} 1/s"
+    assert found.promised and "corners of a hull" in found.sentence()
+    assert f"{region.rate:.3g} 1/s or faster" in found.sentence() and "(T1)" in found.sentence()
+    assert f"<= {region.radius:.3g}^2" in found.sentence()
+    assert (found.theorem, found.kind, found.rate) == (Theorem.T1, Kind.VERTICES, region.rate)
+
+
+def test_no_point_of_the_certified_set_leaves_the_domain(robust):
+    lines, _ = lines_of(robust)
+    radius, P = lines["certified set"].number, robust.parts.drive.gain.P
+    angles = np.linspace(0.0, 2.0 * np.pi, 4001)
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    edge = radius * np.linalg.solve(np.linalg.cholesky(P).T, circle.T)
+    assert np.abs(edge[0]).max() == pytest.approx(0.5, rel=5e-3)
+
+
+def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
+    error = {"angle": 0.1, "rate": 0.3}
+    lines, found = checked(ROBUST, leader={"law": "passive", "start_error": error})
+    model = robust.parts.model
+    solved = scipy.integrate.solve_ivp(
+        lambda t, x: np.asarray(model.drift(jnp.asarray(x))),
+        (0.0, 2.0),
+        [0.1, 0.3],
+        rtol=1e-8,
+        t_eval=np.linspace(0.0, 2.0, 201),
+    )
+    reach = np.abs(solved.y[0]).max()
+    assert 0.1 < reach < 0.5
+    alone, _ = lines_of(robust)
+    share = lines["certified set"].number / alone["certified set"].number
+    assert share == pytest.approx((0.5 - reach) / 0.5, rel=2e-2)
+    assert lines["certified set"].kind is Kind.SAMPLES
+    assert "as in a run of its own" in found.sentence()
+
+
+def test_a_leader_that_leaves_the_domain_leaves_no_set():
+    lines, found = checked(ROBUST, leader={"law": "passive", "start_error": {"angle": 0.6}})
+    line = lines["certified set"]
+    assert (line.verdict, line.shown, line.number) == (Verdict.FAILS, "empty", 0.0)
+    assert "the leader alone reaches 0.6 in `angle`, and the domain 0.5" in line.text
+    assert "no start is certified" in found.sentence()
+
+
+class Yielding(ech.models.Pendulum):
+    """A pendulum whose weight gives way, by a function that has no enclosure."""
+
+    def drift(self, x):
+        return jnp.stack([x[1], -jax.scipy.special.erf(x[0]) - self.damping * x[1]])
+
+
+@pytest.mark.parametrize(
+    ("model", "method", "told", "untold"),
+    [
+        (ech.models.Pendulum(), ech.gains.RobustLQR({"angle": 0.5}, exact=True), "Proved", "seen"),
+        (ech.models.Pendulum(), ech.gains.RobustLQR({"angle": 0.5}), "corners of a hull", "Proved"),
+        (Yielding(), ech.gains.RobustLQR({"angle": 0.5}), "Seen at samples, which is no", "Proved"),
+        (Weakening(), ech.gains.RobustLQR({"angle": 0.2}), "small errors shrink", "any start"),
+        (ech.models.Pendulum(), ech.gains.Riccati(), "no region is proved", "errors shrink"),
+        (ech.models.Pendulum(), ech.gains.Monotone({"angle": 0.5}), "V does not rise", "shrink"),
+    ],
+)
+def test_the_promise_is_as_strong_as_its_argument(robust, model, method, told, untold):
+    built = with_gain(robust, ech.synthesize(model, PATH, method), model=model)
+    found = ech.promise(*built)
+    assert found.promised and told in found.sentence() and untold not in found.sentence()
+    assert not found.hypotheses[Hypothesis.CLAIMS].fails
+
+
+@pytest.mark.parametrize("coupling", [1e13, 1e11])
+def test_margins_are_not_asked_for_where_rounding_hides_the_slowest_mode(coupling):
+    strong = {"gain": {"method": "riccati", "coupling": coupling}}
+    lines, _ = checked(strong, model={"name": "double-integrator"})
+    assert "rounding hides" in lines["margins"].text and "gain margin" not in lines
+
+
+def test_why_a_proof_became_samples_is_said(robust):
+    model, wanted = Yielding(), "no more than samples, since "
+    gain = ech.synthesize(model, PATH, ech.gains.RobustLQR({"angle": 0.5}, exact=True))
+    lines, _ = lines_of(with_gain(robust, gain, model=model))
+    assert wanted in lines["region of the gain"].text
+    assert "erf" in lines["region of the gain"].text.partition(wanted)[2]
+    assert "erf" in gain.certificate.region.why
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rate": 5.0},
+        {"kind": Kind.SAMPLES},
+        {"theorem": Theorem.T2},
+        {"hull": np.array([[[-9.0, 0.0], [0.0, -9.0]]]), "rate": 9.0},
+    ],
+)
+def test_what_a_gain_says_of_itself_is_not_believed_but_compared(robust, changes):
+    true, found = (ech.promise(*each) for each in (robust, with_claim(robust, **changes)))
+    assert (found.theorem, found.kind, found.rate) == (true.theorem, true.kind, true.rate)
+    told = [key for key in changes if key != "hull"]
+    assert found.hypotheses[Hypothesis.CLAIMS].fails is bool(told)
+    assert "Note: the gain says" in found.sentence() and "Note" not in true.sentence()
+
+
+def test_where_only_the_drift_is_known_the_set_pays_for_the_graph_if_g_varies(robust):
+    radii = {}
+    for model in (ech.models.Pendulum(), Weakening()):
+        gain = ech.synthesize(model, PATH, ech.gains.Monotone({"angle": 0.5}))
+        lines, _ = lines_of(with_gain(robust, gain, model=model))
+        radii[type(model)] = lines["certified set"].number
+        W = np.linalg.inv(gain.P)
+        whole = 0.5 / np.sqrt(W[0, 0])
+        assert gain.certificate.region.radius == pytest.approx(radii[type(model)])
+    assert radii[ech.models.Pendulum] == pytest.approx(whole)
+    assert radii[Weakening] == pytest.approx(whole * np.sqrt(LOW / HIGH), rel=5e-3)
+
+
+def test_a_linear_agent_is_certified_everywhere():
+    model = {"name": "linear", "parameters": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}
+    gain = {"method": "contraction", "domain": {}, "rate": 0.2}
+    lines, found = checked({"gain": gain}, model=model)
+    assert lines["certified set"].shown == "radius inf" and "from everywhere" in found.sentence()
+
+
+# ---- what g does ----
+
+
+def test_turning_the_input_stretches_distances_by_half():
+    # g S = (cos, -sin; sin, cos; 0, 1/l): dg_k/dheading is a unit vector, so in P = diag(1, 1, w)
+    # it stretches by half of 1 / sqrt(w), whatever the heading is.
+    agent = ech.models.UnicyclePoint()
+    domain = ech.certificates.Domain.about(agent, {"heading": 1.0})
+    for weight in (0.25, 1.0, 9.0):
+        with precision("float64"):
+            found, kind = killing_residual(agent, np.diag([1.0, 1.0, weight]), domain)
+        assert (found, kind) == (pytest.approx(0.5 / np.sqrt(weight)), Kind.SAMPLES)
+
+
+def test_a_constant_input_map_is_a_proof():
+    agent = ech.models.QuadrotorThrust()
+    domain = ech.certificates.Domain.about(agent, {"attitude": 0.3, "thrust": 1.0})
+    with precision("float64"):
+        assert killing_residual(agent, np.eye(13), domain) == (0.0, Kind.PROOF)
+
+
+def test_a_skew_input_is_killing_in_the_metric_that_it_turns():
+    class Turning(ech.ControlAffine):
+        state_names = ("x", "y")
+        input_names = ("spin",)
+
+        def drift(self, x):
+            return -x
+
+        def input_map(self, x):
+            return jnp.stack([-2.0 * x[1], x[0]])[:, None]
+
+    domain = ech.certificates.Domain.about(Turning(), {"x": 1.0, "y": 1.0})
+    with precision("float64"):
+        assert killing_residual(Turning(), np.diag([1.0, 2.0]), domain)[0] == pytest.approx(0.0)
+        assert killing_residual(Turning(), np.eye(2), domain)[0] == pytest.approx(0.5)
+
+
+# ---- the step ----
+
+
+def test_a_held_integrator_bears_two_time_constants():
+    one = np.eye(1)
+    for k in (0.5, 3.0):
+        assert longest_step(0.0 * one, one, [k * one, 0.1 * k * one]) == pytest.approx(2.0 / k)
+    # x' = -x - k x(t_k): e^-h - k (1 - e^-h) > -1, h < log((k + 1) / (k - 1)).
+    assert longest_step(-one, one, [3.0 * one]) == pytest.approx(np.log(2.0), rel=1e-4)
+    assert longest_step(-one, one, [0.5 * one]) == np.inf
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.99, Verdict.HOLDS), (1.01, Verdict.FAILS)])
+def test_a_step_too_long_for_the_gain_takes_the_promise_away(share, verdict):
+    gain = {"method": "given", "P": "identity", "coupling": 1.0}
+    dt = share * 2.0 / float(HIGH)
+    lines, found = checked(
+        {"gain": gain},
+        model={"name": "single-integrator"},
+        simulation={"horizon": 16 * dt, "dt": dt},
+    )
+    assert lines["step, input held"].verdict is verdict
+    assert found.promised is (verdict is Verdict.HOLDS)
+    if not found.promised:
+        assert "with the input held over the step `dt` it grows" in found.sentence()
+
+
+# ---- who is promised nothing ----
+
+
+def test_followers_that_ignore_each_other_are_promised_nothing():
+    _, found = checked({"law": "passive"})
+    assert not found.promised
+    assert found.sentence() == (
+        "Nothing is promised: the followers' law does not act on the disagreement. What would "
+        "help: use `consensus`."
+    )
+
+
+def test_a_law_without_its_trim_input_is_promised_nothing():
+    step = {"horizon": 1.0, "dt": 0.002}
+    quadrotor = {"model": {"name": "planar-quadrotor"}, "simulation": step}
+    lines, found = checked({"trim": False}, **quadrotor)
+    assert lines["Definition 1, f(0) = 0"].verdict is Verdict.FAILS and not found.promised
+    assert "leaves out the trim input" in found.sentence()
+    lines, found = checked({}, **quadrotor)
+    assert lines["Definition 1, f(0) = 0"].verdict is Verdict.HOLDS and found.promised
+
+
+def test_wind_and_another_plant_are_left_out_of_the_promise_and_said_to_be():
+    wind = {"disturbance": {"rms": {"rate": 0.1}}}
+    plant = {"plant": {"scale": {"damping": 1.1}}}
+    lines, calm = checked({})
+    assert lines["Assumption 3, exact states"].verdict is Verdict.HOLDS
+    assert "without" not in calm.sentence()
+    for sections, told in ((wind, "wind or noise acts"), (plant, "differ from the model")):
+        lines, found = checked({}, **sections)
+        assert lines["Assumption 3, exact states"].verdict is Verdict.FAILS
+        assert found.promised and told in found.sentence()
+
+
+def test_every_failure_says_what_to_change():
+    for name in ("paper-literal", "paper"):
+        found = ech.check(*ech.build(ech.load_scenario(name)))
+        for line in found.lines:
+            assert line.statement
+            assert isinstance(line.kind, Kind) and isinstance(line.verdict, Verdict)
+            assert line.text, line.statement
+
+
+# ---- other lines ----
+
+
+def test_a_long_path_says_which_eigenvalues_it_looked_at():
+    graph = {"name": "path", "agents": 601}
+    lines, found = checked({"gain": {"method": "riccati"}}, graph=graph,
+                           model={"name": "single-integrator"},
+                           simulation={"horizon": 1.0, "dt": 1e-6})  # fmt: skip
+    assert lines["disagreement decays"].text == "at lambda_min and lambda_max; all between decay"
+    assert lines["delay margin"].text.endswith("lambda_min, lambda_max and 30 values between them")
+    assert found.promised
+
+
+def test_a_pushed_integrator_lags_by_its_slowest_mode():
+    gain = {"method": "given", "P": "identity", "coupling": 3.0}
+    lines, _ = checked({"gain": gain}, model={"name": "single-integrator"})
+    for statement in ("disturbance, network", "disturbance, one mode"):
+        values = [float(part.split()[1]) for part in lines[statement].shown.split(", ")]
+        assert values == pytest.approx([1.0 / (3.0 * LOW)] * len(values), rel=5e-3)
+        assert lines[statement].number == pytest.approx(1.0 / (3.0 * LOW), rel=1e-6)
+
+
+def test_a_chain_of_integrators_passes_on_what_it_gets():
+    gain = {"method": "given", "P": "identity", "coupling": 2.0}
+    model = {"name": "single-integrator"}
+    lines, _ = checked({"gain": gain}, model=model)
+    assert lines["string gain"].shown == "1, 1 over 3 links"
+    assert lines["string gain"].verdict is Verdict.NOT_NEEDED
+    lines, _ = checked({"gain": gain}, model=model, graph={"name": "ring", "agents": 4})
+    assert "string gain" not in lines
+
+
+def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
+    # Riccati for a chain of ten on the coupling of one link: A - c B K alone must decay.
+    follower = {"gain": {"method": "riccati", "coupling": 1.0}, "feedforward": "parent"}
+    graph = {"name": "path", "agents": 11}
+    lines, found = checked(follower, model={"name": "double-integrator"}, graph=graph)
+    assert found.promised
+    assert lines["coupling"].shown == "c 1, edge 0.5"
+    # Q = R = I on (x, v): s^2 + sqrt(3) s + 1, whose roots have real part -sqrt(3)/2.
+    assert lines["disagreement decays"].number == pytest.approx(-(3.0**0.5) / 2.0)
+    assert found.rate == pytest.approx(3.0**0.5 / 2.0) and found.theorem is None
+    assert "disturbance, network" not in lines
+    lines, found = checked({**follower, "feedforward": "relay"},
+                           model={"name": "double-integrator"}, graph=graph)  # fmt: skip
+    assert lines["coupling"].verdict is Verdict.FAILS
+
+
+# ---- bad input ----
+
+
+def written(gain, model="planar-quadrotor"):
+    with open("mine.yaml", "w") as mine:
+        mine.write(
+            f"name: mine\nmodel: {{name: {model}}}\ngraph: {{name: path, agents: 3}}\n"
+            f"follower: {{gain: {{{gain}}}}}\nsimulation: {{horizon: 1.0, dt: 0.001}}\n"
+        )
+
+
+@pytest.mark.parametrize(
+    ("model", "gain", "sentence"),
+    [
+        ("quadrotor", "method: robust-lqr, domain: {pitch: 1.6}", "holds only inside (-1.571"),
+        ("pendulum", "method: robust-lqr, domain: {angle: [0.5, 0.2]}", "lower end below its up"),
+        ("pendulum", "method: robust-lqr, domain: {angle: [0.0, 0.0]}", "lower end below its up"),
+        ("pendulum", "method: given, P: [1.0, .nan]", "allowed is a finite"),
+        ("pendulum", "method: robust-lqr, domain: {angle: .inf}", "allowed is a finite"),
+    ],
+)
+@pytest.mark.parametrize("command", ["check", "design"])
+def test_bad_input_is_one_sentence(echelon, command, model, gain, sentence):
+    written(gain, model)
+    code, out, err = echelon(command, "mine.yaml")
+    assert code == 2 and out == ""
+    assert err.count("\n") == 1 and err.startswith("echelon: ") and sentence in err
+
+
+def test_a_gain_file_of_another_model_or_graph_is_refused_by_check(echelon):
+    written("method: riccati", "pendulum")
+    assert echelon("design", "mine.yaml", "--method", "riccati", "--out", "gain.json")[0] == 0
+    written("file: gain.json", "pendulum")
+    code, out, _ = echelon("check", "mine.yaml", "--json")
+    assert code == 0 and json.loads(out)["promise"]["promised"] is True
+    for change, sentence in (
+        ("agents: 5", "made for a graph of 3 agents"),
+        ("agents: 3", "was made for `Pendulum` with state_names"),
+    ):
+        written("file: gain.json", "van-der-pol" if change == "agents: 3" else "pendulum")
+        with open("mine.yaml") as mine:
+            text = mine.read().replace("agents: 3", change)
+        with open("mine.yaml", "w") as mine:
+            mine.write(text)
+        code, _, err = echelon("check", "mine.yaml")
+        assert code == 2 and sentence in err and err.count("\n") == 1
+
+
+def test_a_gain_from_a_file_keeps_its_region(echelon):
+    domain = "method: robust-lqr, domain: {angle: 0.5}"
+    written(domain, "pendulum")
+    before = json.loads(echelon("check", "mine.yaml", "--json")[1])
+    assert echelon("design", "mine.yaml", "--method", "robust-lqr", "--out", "gain.json")[0] == 0
+    written("file: gain.json", "pendulum")
+    after = json.loads(echelon("check", "mine.yaml", "--json")[1])
+    assert after == before and "(T1)" in after["promise"]["sentence"]
+
+
+def test_a_missing_solver_names_its_pip_line(echelon, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    written("method: robust-lqr, domain: {angle: 0.5}", "pendulum")
+    code, _, err = echelon("check", "mine.yaml")
+    assert code == 4 and "pip install" in err and err.count("\n") == 1

@@ -1,0 +1,192 @@
+"""The comparison of methods: alike in all but the law, and told truly."""
+
+import json
+import os
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.apps.cli.app import app
+from echelon.experiments.results.metrics import FollowerMetrics, LeaderMetrics, Metrics
+from echelon.experiments.studies.compare import LABELS, Comparison, Row
+from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
+
+LAWS = ("literal", "riccati-relay", "riccati", "inner-loop")
+SHORT = ["simulation.horizon=1.0"]
+
+
+@pytest.fixture(scope="module")
+def planar() -> Comparison:
+    return ech.compare(ech.load_scenario("planar-quadrotor", SHORT), only=LAWS)
+
+
+def flown(comparison):
+    return {row.label: row.flight.result for row in comparison.rows if row.flight is not None}
+
+
+def test_all_start_alike_and_have_the_same_limits(planar):
+    runs = list(flown(planar).values())
+    assert len(runs) == len(LAWS)
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.states[0], runs[0].states[0])
+        assert run.settings == runs[0].settings
+
+
+@pytest.mark.parametrize(
+    ("label", "changes"),
+    [
+        ("riccati-relay", []),
+        ("riccati", ["follower.feedforward=none"]),
+        ("inner-loop", ["follower.gain.method=inner-loop"]),
+        (
+            "literal",
+            [
+                "follower.gain={method: given, P: identity}",
+                "follower.feedforward=none",
+                "follower.trim=false",
+            ],
+        ),
+    ],
+)
+def test_each_row_is_the_run_that_its_label_names(planar, label, changes):
+    alone = ech.run(ech.load_scenario("planar-quadrotor", [*SHORT, *changes]))
+    # The same numbers but for the compiler's order of operations.
+    np.testing.assert_allclose(flown(planar)[label].states, alone.states, rtol=1e-9, atol=1e-9)
+
+
+def test_the_steady_window_is_shorter_than_the_run(planar):
+    assert planar.steady_window == pytest.approx(0.2)
+    assert planar.horizon == 1.0
+
+
+def test_the_paragraph_names_the_row_with_the_least_number(planar):
+    text = " ".join(verdict(planar))
+    whole = {row.label: row.whole for row in planar.rows}
+    best = min(whole, key=whole.__getitem__)
+    assert f"{best} has the smallest error over the whole run" in text
+    assert "do not bring every follower within 1 cm" in text
+
+
+def row_of(label, settles, effort, computing):
+    """A method of one follower, with the numbers that the paragraph reads."""
+    follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
+    numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
+    return Row(label, types.SimpleNamespace(computing=computing), numbers)
+
+
+def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():
+    rows = (
+        row_of("slow", None, 1.0, 1e-3),
+        row_of("a", 2.0, 5.0, 2e-3),
+        row_of("b", 3.0, 6.0, 9e-3),
+    )
+    text = " ".join(verdict(Comparison("mine", rows, 5.0, 1.0, ())))
+    assert "Of those that settle, a asks the least of the inputs (5; next b, 6)." in text
+    assert "Of those that settle, a takes the least computing, b 4 times as much." in text
+    text = " ".join(verdict(Comparison("mine", rows[1:], 5.0, 1.0, ())))
+    assert "Of those" not in text and "a asks the least of the inputs (5; next b, 6)." in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "labels"),
+    [
+        ([], ["riccati-relay"]),
+        (["follower.gain={method: inner-loop, coupling: 5.0}"], ["inner-loop-relay"]),
+        (["follower.feedforward=parent"], ["riccati-parent"]),
+        (["follower.gain={method: given, P: identity}"], ["given-relay"]),
+        (["follower.trim=false"], ["riccati-relay, own"]),
+    ],
+)
+def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
+    short = ["simulation.horizon=0.02", "report.steady_window=0.01"]
+    scenario = ech.load_scenario("planar-quadrotor", [*short, *changes])
+    found = ech.compare(scenario, only=("riccati-relay", "inner-loop", "own"))
+    assert [row.label for row in found.rows] == [
+        *("riccati-relay", "inner-loop"),
+        *(label for label in labels if label != "riccati-relay"),
+    ]
+    told = comparison_mapping(found)["methods"]
+    for row in found.rows:
+        result = row.flight.result
+        assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
+
+
+@pytest.mark.slow
+def test_a_law_of_ones_own_flies_beside_the_methods():
+    given = {
+        "name": "pendulums",
+        "model": {"name": "pendulum"},
+        "graph": {"name": "path", "agents": 3},
+        "follower": {
+            "gain": {"method": "monotone", "domain": {"angle": 0.5}},
+            "feedforward": "relay",
+        },
+        "initial": {"spread": {"angle": 0.2}},
+        "simulation": {"horizon": 0.5, "dt": 0.01},
+    }
+    found = ech.compare(ech.scenario_from_mapping(given))
+    assert [row.label for row in found.rows] == [*LABELS, "monotone-relay"]
+    reasons = {row.label: row.reason for row in found.rows if row.flight is None}
+    assert "inner-loop" in reasons
+    assert all(reason.endswith(".") for reason in reasons.values())
+
+
+def test_labels_are_whole_however_narrow_the_output_is(planar):
+    for width in (40, 60, 200):
+        text = comparison_report(planar, width)
+        for label in LAWS:
+            assert f"\n {label} " in text or f"\n{label} " in text
+
+
+def test_the_command_writes_numbers_text_runs_and_figures(tmp_path, capsys):
+    out = tmp_path / "here"
+    arguments = ["compare", "planar-quadrotor", "--horizon", "0.5", "--out", str(out), "--json"]
+    for label in ("riccati", "riccati-relay"):
+        arguments += ["--method", label]
+    app(arguments, standalone_mode=False)
+    told = json.loads(capsys.readouterr().out)
+    assert told == json.loads((out / "comparison.json").read_text())
+    assert list(told["methods"]) == ["riccati-relay", "riccati"]
+    assert told["horizon_s"] == 0.5
+    assert (out / "comparison.txt").read_text().startswith("planar-quadrotor")
+    assert {path.name for path in (out / "runs").iterdir()} == {"riccati-relay.nc", "riccati.nc"}
+    names = ("formation_error", "tracking_error", "approach")
+    assert {path.name for path in (out / "figures").iterdir()} == {
+        f"{name}.{kind}" for name in names for kind in ("png", "pdf")
+    }
+
+
+def test_two_scenarios_get_a_folder_each(tmp_path, capsys):
+    out = tmp_path / "both"
+    arguments = ["compare", "integrators", "van-der-pol", "--horizon", "0.1", "--no-figures"]
+    app([*arguments, "--method", "riccati", "--out", str(out)], standalone_mode=False)
+    assert sorted(path.name for path in out.iterdir()) == ["integrators", "van-der-pol"]
+    assert "what it takes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["compare", "paper", "--method", "riccati-realy"], "did you mean `riccati-relay`"),
+        (["compare", "paper", "--horizon", "0"], "simulation.horizon"),
+        (["compare", "paper", "paper"], "two scenarios have the name `paper`"),
+        (["compare", "papr"], "no such file exists"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_leaves_nothing(tmp_path, arguments, told):
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-m", "echelon", *arguments],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+    )
+    assert done.returncode == 2
+    assert told in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())

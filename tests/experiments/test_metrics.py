@@ -1,0 +1,170 @@
+"""The numbers of a run, against closed forms on made-up runs."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from runs import made_up, simulate
+
+import echelon as ech
+from echelon.core.errors import Outcome
+from echelon.experiments.results.metrics import formation_errors, metrics, output_errors
+
+
+@pytest.fixture
+def exponential():
+    """Two agents in space, the follower off by 2^-t (3, 0, 4) from its goal (1, 0, 0) ahead."""
+    model, graph = ech.models.SingleIntegrator(3), ech.Graph.path(2)
+    t = np.arange(21.0)
+    leader = np.column_stack([np.sin(t), t, 0 * t])
+    goal = leader + [1.0, 0.0, 0.0]
+    follower = goal + 2.0 ** -t[:, None] * [3.0, 0.0, 4.0]
+    offsets = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    return made_up(np.stack([leader, follower], axis=1), model, graph, offsets, window=2.0)
+
+
+def follower_moved(result, frame):
+    """The same run with the follower a metre off its path in one frame."""
+    states = result.states.copy()
+    states[frame, 1] += 1.0
+    return made_up(states, result.model, result.graph, result.formation.offsets, window=2.0)
+
+
+def test_formation_error_is_the_vector_to_the_goal(exponential):
+    t = exponential.times
+    assert np.allclose(formation_errors(exponential)[:, 1], 5.0 * 2.0**-t, rtol=1e-12)
+    assert not formation_errors(exponential)[:, 0].any()
+    numbers = metrics(exponential).followers[0]
+    # Steps begin at all frames but the last; two of them in the window of 2 s.
+    squares = 25.0 * 4.0 ** -t[:-1]
+    assert numbers.rmse == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-12)
+    assert numbers.steady_rmse == pytest.approx(np.sqrt(np.mean(squares[-2:])), rel=1e-9)
+
+
+def test_settling_time_is_when_one_centimetre_is_kept_for_good(exponential):
+    # 5 * 2^-8 = 0.0195 is above, 5 * 2^-9 = 0.0098 below.
+    assert metrics(exponential).followers[0].settling_time == 9.0
+    assert metrics(follower_moved(exponential, 15)).followers[0].settling_time == 16.0
+    assert metrics(follower_moved(exponential, 19)).followers[0].settling_time == 20.0
+    assert metrics(follower_moved(exponential, 20)).followers[0].settling_time is None
+
+
+def test_edge_error_is_that_of_the_distance(exponential):
+    offset = np.array([1.0, 0.0, 0.0]) + 2.0 ** -exponential.times[:, None] * [3.0, 0.0, 4.0]
+    expected = np.sqrt(np.mean((np.linalg.norm(offset[:-1], axis=1) - 1.0) ** 2))
+    numbers = metrics(exponential)
+    assert numbers.edges[0].edge == (0, 1)
+    assert numbers.edges[0].distance_rmse == pytest.approx(expected, rel=1e-12)
+    assert numbers.minimum_distance == pytest.approx(np.linalg.norm(offset, axis=1).min())
+
+
+def test_leader_error_by_output_with_the_heading_wound():
+    model, graph = ech.models.Unicycle(), ech.Graph.path(2)
+    reference = np.tile([1.0, 2.0, 3.1], (5, 1))
+    states = np.stack([reference + [0.3, 0.4, 2 * np.pi + 0.1], reference], axis=1)
+    result = made_up(states, model, graph, reference=reference)
+    numbers = metrics(result)
+    assert numbers.leader.rmse == pytest.approx(0.5)
+    by_output = numbers.leader.rmse_by_output
+    assert by_output["x"] == pytest.approx(0.3) and by_output["y"] == pytest.approx(0.4)
+    assert by_output["heading"] == pytest.approx(0.1)
+    assert np.allclose(output_errors(result), [[0.3, 0.4, 0.1]])
+
+
+@pytest.fixture(scope="module")
+def stored():
+    """The same saturating flight, with all frames stored and with few."""
+    model, graph = ech.models.PlanarQuadrotor(), ech.Graph.path(3)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati())
+
+    def fly(store_every):
+        return simulate(
+            model,
+            graph,
+            ech.Formation.line(model, graph),
+            leader=ech.laws.Tracking(ech.references.Circle(radius=1.0, rate=0.5)),
+            follower=ech.laws.Consensus(gain, feedforward="relay"),
+            initial={"position": 2.0},
+            horizon=12.0,
+            dt=0.02,
+            store_every=store_every,
+            seed=1,
+        )
+
+    return [fly(store_every) for store_every in (1, 7, 200)]
+
+
+def test_no_mean_depends_on_the_frames_that_are_stored(stored):
+    every, *few = map(metrics, stored)
+    assert every.followers[1].saturated > 0.0 and every.followers[1].effort > 0.1
+    for numbers in few:
+        for one, other in zip(every.followers, numbers.followers, strict=True):
+            assert one == pytest.approx(other, rel=1e-12)
+        assert every.leader[:2] == pytest.approx(numbers.leader[:2], rel=1e-12)
+        assert every.leader.rmse_by_output == pytest.approx(
+            numbers.leader.rmse_by_output, rel=1e-12
+        )
+        edges = [edge.distance_rmse for edge in every.edges]
+        assert edges == pytest.approx([edge.distance_rmse for edge in numbers.edges], rel=1e-12)
+
+
+def test_means_are_those_of_the_frames_where_every_step_is_stored(stored):
+    result, numbers = stored[0], metrics(stored[0])
+    errors = formation_errors(result)[:-1]
+    rms = np.sqrt(np.mean(errors**2, axis=0))
+    assert [each.rmse for each in numbers.followers] == pytest.approx(rms[1:].tolist(), rel=1e-12)
+    trim, scale = result.model.trim[1], np.asarray(result.model.input_scale)
+    v = np.linalg.solve(scale, (result.inputs[:-1, 1] - np.asarray(trim)).T)
+    effort = np.sqrt(np.mean(np.sum(v**2, axis=0)))
+    assert numbers.followers[0].effort == pytest.approx(effort, rel=1e-12)
+    by_output = np.sqrt(np.mean(output_errors(result)[:-1] ** 2, axis=0))
+    assert list(numbers.leader.rmse_by_output.values()) == pytest.approx(by_output, rel=1e-9)
+
+
+def test_effort_is_of_the_normalized_input_about_the_trim():
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(2)
+    inputs = np.tile(np.asarray(model.trim[1]), (4, 2, 1))
+    inputs[:, 1] += np.asarray(model.input_scale) @ [3.0, 0.0, 4.0, 0.0]
+    result = made_up(np.zeros((4, 2, 12)), model, graph, inputs=inputs)
+    assert metrics(result).followers[0].effort == pytest.approx(5.0, rel=1e-12)
+
+
+def test_what_does_not_exist_is_none():
+    model, graph = ech.models.VanDerPol(), ech.Graph.path(3)
+    numbers = metrics(made_up(np.zeros((3, 3, 2)), model, graph))
+    assert numbers.leader.rmse is None and numbers.minimum_distance is None
+    diverged = made_up(np.zeros((3, 3, 2)), model, graph, outcome=Outcome.DIVERGED)
+    numbers = metrics(diverged)
+    assert all(each.rmse is None and each.settling_time is None for each in numbers.followers)
+    assert numbers.worst_steady is None and numbers.edges[0].distance_rmse is None
+
+
+def test_a_run_without_a_frame_has_no_numbers():
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(2)
+    result = made_up(np.zeros((1, 2, 2)), model, graph, outcome=Outcome.INTERRUPTED)
+    gone = {name: getattr(result, name)[:0] for name in ("times", "states", "inputs")}
+    nothing = dataclasses.replace(result, **gone)
+    numbers = metrics(nothing)
+    assert numbers.followers[0].rmse is None and numbers.minimum_distance is None
+    assert "interrupted" in ech.report(nothing)
+
+
+@pytest.mark.slow
+def test_the_relay_is_a_fixed_point_of_the_formation():
+    """Started on their goals, followers told the leader's input stay there to rounding."""
+    model, graph = ech.models.Quadrotor.crazyflie(), ech.Graph.path(3)
+    formation = ech.Formation.from_offsets(model, graph, {1: (1, 0, 0), 2: (2, 0, 0)})
+    result = simulate(
+        model,
+        graph,
+        formation,
+        leader=ech.laws.Tracking(ech.references.Lemniscate()),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.Riccati()), feedforward="relay"
+        ),
+        start_error={"x": -6.0, "y": 3.0},
+        horizon=2.0,
+        dt=0.01,
+    )
+    assert formation_errors(result).max() < 1e-13
+    assert result.saturated[0] > 0.0

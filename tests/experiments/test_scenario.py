@@ -1,0 +1,589 @@
+"""The scenario file: what is accepted, what every default is, and the sentence of every fault."""
+
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import echelon.experiments.scenario.scenario
+from echelon.core.errors import ScenarioError, listing
+from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.part import accepted, resolve
+from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
+from echelon.experiments.scenario.scenario import (
+    Fault,
+    bundled_scenarios,
+    json_schema,
+    load_scenario,
+    scenario_from_mapping,
+)
+from echelon.experiments.scenario.yaml import read_yaml
+
+FOLDER = Path(echelon.experiments.scenario.scenario.__file__).parent
+
+# Each line of this file stands alone, so that a test replaces one and knows its number.
+LINES = {
+    "name": "name: paper",
+    "model": "model: {name: quadrotor, parameters: crazyflie}",
+    "graph": "graph: {edges: [[0, 1], [1, 2], [1, 3]], leaders: [0]}",
+    "formation": "formation: {offsets: {1: [1, 0, 0], 2: [1, 0.8, 0], 3: [1, -0.8, 0]}}",
+    "reference": "reference: {name: lemniscate, center: [0.25, 0.25, 1.0], amplitude: [1.25, 3.54],"
+    " rate: 0.646}",
+    "leader": "leader: {law: tracking, reacts: false, start_error: {x: -1.344, y: 0.530}}",
+    "follower": "follower: {law: consensus, gain: {method: riccati}, feedforward: relay}",
+    "initial": "initial: {spread: {position: 1.0, attitude: 0.3}}",
+    "simulation": "simulation: {horizon: 60.0, dt: 0.005, integrator: rk4, limits: true,"
+    " store_every: 10}",
+    "report": "report: {steady_window: 10.0}",
+    "seed": "seed: 0",
+}
+FOLDER_NAME = "text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"
+NUMBER = {name: number for number, name in enumerate(LINES, start=1)}
+
+
+@pytest.fixture
+def load(tmp_path, monkeypatch):
+    """Load the scenario above with some lines replaced; `None` drops one."""
+    monkeypatch.chdir(tmp_path)
+
+    def loader(*overrides, **changed):
+        lines = [changed.get(name, line) for name, line in LINES.items()]
+        Path("s.yaml").write_text("\n".join(line or "#" for line in lines), "utf-8")
+        return load_scenario("s.yaml", overrides)
+
+    return loader
+
+
+@pytest.fixture
+def refused(load):
+    """The lines of the error that loading ends in."""
+
+    def loader(*overrides, **changed):
+        with pytest.raises(ScenarioError) as caught:
+            load(*overrides, **changed)
+        return str(caught.value).splitlines()
+
+    return loader
+
+
+def test_the_file_is_read_as_written(load):
+    scenario = load()
+    assert scenario.graph.edges == ((0, 1, 1.0), (1, 2, 1.0), (1, 3, 1.0))
+    assert scenario.graph.leaders == (0,)
+    assert scenario.formation.offsets == {1: (1, 0, 0), 2: (1, 0.8, 0), 3: (1, -0.8, 0)}
+    assert scenario.reference.name == "lemniscate"
+    assert scenario.reference.parameters == {
+        "center": (0.25, 0.25, 1.0),
+        "amplitude": (1.25, 3.54),
+        "rate": 0.646,
+    }
+    assert scenario.leader.start_error == {"x": -1.344, "y": 0.53}
+    assert scenario.initial.spread == {"position": 1.0, "attitude": 0.3}
+    assert (scenario.simulation.horizon, scenario.simulation.dt) == (60.0, 0.005)
+    assert scenario.report.steady_window == 10.0
+    assert scenario.text == Path("s.yaml").read_text("utf-8")
+    assert scenario.folder == Path()
+
+
+def test_defaults():
+    scenario = scenario_from_mapping(
+        {
+            "name": "least",
+            "model": {"name": "pendulum"},
+            "graph": {"name": "path", "agents": 4},
+            "simulation": {"horizon": 30, "dt": 0.01},
+        }
+    )
+    assert scenario.model_dump() == {
+        "name": "least",
+        "model": {
+            "name": "pendulum",
+            "python": None,
+            "parameters": None,
+            "allow_unphysical": False,
+        },
+        "plant": None,
+        "graph": {
+            "edges": None,
+            "weights": None,
+            "directed": False,
+            "schedule": (),
+            "period": None,
+            "name": "path",
+            "agents": 4,
+            "rows": None,
+            "columns": None,
+            "radius": None,
+            "seed": 0,
+            "leaders": (0,),
+        },
+        "formation": {"offsets": None, "name": None, "spacing": 1.0, "columns": None},
+        "reference": None,
+        "leader": {
+            "law": "passive",
+            "reacts": False,
+            "start_error": {},
+            "gain": None,
+            **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer")),
+        },
+        "follower": {
+            "law": "consensus",
+            "gain": {
+                "method": "riccati",
+                "Q": None,
+                "R": None,
+                "P": None,
+                "coupling": None,
+                "domain": None,
+                "rate": None,
+                "exact": None,
+                "symmetry_weight": None,
+                "python": None,
+                "file": None,
+            },
+            **dict.fromkeys(("roots", "rate", "coupling", "speed", "observer", "hears")),
+            "feedforward": "relay",
+            "frame": "heading",
+            "trim": True,
+        },
+        "initial": {"spread": None, "states": None},
+        "disturbance": None,
+        "simulation": {
+            "horizon": 30.0,
+            "dt": 0.01,
+            "integrator": "rk4",
+            "limits": True,
+            "store_every": 1,
+            "precision": "float64",
+            "engine": "auto",
+            "devices": 1,
+        },
+        "report": {"steady_window": 6.0},
+        "live": (),
+        "seed": 0,
+    }
+
+
+def test_a_leader_with_a_reference_tracks_it_by_default(load):
+    assert load(leader="leader: {reacts: true}").leader.law == "tracking"
+    assert load(leader="leader:").leader.law == "tracking"
+
+
+def test_sections_that_are_empty_take_their_defaults(load):
+    scenario = load(formation="formation:", report="report:", initial="initial:")
+    assert scenario.formation.offsets is None and scenario.initial.spread is None
+    assert scenario.report.steady_window == 12.0
+
+
+def test_a_steady_window_not_shorter_than_the_run_is_a_fifth_of_it(load):
+    assert load("simulation.horizon=10").report.steady_window == 2.0
+    assert load("simulation.horizon=10.5").report.steady_window == 10.0
+    assert load("simulation.horizon=600", report="report: {}").report.steady_window == 120.0
+
+
+@pytest.mark.parametrize(
+    ("given", "rows"),
+    [
+        ("[2, 0.5]", ((2.0, 0.0), (0.0, 0.5))),
+        ("[[2, 1], [1, 2]]", ((2.0, 1.0), (1.0, 2.0))),
+        ("identity", "identity"),
+    ],
+)
+def test_a_list_of_numbers_is_a_diagonal(load, given, rows):
+    gain = load(f"follower.gain={{method: given, P: {given}, R: [3], coupling: 2}}").follower.gain
+    assert (gain.P, gain.R, gain.coupling) == (rows, ((3.0,),), 2.0)
+
+
+@pytest.mark.parametrize(
+    "graph",
+    [
+        "{edges: [[0, 1, 0.5], [1, 2, 3]], agents: 4, leaders: [0, 3]}",
+        "{name: grid, rows: 2, columns: 2}",
+        "{name: grid, rows: 2, columns: 2, agents: 4}",
+        "{name: geometric, agents: 4, radius: 0.5, seed: 3}",
+        "{name: ring, agents: 4}",
+        "{name: star, agents: 4}",
+        "{name: complete, agents: 4, leaders: [3]}",
+    ],
+)
+def test_graphs_that_are_accepted(load, graph):
+    assert load(graph=f"graph: {graph}").graph.leaders
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "formation={name: wedge, spacing: 0.5}",
+        "formation={name: grid, columns: 2}",
+        "initial={states: {1: [1, 2, 3], 2: [0, 0, 1]}}",
+        "model={python: 'my models/pendulum.py:Pendulum', parameters: {damping: 0.5}}",
+        "model={name: quadrotor, parameters: paper, allow_unphysical: true}",
+        "leader.gain={Q: [1, 2], R: [3]}",
+        "reference={name: waypoints, times: [0, 1], points: [[0, 0, 1], [1, 0, 1]], yaw: 0}",
+        "follower.law=passive",
+        "simulation.precision=float32",
+    ],
+)
+def test_further_sections_that_are_accepted(load, override):
+    assert load(override).place(override.split("=")[0].split(".")[0])
+
+
+def test_the_tables_of_choices_cover_the_registry():
+    checks = echelon.experiments.scenario.checks
+    assert set(checks._GRAPH_KEYS) == {"edges", *GRAPHS}
+    assert set(checks._FORMATION_KEYS) == {"offsets", *FORMATIONS}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_table_of_methods_says_what_their_classes_say(name):
+    entry, method = METHODS[name], resolve(METHODS[name])
+    arguments = [field.name for field in dataclasses.fields(method)]
+    assert method.name == name and method.needs == entry.needs
+    assert sorted([*entry.needs, *entry.takes]) == sorted(arguments)
+    assert {*method.usual} <= {*method.needs}
+
+
+@pytest.mark.parametrize("role", ["leader", "follower"])
+def test_the_table_of_laws_says_what_their_classes_say(role):
+    for name, entry in getattr(registry, f"{role.upper()}_LAWS").items():
+        stopping = ("roots", "rate", "coupling", "speed", "observer")
+        offered = {
+            "leader": ("gain", *stopping),
+            "follower": ("gain", "feedforward", "trim", "frame", *stopping, "hears"),
+        }[role]
+        taken = set(accepted(resolve(entry))) & {*offered}
+        assert {*entry.needs, *entry.takes} == taken, name
+
+
+def test_yaml_1_2_decides_what_a_word_is(load, refused):
+    assert load("simulation.dt=1e-3").simulation.dt == 0.001
+    assert refused("simulation.limits=no") == [
+        "--set simulation.limits=no: got `no`, allowed is `true` or `false`."
+    ]
+
+
+def planted():
+    """Pairs of a faulty line and its sentence."""
+    text = (Path(__file__).parents[1] / "scenario_faults.txt").read_text("utf-8")
+    text = re.sub("<([A-Z_]+)>", lambda table: listing(getattr(registry, table[1])), text)
+    blocks = [block.splitlines() for block in text.split("\n\n") if not block.startswith("#")]
+    assert len(blocks) > 90
+    return [pytest.param(line, fault, id=line) for line, fault in blocks]
+
+
+@pytest.mark.parametrize(("line", "fault"), planted())
+def test_every_fault_is_one_sentence_with_its_line(refused, line, fault):
+    key = line.partition(":")[0]
+    # a reference that is gone is told at the law that needs it, and so the other way round
+    at = {"reference:": "leader", "leader: {law: passive}": "reference"}.get(line, key)
+    assert refused(**{key: line}) == [f"s.yaml:{NUMBER[at]}: {fault}"]
+
+
+@pytest.mark.parametrize("key", ["name", "model", "graph", "simulation"])
+def test_a_missing_key_is_told_at_its_parent(refused, key):
+    first = 2 if key == "name" else 1
+    assert refused(**{key: None}) == [f"s.yaml:{first}: {key}: got nothing, this key is required."]
+
+
+def test_an_unknown_section_gets_a_guess(refused):
+    assert refused(seed="sed: 0") == [
+        "s.yaml:11: sed: got an unknown key, allowed are `name`, `model`, `plant`, `graph`,"
+        " `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`, `simulation`,"
+        " `report`, `live`, `seed` (did you mean `seed`?)."
+    ]
+
+
+def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
+    lines = refused(
+        model="model: {name: quadroto}",
+        graph="graph: {edges: [[0, 1], [1, 1], [1, 3]], agents: 4}",
+        formation="formation: {offsets: {1: [1, 0, .nan]}}",
+        follower="follower: {feedforward: rely}",
+        simulation="simulation:\n  horizon: 60\n  dt: 0\nseed: 1",
+    )
+    assert lines == [
+        f"s.yaml:2: model.name: got `quadroto`, allowed are {listing(MODELS)} (did you mean"
+        " `quadrotor`?).",
+        "s.yaml:3: graph.edges.1: got `[1, 1]`, allowed is an edge between two different agents.",
+        "s.yaml:4: formation.offsets.1.2: got `.nan`, allowed is a finite number.",
+        "s.yaml:7: follower.feedforward: got `rely`, allowed are `none`, `relay`,"
+        " `relay-velocity`, `parent` (did you mean `relay`?).",
+        "s.yaml:11: simulation.dt: got `0`, allowed is a number above 0.",
+        "s.yaml:14: seed: got this key twice, it stands at s.yaml:12 already.",
+    ]
+
+
+def test_one_fault_does_not_make_others_up(refused):
+    """An edge that cannot be read leaves the number of agents open, so offsets are not blamed."""
+    lines = refused(graph="graph: {edges: [[0, 1], [1, 2], [1, x]]}")
+    assert len(lines) == 1 and lines[0].startswith("s.yaml:3: graph.edges.2.1: got `x`")
+
+
+def spoiled(data, random):
+    """Plain data with junk in some places."""
+    if random.random() < 0.05:
+        return random.choice(SAMPLES)
+    if isinstance(data, dict):
+        return {key: spoiled(item, random) for key, item in data.items()}
+    return [spoiled(item, random) for item in data] if isinstance(data, list) else data
+
+
+SAMPLES = [
+    None, True, 0, -1, 3, 10**400, 0.5, math.nan, -math.inf, "", "x", "1", [], [[]], [0, "1"],
+    [0, 1], [[0, 1], [1]], {}, {1: 2}, {"name": None}, {"x": {}}, {0: [1.0]},
+]  # fmt: skip
+
+
+@given(st.randoms(use_true_random=False))
+def test_whatever_stands_anywhere_is_accepted_or_told(random):
+    data = read_yaml("\n".join(LINES.values()), "s.yaml").data
+    scenario = {key: spoiled(item, random) for key, item in data.items()}
+    try:
+        assert scenario_from_mapping(scenario).simulation.dt > 0
+    except ScenarioError as error:
+        lines = str(error).splitlines()
+        assert lines and all(re.fullmatch(r"mapping: [\w.-]+: .+\.", line) for line in lines)
+        assert len({fault.field for fault in error.faults}) == len(lines)
+
+
+def test_the_error_carries_its_faults(load):
+    with pytest.raises(ScenarioError) as caught:
+        load(seed="seed: -1", name="name: 3")
+    assert caught.value.faults == (
+        Fault("s.yaml:1", "name", f"got `3`, allowed is {FOLDER_NAME}."),
+        Fault("s.yaml:11", "seed", "got `-1`, allowed is a number from 0 on."),
+    )
+    assert str(caught.value) == "\n".join(map(str, caught.value.faults))
+    assert caught.value.exit_code == 2
+
+
+def test_overrides_meet_the_same_rules_and_come_last(refused):
+    assert refused("simulation.dt=0", "graph.edges.1=[1, 1]", "graph.agents=4", name="name: 3") == [
+        f"s.yaml:1: name: got `3`, allowed is {FOLDER_NAME}.",
+        "--set graph.edges.1=[1, 1]: got `[1, 1]`, allowed is an edge between two"
+        " different agents.",
+        "--set simulation.dt=0: got `0`, allowed is a number above 0.",
+    ]
+
+
+def test_overrides_are_part_of_the_text_that_is_kept(load):
+    scenario = load("seed=7", "formation.offsets.3=[0, 1, 0]", "seed=8")
+    assert scenario.seed == 8 and scenario.formation.offsets[3] == (0.0, 1.0, 0.0)
+    assert scenario.place("formation", "offsets", 3, 1) == "--set formation.offsets.3=[0, 1, 0]"
+    assert scenario.place("formation", "offsets", 2) == "s.yaml:4"
+    again = scenario_from_mapping(read_yaml(scenario.text, "kept").data)
+    assert again.model_dump() == scenario.model_dump()
+
+
+def test_a_malformed_override_is_refused(refused):
+    assert refused("seed") == ["--set seed: got no `=`, allowed is `key=value`, as in `seed=7`."]
+
+
+def test_places_are_there_for_later_faults(load):
+    scenario = load()
+    assert scenario.place("graph", "edges", 2) == "s.yaml:3"
+    assert scenario.place("follower", "gain", "coupling") == "s.yaml:7"
+    assert scenario.place("nothing") == "s.yaml:1"
+
+
+@pytest.mark.parametrize(
+    ("text", "got"), [("- 1\n", "`[1]`"), ("just text", '`"just text"`'), ("3", "`3`")]
+)
+def test_a_file_that_is_no_mapping_is_refused(tmp_path, text, got):
+    file = tmp_path / "s.yaml"
+    file.write_text(text, "utf-8")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(file)
+    assert str(caught.value) == (
+        f"{file}:1: got {got}, allowed is a mapping with the keys `name`, `model`, `plant`,"
+        " `graph`, `formation`, `reference`, `leader`, `follower`, `initial`, `disturbance`,"
+        " `simulation`, `report`, `live`, `seed`."
+    )
+
+
+def test_an_empty_file_lacks_what_is_required(tmp_path):
+    file = tmp_path / "s.yaml"
+    file.write_text("# nothing yet\n", "utf-8")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(file)
+    assert [fault.field for fault in caught.value.faults] == [
+        "name",
+        "model",
+        "graph",
+        "simulation",
+    ]
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    file = tmp_path / "s.yaml"
+    file.write_bytes(b"name: \xff")
+    with pytest.raises(ScenarioError, match="s.yaml: this file cannot be read as UTF-8 text: "):
+        load_scenario(file)
+
+
+def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path):
+    file = tmp_path / "s.yaml"
+    file.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(LINES.values()).encode())
+    assert load_scenario(file).place("seed") == f"{file}:11"
+
+
+def test_an_unknown_scenario_is_refused_with_the_bundled_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("papr.yaml")
+    assert str(caught.value) == (
+        "got the scenario `papr.yaml`, no such file exists, allowed is a file, the folder of"
+        f" a run or a bundled scenario: {listing(bundled_scenarios())} (did you mean `paper`?)."
+    )
+
+
+def test_a_mapping_is_checked_like_a_file():
+    data = read_yaml("\n".join(LINES.values()), "s.yaml").data
+    given = data | {
+        "formation": {"offsets": {1: (1, 0, 0), np.int64(2): np.array([1, 0.8, 0])}},
+        "seed": np.int64(3),
+    }
+    scenario = scenario_from_mapping(given, folder="here")
+    assert scenario.formation.offsets == {1: (1.0, 0.0, 0.0), 2: (1.0, 0.8, 0.0)}
+    assert (scenario.seed, scenario.folder, scenario.place("seed")) == (3, Path("here"), "mapping")
+    with pytest.raises(ScenarioError) as caught:
+        scenario_from_mapping(given | {"seed": -1})
+    assert str(caught.value) == "mapping: seed: got `-1`, allowed is a number from 0 on."
+
+
+def test_a_scenario_cannot_be_changed(load):
+    with pytest.raises(ValueError, match="frozen"):
+        load().seed = 3
+
+
+@pytest.mark.parametrize("name", bundled_scenarios())
+def test_bundled_scenarios_load_and_introduce_themselves(name):
+    scenario = load_scenario(name)
+    assert scenario.name == name and scenario.folder == FOLDER / "bundled"
+    assert scenario.place("name").startswith(f"{name}.yaml:")
+    summary = bundled_scenarios()[name]
+    assert summary.endswith(".") and len(summary) < 100
+
+
+def test_the_bundled_scenarios_are_the_promised_ones():
+    paper, line, fast, literal = map(
+        load_scenario, ["paper", "paper-line", "paper-fast", "paper-literal"]
+    )
+    assert (
+        paper.model_dump()
+        == scenario_from_mapping(read_yaml("\n".join(LINES.values()), "s.yaml").data).model_dump()
+    )
+    same = {"model", "formation", "reference", "initial", "seed"}
+    for other in (line, fast, literal):
+        assert other.model_dump(include=same) == paper.model_dump(include=same)
+    assert line.graph.edges == ((0, 1, 1.0), (1, 2, 1.0), (2, 3, 1.0))
+    assert fast.leader.gain == fast.follower.gain
+    assert np.diag(fast.follower.gain.Q).tolist() == [12] * 3 + [0.8] * 3 + [2.5] * 3 + [0.03] * 3
+    assert np.diag(fast.follower.gain.R).tolist() == [0.04, 0.001, 0.001, 0.005]
+    assert (literal.follower.gain.P, literal.follower.gain.coupling) == ("identity", 1.0)
+    assert literal.follower.feedforward == "none" and not literal.follower.trim
+
+
+def test_the_shipped_schema_is_the_one_of_the_code():
+    shipped = json.loads((FOLDER / "scenario.schema.json").read_text("utf-8"))
+    assert shipped == json_schema(), "write json_schema() to scenario.schema.json"
+
+
+def test_every_number_of_the_schema_is_described():
+    parts = json_schema()["$defs"].values()
+    undescribed = [
+        (part["title"], key)
+        for part in parts
+        for key, field in part["properties"].items()
+        if "description" not in field
+    ]
+    assert not undescribed
+
+
+KINDS = {
+    "object": dict,
+    "array": list,
+    "string": str,
+    "boolean": bool,
+    "integer": int,
+    "number": int | float,
+    "null": None.__class__,
+}
+
+
+def is_kind(value, name):
+    return isinstance(value, KINDS[name]) and (name == "boolean" or not isinstance(value, bool))
+
+
+def conforms(value, schema, whole):
+    """Tell whether a value conforms to a JSON schema, for the keywords that ours uses."""
+    if "$ref" in schema:
+        return conforms(value, whole["$defs"][schema["$ref"].rpartition("/")[2]], whole)
+    kinds = schema.get("type", [])
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    checks = [
+        not kinds or any(is_kind(value, kind) for kind in kinds),
+        "enum" not in schema or value in schema["enum"],
+        "const" not in schema or value == schema["const"],
+        "pattern" not in schema or bool(re.search(schema["pattern"], value)),
+    ]
+    for keyword, wanted in (("anyOf", any), ("oneOf", lambda found: sum(found) == 1)):
+        if keyword in schema:
+            checks.append(wanted([conforms(value, one, whole) for one in schema[keyword]]))
+    return all(checks) and contents_conform(value, schema, whole)
+
+
+def contents_conform(value, schema, whole):
+    if isinstance(value, dict):
+        fields, other = schema.get("properties", {}), schema.get("additionalProperties", {})
+        other = {} if other is True else other
+        value = {str(key): item for key, item in value.items()}
+        return set(schema.get("required", [])) <= set(value) and all(
+            key in fields or other is not False and conforms(item, other, whole)
+            if key not in fields
+            else conforms(item, fields[key], whole)
+            for key, item in value.items()
+        )
+    if isinstance(value, list):
+        first = schema.get("prefixItems", [])
+        rest = [schema.get("items", {})] * len(value)
+        size = schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", len(value))
+        pairs = zip(value, [*first, *rest[len(first) :]], strict=False)
+        return size and all(conforms(item, one, whole) for item, one in pairs)
+    if is_kind(value, "number"):
+        above = value > schema.get("exclusiveMinimum", -float("inf"))
+        return above and value >= schema.get("minimum", value)
+    return True
+
+
+@pytest.mark.parametrize("name", bundled_scenarios())
+def test_the_schema_accepts_every_bundled_scenario(name):
+    schema = json_schema()
+    data = read_yaml(load_scenario(name).text, name).data
+    assert conforms(data, schema, schema)
+    assert not conforms(data | {"sed": 0}, schema, schema)
+    assert not conforms(data | {"simulation": {"horizon": 1}}, schema, schema)
+    assert not conforms(data | {"graph": {"edges": [[0]]}}, schema, schema)
+    assert not conforms(data | {"model": {"name": "quadroto"}}, schema, schema)
+
+
+def test_a_named_set_of_parameters_may_be_changed(load):
+    model = "model={name: quadrotor, parameters: {set: crazyflie-2.1+, mass: 0.03}}"
+    made = echelon.build(load(model)).parts.model
+    assert (made.mass, made.motor_thrust) == (0.03, 0.12)
+    for parameters, said in (
+        ("{set: crazyfly}", "parameters `crazyfly` are unknown"),
+        ("{set: [1]}", "parameters `[1]` are unknown"),
+        ("{set: crazyflie, weight: 1}", "got the parameter `weight` of `quadrotor`"),
+    ):
+        with pytest.raises(echelon.EchelonError) as caught:
+            echelon.build(load(f"model={{name: quadrotor, parameters: {parameters}}}"))
+        assert said in str(caught.value)
+    with pytest.raises(echelon.EchelonError, match="`pendulum` has no named parameter sets"):
+        echelon.build(load("model={name: pendulum, parameters: {set: small}}"))

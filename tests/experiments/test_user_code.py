@@ -1,0 +1,247 @@
+"""Laws, references and gain methods of one's own in a scenario, and what is said of bad ones."""
+
+import numpy as np
+import pytest
+
+import echelon as ech
+
+MINE = '''
+import jax.numpy as jnp
+import numpy as np
+import echelon as ech
+from echelon.synthesis.gains import Feedback
+
+
+class Pull(ech.Law):
+    """u = -strength z."""
+
+    strength: float = 1.0
+
+    def update(self, model, view, memory):
+        return -self.strength * view.disagreement, memory
+
+
+class Steer(ech.Law):
+    """A leader at a constant velocity along its reference."""
+
+    reference: ech.Reference
+
+    def start(self, model):
+        return self.reference(jnp.zeros(()))[:2]
+
+    def update(self, model, view, memory):
+        return jnp.asarray(self.reference.velocity, view.x.dtype), memory
+
+
+class Ray(ech.Reference):
+    """A straight line from the origin."""
+
+    velocity: tuple = (1.0, 0.0)
+
+    def __check_init__(self):
+        if len(self.velocity) != 2:
+            raise ValueError("`velocity` must be two numbers")
+
+    def __call__(self, t):
+        v = jnp.asarray(self.velocity, t.dtype)
+        return jnp.concatenate([v * t, jnp.zeros(2, t.dtype)])
+
+
+class Heavy(ech.Method):
+    """P = weight I."""
+
+    name = "heavy"
+    weight: float = 1.0
+
+    def feedback(self, model, linear):
+        n, m = linear.B.shape
+        return Feedback(self.weight * np.eye(n), np.eye(m), None)
+
+
+class Fails(Heavy):
+    def feedback(self, model, linear):
+        return np.linalg.inv(np.zeros((2, 2)))
+
+
+class Restless(ech.Law):
+    def prepared(self, model, graph):
+        return {}["nothing"]
+
+    def update(self, model, view, memory):
+        return view.x, memory
+'''
+
+SCENARIO = {
+    "name": "own",
+    "model": {"name": "single-integrator", "parameters": {"dimension": 2}},
+    "graph": {"name": "path", "agents": 3},
+    "reference": {"python": "mine.py:Ray", "velocity": [0.5, 0.25]},
+    "leader": {"law": {"python": "mine.py:Steer"}},
+    "follower": {"law": {"python": "mine.py:Pull", "strength": 2.0}},
+    "simulation": {"horizon": 1.0, "dt": 0.1},
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "mine.py").write_text(MINE)
+    return tmp_path
+
+
+def own(folder, **sections):
+    data = {key: value for key, value in {**SCENARIO, **sections}.items() if value is not None}
+    return ech.scenario_from_mapping(data, folder)
+
+
+def test_a_law_a_reference_and_a_leader_of_ones_own_run(folder):
+    run = ech.run(own(folder, initial={"states": {1: [0.0, 0.1]}}))
+    assert run.states[-1, 0] == pytest.approx([0.5, 0.25])
+    # u = -2 z over one step of 0.1 s from rest, with one neighbour at the origin and one 0.1 off.
+    assert run.inputs[0, 1] == pytest.approx([0.0, -0.4])
+    assert run.inputs[0, 2] == pytest.approx([0.0, 0.2])
+
+
+def test_a_method_of_ones_own_makes_the_gain(folder):
+    follower = {"gain": {"python": "mine.py:Heavy", "weight": 3.0, "coupling": 0.5}}
+    gain = ech.build(own(folder, follower=follower)).parts.drive.gain
+    assert np.array_equal(gain.P, 3.0 * np.eye(2)) and gain.coupling == 0.5
+    assert gain.method == "heavy"
+
+
+def test_a_reference_of_ones_own_leads_the_law_that_tracks(folder):
+    run = ech.run(own(folder, leader=None, follower=None))
+    assert run.states[-1, 0] == pytest.approx([0.5, 0.25])
+
+
+SENTENCES = {
+    "a class that is not there": (
+        {"follower": {"law": {"python": "mine.py:Pul"}}},
+        "follower",
+        "`Pul` in `{folder}/mine.py` is no `Law` class; it has `Pull`, `Steer`, `Restless` (did "
+        "you mean `Pull`?).",
+    ),
+    "a class of another kind": (
+        {"reference": {"python": "mine.py:Pull"}},
+        "reference",
+        "`Pull` in `{folder}/mine.py` is no `Reference` class; it has `Ray`.",
+    ),
+    "a key that a law of one's own does not take": (
+        {"follower": {"law": {"python": "mine.py:Pull"}, "gain": {"method": "riccati"}}},
+        "follower.gain",
+        "got a key that the law `mine.py:Pull` does not take, allowed are those that its class "
+        "names.",
+    ),
+    "a file that is not there": (
+        {"follower": {"gain": {"python": "yours.py:Heavy"}}},
+        "follower.gain",
+        "the file `{folder}/yours.py` does not exist; a `python` path is relative to the scenario "
+        "file, and on the command line to the working folder.",
+    ),
+    "a key that the law lacks": (
+        {"follower": {"law": {"python": "mine.py:Pull", "strenght": 1.0}}},
+        "follower",
+        "got the parameter `strenght` of `mine.py:Pull`, allowed is `strength` (did you mean "
+        "`strength`?).",
+    ),
+    "a value that the reference refuses": (
+        {"reference": {"python": "mine.py:Ray", "velocity": [1, 2, 3]}},
+        "reference",
+        "`mine.py:Ray` cannot be made with these parameters: ValueError: `velocity` must be two "
+        "numbers.",
+    ),
+    "a reference that nobody takes": (
+        {"leader": {"law": {"python": "mine.py:Pull"}}},
+        "leader",
+        "there is a `reference`, and the law `mine.py:Pull` takes none.",
+    ),
+    "a method that fails": (
+        {"follower": {"gain": {"python": "mine.py:Fails"}}},
+        "follower.gain",
+        "`mine.py:Fails` fails: LinAlgError: Singular matrix.",
+    ),
+    "a law that fails": (
+        {"follower": {"law": {"python": "mine.py:Restless"}}},
+        "follower",
+        "`mine.py:Restless` fails: KeyError: 'nothing'.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SENTENCES)
+def test_each_fault_of_ones_own_code_has_its_sentence(folder, name):
+    sections, field, sentence = SENTENCES[name]
+    with pytest.raises(ech.EchelonError) as caught:
+        ech.build(own(folder, **sections))
+    said = sentence.replace("{folder}", str(folder))
+    assert str(caught.value) == f"mapping: {field}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("import sys; sys.exit()", "SystemExit: no message"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("def", "SyntaxError: invalid syntax"),
+    ],
+)
+def test_a_file_that_does_not_import_is_told(folder, text, said):
+    (folder / "mine.py").write_text(text)
+    with pytest.raises(ech.EchelonError) as caught:
+        ech.build(own(folder, reference=None, leader=None))
+    assert f"does not import: {said}" in str(caught.value)
+
+
+# ---- paths and keys that the command line sets ----
+
+
+def test_a_path_on_the_command_line_is_relative_to_the_working_folder(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    own_law = "follower.law={python: mine.py:Pull, strength: 2}"
+    scenario = ech.load_scenario("integrators", [own_law])
+    assert scenario.follower.law.python == f"{folder}/mine.py:Pull"
+    assert type(ech.build(scenario).parts.drive.follower).__name__ == "Pull"
+
+
+def test_a_gain_file_or_a_method_of_ones_own_takes_the_place_of_a_method(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    built = ech.build(ech.load_scenario("van-der-pol"))
+    ech.save_gain(built.parts.drive.gain, built.parts.model, built.parts.graph, folder / "g.json")
+    again = ech.load_scenario("van-der-pol", ["follower.gain.file=g.json"])
+    gain = ech.build(again).parts.drive.gain
+    assert np.array_equal(gain.P, built.parts.drive.gain.P)
+    mine = ech.load_scenario("van-der-pol", ["follower.gain.python=mine.py:Heavy"])
+    assert ech.build(mine).parts.drive.gain.method == "heavy"
+    # Both from the command line, neither gives way.
+    with pytest.raises(ech.EchelonError, match="got `file` and `python`, allowed is one of them"):
+        ech.load_scenario(
+            "van-der-pol", ["follower.gain.file=g.json", "follower.gain.python=mine.py:Heavy"]
+        )
+
+
+def test_a_model_of_ones_own_takes_the_place_of_a_named_one(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "line.py").write_text(
+        "import echelon as ech\n\n\nclass Line(ech.models.SingleIntegrator):\n    pass\n"
+    )
+    scenario = ech.load_scenario("integrators", ["model.python=line.py:Line"])
+    assert scenario.model.name is None
+    assert type(ech.build(scenario).parts.model).__name__ == "Line"
+
+
+def test_keys_that_only_another_law_takes_give_way_to_a_law_on_the_command_line():
+    scenario = ech.load_scenario("paper", ["follower.law=passive"])
+    assert scenario.data["follower"] == {"law": "passive"}
+    with pytest.raises(ech.EchelonError) as caught:
+        ech.load_scenario("paper", ["follower.law=passive", "follower.gain.coupling=2"])
+    assert str(caught.value) == (
+        "--set follower.gain.coupling=2: follower.gain: got a key that `passive` does not take, "
+        "allowed beside it is no other key."
+    )
+
+
+def test_some_agents_start_by_the_spread_and_others_where_they_are_told(folder):
+    start = {"spread": {"position": 0.5}, "states": {2: [3.0, 4.0]}}
+    parts, settings = ech.build(own(folder, initial=start))
+    run = ech.simulate(parts, settings)
+    assert run.states[0, 2].tolist() == [3.0, 4.0]
+    assert 0.0 < np.abs(run.states[0, 1]).max() <= 0.5

@@ -1,0 +1,362 @@
+"""Where flat coordinates end: a length that must not be 0, and models that do not say (T5)."""
+
+import json
+from fractions import Fraction
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import echelon as ech
+from echelon.agents.models.chains import chains_of
+from echelon.agents.models.model import FlatBound, FlatChains
+from echelon.core.errors import EchelonError
+from echelon.core.words import Kind, Theorem
+from echelon.guarantees.promises.promise import promise
+from echelon.guarantees.stopping.chain_clearance import length_room_of
+from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.flat_everywhere import bounds_of
+from echelon.guarantees.verifier.verify import verify
+from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
+from echelon.simulation.engine.prepare import prepare
+
+CIRCLE = ech.references.Circle(radius=2.0, rate=0.7)
+TREE = ech.Graph([(0, 1), (1, 2), (1, 3)])
+UNICYCLE = ech.models.Unicycle()
+START = np.array([2.0, 0.0, np.pi / 2])
+"""On the circle at time 0, which is driven through at 1.4 m/s."""
+
+
+def driven(headings=(0.0, 0.0, 0.0), away=0.0, reference=CIRCLE, leader=None, **law):
+    """Unicycles whose headings (rad) are so far off, on goals beside each other and away (m)."""
+    graph = ech.Graph([(0, k) if k == 1 else (1, k) for k in range(1, len(headings) + 1)])
+    offsets = {k: (0.5 * k, -0.3 * k, 0.0) for k in range(1, len(headings) + 1)}
+    formation = ech.Formation.from_offsets(UNICYCLE, graph, offsets)
+    states = START + formation.offsets
+    states[1:, 2] += headings
+    states[1:, :2] += away
+    drive = ech.Laws(StoppingLeader(reference=reference, **(leader or {})), StoppingPoint(**law))
+    return ech.Parts(UNICYCLE, graph, formation, drive, initial=states)
+
+
+def promised(parts, horizon=8.0):
+    return promise(parts, ech.Settings(horizon=horizon, dt=0.01))
+
+
+# ---- the certificate -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("roots", "order"), [((4.0,), 0), ((2.0, 3.0), 1), ((2.0, 2.5, 3.0), 1)])
+def test_a_vector_grows_no_longer_than_its_room(roots, order):
+    draw, p = np.random.default_rng(0), len(roots)
+    starts, speed = draw.uniform(-1.0, 1.0, (2, p)), 0.8
+    exact = [list(map(Fraction, row)) for row in starts.tolist()]
+    fall = float(length_room_of(Chain.of(roots), order, exact, Fraction("0.8"), Fraction(9)).fall)
+    A = np.eye(p, k=1)
+    A[-1] = -np.poly(-np.array(roots))[:0:-1]
+    b, dt = np.eye(p)[-1] * A[-1, 0], 0.002
+    flow = scipy.linalg.expm(np.block([[A, b[:, None]], [np.zeros((1, p + 1))]]) * dt)
+    worst = 0.0
+    for _ in range(40):
+        # Pushes of the whole size that turn now and then, and some straight against the start.
+        angles = np.repeat(draw.uniform(-np.pi, np.pi, 50), 30) * draw.integers(0, 2)
+        x, w = starts.T.copy(), speed * np.stack([np.cos(angles), np.sin(angles)])
+        for k in range(w.shape[1]):
+            x = flow[:p, :p] @ x + np.outer(flow[:p, p], w[:, k])
+            worst = max(worst, float(np.linalg.norm(x[order])))
+    free = max(np.linalg.norm(scipy.linalg.expm(A * t) @ starts.T, axis=1)[order] for t in (0, 0.1))
+    assert max(worst, free) <= fall <= 2.5 * worst
+
+
+def test_of_one_root_the_longest_vector_is_the_longer_of_start_and_speed():
+    for start, speed in ((1.0, 0.4), (0.3, 0.9)):
+        exact = [[Fraction(start)], [Fraction(0)]]
+        room = length_room_of(Chain.of((4.0,)), 0, exact, Fraction(speed), Fraction(2))
+        assert max(start, speed) <= float(room.fall) <= 1.02 * max(start, speed)
+        # Behind a leader at rest a start alone may be as long as what is allowed.
+        alone = length_room_of(Chain.of((4.0,)), 0, (), Fraction(speed), Fraction(2))
+        assert 1.98 <= float(alone.steepest) <= 2.0
+
+
+# ---- unicycles -----------------------------------------------------------------------------------
+
+
+def test_a_unicycle_is_promised_while_it_drives(tmp_path):
+    found = promised(driven((0.9, -0.9, 0.2), away=8.0))
+    assert found.promised and found.theorem is Theorem.T5 and found.kind is Kind.PROOF
+    [border] = found.tube.borders
+    # A chord of the leader's speed is 60 degrees; its path is enclosed a little below 1.4 m/s.
+    assert 1.36 < border["path"] <= 1.4 and "a speed above 0" in found.sentence()
+    chord = 2.0 * np.degrees(np.arcsin(found.tube.steepest / 2.8))
+    assert 57.0 < chord < 60.0 and f"{chord:.3g} deg to either side" in found.sentence()
+    file = tmp_path / "summary.json"
+    file.write_text(json.dumps({"promise": found.as_mapping()}))
+    assert verify(file).holds
+    told = found.as_mapping()
+    [border] = told["anywhere"]["borders"]
+    for key, factor in (("left", 1.1), ("steepest", 1.1), ("speed", 1.8), ("starts", 2.0)):
+        was = border[key]
+        border[key] = (factor * np.array(was)).tolist()
+        file.write_text(json.dumps({"promise": told}))
+        assert verify(file).verdict == "refused"
+        border[key] = was
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"headings": (1.2, 0.0, 0.0)}, "is not proved to stay above 0"),
+        ({"speed": 1.2}, "lower the `speed` of `x`, `y` below 0.9"),
+    ],
+)
+def test_a_unicycle_that_might_stop_is_told_what_would_help(change, text):
+    found = promised(driven(**change))
+    assert not found.promised and text in found.sentence()
+
+
+def led(place=(0.0, 0.0), turned=0.0, **leader):
+    """Unicycles whose leader alone starts away from its place (m) and turned (rad)."""
+    parts = driven(leader=leader, speed=0.4)
+    states = np.array(parts.initial)
+    states[0] += (*place, turned)
+    return promised(parts.replace(initial=states))
+
+
+def test_of_a_leader_off_its_path_no_other_place_is_meant():
+    # At most c |zeta - path| of its speed is used here, which grows from another place.
+    found = led(place=(0.0, 0.02), speed=5.0)
+    assert found.promised
+    assert "from any position of the followers, with a speed above 0" in found.sentence()
+    assert "and the leader as at these starts" in found.sentence()
+    assert "any position," in led().sentence() and "keeps to its path" in led().sentence()
+
+
+def test_a_leader_that_is_turned_does_not_keep_to_its_path():
+    # Its stopping point is on the path: y' / root away from where it is.
+    turn, speed = 0.5, 1.4
+    ways = np.array([[np.cos(a), np.sin(a)] for a in (np.pi / 2, np.pi / 2 + turn)])
+    found = led(place=-speed * (ways[1] - ways[0]) / 4.0, turned=turn)
+    assert found.promised and "keeps to its path" not in found.sentence()
+    assert "and the leader as at these starts" in found.sentence()
+
+
+def test_a_path_that_stands_still_has_no_direction():
+    with pytest.raises(EchelonError, match="`x'`, `y'` are 0 there, and allowed is a speed above"):
+        prepare(driven(reference=ech.references.Hover()), ech.Settings(horizon=1.0, dt=0.01))
+
+
+@pytest.mark.slow
+def test_unicycles_come_together_from_afar_and_never_stop():
+    draw = np.random.default_rng(1)
+    headings = draw.uniform(-0.95, 0.95, 6)
+    parts = driven(headings)
+    states = np.array(parts.initial)
+    states[1:, :2] += draw.uniform(-10.0, 10.0, (6, 2))
+    parts = parts.replace(initial=states)
+    found = promised(parts, 40.0)
+    result = ech.simulate(parts, ech.Settings(horizon=40.0, dt=0.01))
+    assert found.promised and result.inputs[:, :, 0].min() >= found.tube.left
+    off = np.linalg.norm(result.errors[:, 1:, :2], axis=2)
+    assert off[-1].max() <= 1e-9
+    outside = result.times[np.flatnonzero((off >= 0.01).any(axis=1))[-1]]
+    assert outside <= found.tube.arrival.time <= 2.0 * outside
+
+
+# ---- models that do not say ----------------------------------------------------------------------
+
+
+class Swing(ech.ControlAffine):
+    """A pendulum of which nothing is said but drift and input map."""
+
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
+
+    def drift(self, x):
+        return jnp.stack([x[1], -9.81 * jnp.sin(x[0]) - 0.3 * x[1] * jnp.exp(x[0])])
+
+    def input_map(self, x):
+        return jnp.array([[0.0], [2.0]])
+
+
+class Spring(Swing):
+    """The same with a force that is infinite somewhere."""
+
+    def drift(self, x):
+        return jnp.stack([x[1], -x[0] / (1.0 + x[0])])
+
+
+class Tilted(Swing):
+    """The same with an input that is lost somewhere."""
+
+    def input_map(self, x):
+        return jnp.stack([jnp.zeros(1), jnp.cos(x[:1])])
+
+
+class Bent(Swing):
+    """The same whose rate is no linear form of its states."""
+
+    def drift(self, x):
+        return jnp.stack([x[1] + 0.1 * x[1] ** 3, -x[0]])
+
+
+@pytest.mark.parametrize(
+    ("model", "everywhere"),
+    [
+        (Swing(), True),
+        (Spring(), False),
+        (Tilted(), False),
+        (Bent(), False),
+        (ech.models.Linear([[0.0, 1.0], [2.0, -0.3]], [[0.0], [1.0]]), True),
+        (ech.models.Linear([[0, 1, 0], [0, 0, 1], [1, 2, 3]], [[0.0], [0.0], [1.0]]), True),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_model_that_does_not_say_has_no_border_where_its_coordinates_are_linear(
+    model, everywhere
+):
+    assert (bounds_of(model, chains_of(model)) is not None) == everywhere
+
+
+def swings(model):
+    drive = ech.Laws(StoppingLeader(), StoppingPoint())
+    return ech.Parts(model, TREE, ech.Formation(np.zeros((4, 2))), drive, initial={"angle": 3.0})
+
+
+def test_what_is_proved_of_a_model_of_ones_own_is_promised_and_flown():
+    found = promised(swings(Swing()))
+    assert (
+        found.promised and found.kind is Kind.PROOF and "any state of any agent" in found.sentence()
+    )
+    result = ech.simulate(swings(Swing()), ech.Settings(horizon=8.0, dt=0.01))
+    assert np.abs(result.errors[-1]).max() <= 1e-9
+
+
+def test_a_model_that_ends_somewhere_unknown_is_promised_nothing():
+    found = promised(swings(Tilted()))
+    assert not found.promised
+    assert "does not say where its flat coordinates end" in found.sentence()
+
+
+# ---- bounds that models state --------------------------------------------------------------------
+
+
+def bounded(*bounds, degree=2):
+    """A pendulum that states these bounds."""
+
+    class Bounded(Swing):
+        flat_chains, flat_bounds = FlatChains((degree,), (0,)), bounds
+
+    return Bounded()
+
+
+@pytest.mark.parametrize(
+    ("bound", "text"),
+    [
+        (("angle",), "must be a tuple of `FlatBound`"),
+        (FlatBound("angle", 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound((), 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound(("q",), 1, -1.0, "slow"), "must name different outputs of the chains, `angle`"),
+        (FlatBound(("angle", "angle"), 1, 0.0, "slow"), "must name different outputs"),
+        (FlatBound(("angle",), 0, -1.0, "slow"), "order 0 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 2, -1.0, "slow"), "order 2 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 1.0, -1.0, "slow"), "order 1.0 of `angle`, and allowed is 1"),
+        (FlatBound(("angle",), 1, float("nan"), "slow"), "above nan, which must be a finite"),
+    ],
+)
+def test_a_bound_of_which_nothing_is_proved_is_refused(bound, text):
+    with pytest.raises(EchelonError, match=text):
+        StoppingPoint().prepared(bounded(bound), TREE)
+
+
+def test_bounds_of_chains_that_differ_are_refused():
+    class Mixed(ech.ControlAffine):
+        """An output that is pushed, and one that is commanded."""
+
+        state_names = ("x", "v", "y")
+        input_names = ("push", "speed")
+        flat_outputs = ("x", "y")
+        flat_chains = FlatChains((2, 1), (0, 0))
+        flat_bounds = (FlatBound(("x", "y"), 1, 0.0, "moving"),)
+
+        def drift(self, x):
+            return jnp.stack([x[1], 0.0 * x[0], 0.0 * x[0]])
+
+        def input_map(self, x):
+            return jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+
+    with pytest.raises(EchelonError, match="chains of 2 and 1 integrators, which must be alike"):
+        StoppingPoint().prepared(Mixed(), TREE)
+
+
+SLOW = FlatBound(("angle",), 1, -1.0, "a rate above -1")
+
+
+def test_starts_beyond_a_bound_that_no_integrator_decides_are_refused():
+    parts = swings(bounded(SLOW))
+    for rate, refused in ((-0.9, False), (-1.1, True)):
+        law = StoppingPoint().prepared(parts.model, TREE)
+        found = list(law.refusals(parts.model, np.array([[0.3, rate], [0.3, 2.0]])))
+        assert [k for k, _ in found] == [0] * refused
+    assert found[0][1] == "`angle'` is -1.1 there, allowed is a rate above -1"
+
+
+@pytest.mark.slow
+def test_a_bound_that_no_integrator_decides_is_promised_and_flown():
+    parts = swings(bounded(SLOW)).replace(initial={"angle": 1.0})
+    found = promised(parts)
+    assert found.promised and 0.0 < found.tube.left < 1.0
+    result = ech.simulate(parts, ech.Settings(horizon=4.0, dt=0.01))
+    assert result.states[:, :, 1].min() >= found.tube.left - 1.0
+
+
+class Lost(ech.models.Pendulum):
+    """A pendulum whose torque is lost where it hangs level, which inherits a word."""
+
+    def input_map(self, x):
+        return super().input_map(x) * jnp.cos(x[0])
+
+
+class Stated(Lost):
+    """The same with a word of its own."""
+
+    flat_bounds = ()
+
+
+class Quickened(ech.models.Unicycle):
+    """A unicycle that is quicker elsewhere, which inherits the bound of its speed."""
+
+    def input_map(self, x):
+        return super().input_map(x) * (1.0 + x[0] ** 2)
+
+
+class Damped(ech.models.Pendulum):
+    """A pendulum of another friction: what it inherits is proved of it again."""
+
+    def drift(self, x):
+        return super().drift(x) - jnp.stack([0.0 * x[0], x[1] ** 3])
+
+
+class Renamed(ech.models.Unicycle):
+    """A unicycle that moves as it does."""
+
+    input_names = ("v", "w")
+
+
+@pytest.mark.parametrize(
+    ("model", "known"),
+    [
+        (Lost(), False),
+        (Stated(), True),
+        (Quickened(), False),
+        (Damped(), True),
+        (Renamed(), True),
+        *((getattr(ech.models, name)(), True) for name in ("Unicycle", "Pendulum", "VanDerPol")),
+        *((getattr(ech.models, name)(), True) for name in ("Quadrotor", "PlanarQuadrotor")),
+        *((getattr(ech.models, name)(), True) for name in ("QuadrotorEuler", "QuadrotorThrust")),
+        *((getattr(ech.models, f"{name}Integrator")(), True) for name in ("Single", "Double")),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_word_on_borders_is_of_the_motion_that_it_was_given_with(model, known):
+    assert (bounds_of(model, chains_of(model)) is not None) == known

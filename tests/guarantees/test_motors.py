@@ -1,0 +1,261 @@
+"""The certificate of motors under `stopping-point`: enclosures by second ways, and attacks."""
+
+import json
+from fractions import Fraction
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import echelon as ech
+from echelon.core.enclosure.series import enclose_derivatives
+from echelon.core.errors import GainError
+from echelon.core.numerics import precision
+from echelon.core.statement import Hypothesis
+from echelon.core.words import Kind, Verdict
+from echelon.guarantees.promises.promise import promise, promises
+from echelon.guarantees.stopping.chain_response import Chain
+from echelon.guarantees.stopping.motor_bounds import Asked, motors_for
+from echelon.guarantees.stopping.time_slices import slices_of
+from echelon.guarantees.verifier.verify import verify
+from echelon.simulation.engine.prepare import prepare
+
+QUADROTOR = ech.models.Quadrotor()
+MIXER = np.asarray(QUADROTOR.input_limits.matrix)
+
+
+# ---- a path over time ----------------------------------------------------------------------------
+
+
+def hard(t):
+    """All functions that a path may be made of, where each is defined."""
+    u, v = 0.3 * jnp.sin(t) + 0.5, jnp.sqrt(1.5 + jnp.cos(2.0 * t))
+    return jnp.stack(
+        [
+            jnp.exp(u) * v**3 + jnp.log(v) / jnp.cosh(u) + jnp.sinh(u) * jnp.expm1(v),
+            jnp.arctan(u * v) + jnp.arcsin(u) - jnp.arccos(u) * jnp.tanh(v),
+            jnp.tan(u) ** 2 + u**1.5 + jax.nn.sigmoid(t) - jnp.log1p(v) + 1.0 / v**2,
+        ]
+    )
+
+
+@pytest.mark.parametrize("path", [ech.references.Lemniscate(), hard], ids=["lemniscate", "hard"])
+def test_a_path_and_its_derivatives_lie_in_their_enclosure(path):
+    times = [Fraction(k, 100) for k in range(4)]
+    with precision("float64"):
+        rows = [path]
+        for _ in range(4):
+            rows.append(jax.jacfwd(rows[-1]))
+        every = jax.jit(jax.vmap(lambda t: jnp.stack([row(t) for row in rows])))
+        for piece, low, high in zip(enclose_derivatives(path, times, 4), times, times[1:]):
+            seen = np.asarray(every(jnp.linspace(float(low), float(high), 30)))
+            lows = np.array([[float(x.lo) for x in row] for row in piece])
+            highs = np.array([[float(x.hi) for x in row] for row in piece])
+            slack = 1e-11 * (1.0 + np.abs(seen).max(axis=0))
+            assert (seen >= lows - slack).all() and (seen <= highs + slack).all()
+            # Near, too: farther off by less than half of the values themselves.
+            size = 1.0 + np.abs(seen).max(axis=0)
+            assert (highs - lows <= np.ptp(seen, axis=0) + 0.5 * size).all()
+
+
+def test_a_path_that_has_no_enclosure_is_told():
+    with pytest.raises(GainError, match="`floor`"):
+        list(enclose_derivatives(lambda t: jnp.floor(t)[None], [Fraction(0), Fraction(1)], 2))
+
+
+# ---- agents over time ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("roots", [(2.0, 2.5, 3.0), (4.0, 4.5, 5.0)])
+def test_responses_stay_in_their_slices(roots):
+    slices, size = slices_of(Chain.of(roots)), len(roots)
+    A = np.eye(size, k=1)
+    A[-1] = -np.poly(-np.array(roots))[:0:-1]
+    b, times = np.eye(size)[-1] * -np.prod(roots), np.linspace(0.0, 6.0, 3001)
+    flow, states = scipy.linalg.expm(A * times[1]), [np.column_stack([np.eye(size), b])]
+    for _ in times[1:]:
+        states.append(flow @ states[-1])
+    # v .. v^(p), of starts 1 in v, v', v'', and of an impulse.
+    every = np.stack(states)
+    every = np.concatenate([every, (A[-1] @ every)[:, None]], axis=1)
+    kernels = np.abs(every[:, :, -1])
+    grown = np.concatenate(
+        [np.zeros((1, size + 1)), np.cumsum(0.5 * (kernels[1:] + kernels[:-1]), axis=0) * times[1]]
+    )
+    grown[:, -1] += np.prod(roots)
+    for piece in slices:
+        end = np.inf if piece.end is None else float(piece.end)
+        inside = (times >= float(piece.begin)) & (times <= end)
+        if inside.any():
+            free = np.abs(every[inside][:, :, :-1]).max(axis=0)
+            bounds = np.array(piece.whole.free, float)
+            assert (free <= bounds + 1e-9).all() and (bounds <= 1.05 * free + 1.0).all()
+            driven = np.array(piece.whole.driven, float)
+            assert (grown[inside].max(axis=0) <= driven + 1e-4 * driven).all()
+    assert float(slices[0].begin) == 0.0 and slices[-1].end is None
+
+
+# ---- motors --------------------------------------------------------------------------------------
+
+
+def flown(free, bounds):
+    """The motors of a motion within bounds, by the model's own inverse, from any numbers (12,)."""
+    a, j, s, low, high, jz, sz, turn, turning = bounds
+
+    def ball(v):
+        return v / jnp.maximum(1.0, jnp.linalg.norm(v))
+
+    rows = jnp.zeros((5, 4)).at[2, :2].set(a * ball(free[:2])).at[3, :2].set(j * ball(free[2:4]))
+    rows = rows.at[4, :2].set(s * ball(free[4:6]))
+    rows = rows.at[2, 2].set(low + (high - low) * 0.5 * (1.0 + jnp.tanh(free[6])))
+    rows = rows.at[3, 2].set(jz * jnp.tanh(free[7])).at[4, 2].set(sz * jnp.tanh(free[8]))
+    rows = rows.at[0, 3].set(free[9]).at[1, 3].set(turn * jnp.tanh(free[10]))
+    return MIXER @ QUADROTOR.flat(rows.at[2, 3].set(turning * jnp.tanh(free[11])))[1]
+
+
+def climbed(bounds, starts):
+    """The least and the largest motor that gradients find from starts (K, 12)."""
+
+    def climb(free, sign):
+        # The motor that is worst, downward or upward.
+        ascent = jax.value_and_grad(lambda f: jnp.max(sign * flown(f, bounds)))
+
+        def step(k, state):
+            free, best = state
+            value, slope = ascent(free)
+            free = free + 0.3 * 0.98**k * slope / (jnp.linalg.norm(slope) + 1e-12)
+            return free, jnp.maximum(best, value)
+
+        return jax.lax.fori_loop(0, 150, step, (free, -jnp.inf))[1]
+
+    found = jax.vmap(lambda f: jnp.stack([-climb(f, -1.0), climb(f, 1.0)]))(starts)
+    return jnp.nanmin(found[:, 0]), jnp.nanmax(found[:, 1])
+
+
+@pytest.mark.slow
+def test_no_motion_within_bounds_asks_more_of_motors_and_the_worst_nearly_does():
+    draw, near = np.random.default_rng(0), []
+    with precision("float64"):
+        search = jax.jit(climbed)
+        for _ in range(8):
+            a, j, s, low, high, jz, sz, turn, turning = bounds = draw.uniform(
+                [0, 0, 0, -3, 0, 0, 0, 0, 0], [7, 15, 120, 0, 5, 5, 30, 1, 2]
+            )
+            exact = [Fraction(float(x)) for x in bounds]
+            asked = Asked(tuple(exact[:3]), exact[3], exact[4], tuple(exact[5:7]), tuple(exact[7:]))
+            found = motors_for(QUADROTOR.airframe, asked)
+            least, largest = map(float, search(jnp.asarray(bounds), draw.normal(size=(60, 12)) * 2))
+            assert float(found.least) <= least and largest <= float(found.largest)
+            near.append((largest - least) / float(found.largest - found.least))
+    assert np.median(near) > 0.6
+
+
+GENTLE = (
+    "follower.roots=[2, 2.5, 3]",
+    "leader.roots=[2, 2.5, 3]",
+    "follower.speed=[1.4, 1.4, 0.7, 0.3]",
+    "leader.speed=[0.7, 0.7, 0.7, 0.3]",
+)
+
+
+def gentle(*more):
+    return ech.build(ech.load_scenario("paper-global", overrides=[*GENTLE, *more]))
+
+
+@pytest.fixture(scope="module")
+def hovering():
+    """Parts and settings of a leader that hovers, whose path is one piece, and the promise."""
+    parts, settings = gentle("reference={name: hover}", "leader.start_error={x: 5}")
+    return parts, settings, promise(parts, settings)
+
+
+def test_said_briefly_a_promise_is_the_same_but_for_motors_and_arrival(hovering):
+    parts, settings, whole = hovering
+    # Of other parts, since a promise is kept for those of which it was asked.
+    [brief] = promises(parts.replace(), [settings], briefly=True)
+    assert whole.tube.strain is not None and whole.tube.arrival is not None
+    assert brief.tube == whole.tube._replace(strain=None, arrival=None)
+    assert "motors" not in brief.sentence() and "within 1 cm" not in brief.sentence()
+    for name in ("promised", "reasons", "kind", "theorem", "rate", "hold", "certified"):
+        assert getattr(brief, name) == getattr(whole, name), name
+    rest = {name: line for name, line in whole.hypotheses.items() if name is not Hypothesis.LIMITS}
+    assert dict(brief.hypotheses) == rest
+
+
+def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
+    _, _, found = hovering
+    strain, line = found.tube.strain, found.hypotheses[Hypothesis.LIMITS]
+    assert line.verdict is Verdict.HOLDS and line.kind is Kind.PROOF
+    assert 0.0 < strain.least < QUADROTOR.mass * QUADROTOR.gravity / 4.0 < strain.largest < 0.15975
+    assert "motors give between" in found.sentence() and strain.alone.rest
+    told = found.as_mapping()
+    file = tmp_path / "summary.json"
+
+    def check():
+        file.write_text(json.dumps({"promise": told}))
+        return verify(file)
+
+    assert check().holds, check().sentence
+    motors = told["anywhere"]["motors"]
+    for place, key, factor in (
+        (motors, "least", 1.02),
+        (motors, "largest", 0.99),
+        (motors["alone"], "tilt", 1.1),
+        (motors["alone"], "upward", 1.1),
+        (motors["speeds"], 0, 1.1),
+    ):
+        was, place[key] = place[key], place[key] * factor
+        assert check().verdict == "refused", key
+        place[key] = was
+
+
+def test_motors_that_may_not_suffice_leave_the_promise_of_the_tube(hovering):
+    parts, settings, _ = hovering
+    law, speeds = parts.drive.follower, (4.0, 4.0, 0.7, 0.3)
+    fast = parts.replace(
+        drive=parts.drive.with_follower(eqx.tree_at(lambda law: law.speed, law, speeds))
+    )
+    found = promise(fast, settings)
+    assert found.promised and found.tube.strain is None
+    line = found.hypotheses[Hypothesis.LIMITS]
+    assert line.fails and "gentler `roots`" in line.remedy
+    free = promise(parts, settings._replace(limits=False))
+    assert free.hypotheses[Hypothesis.LIMITS].verdict is Verdict.NOT_NEEDED
+
+
+@pytest.mark.slow
+def test_starts_at_the_edge_of_the_certificate_are_flown_within_it():
+    parts, settings = gentle("simulation.horizon=6")
+    strain = promise(parts, settings).tube.strain
+    draw, found = np.random.default_rng(0), []
+    start = prepare(parts, settings).problem.states
+    for kind in ("tilt", "sideways", "upward", "rate", "rest"):
+        x = start.copy()
+        for agent in x[1:]:
+            agent[:] = x[0]
+            agent[:3] += draw.uniform(-8.0, 8.0, 3)
+            way = draw.uniform(-np.pi, np.pi)
+            along = np.array([np.cos(way), np.sin(way)])
+            if kind == "tilt":
+                # Yaw 0: pitch leans forward, roll to the right.
+                lean = np.tan(strain.alone.tilt) * along
+                agent[6:] = 0.0
+                agent[7] = np.arctan(lean[0])
+                agent[6] = np.arctan(-lean[1] * np.cos(agent[7]))
+            elif kind == "sideways":
+                agent[3:5] += strain.alone.sideways * along
+            elif kind == "upward":
+                agent[5] += strain.alone.upward * draw.choice([-1.0, 1.0])
+            else:
+                agent[6:] = 0.0
+                agent[8] = way
+                agent[9:11] = strain.alone.rate * along * (kind == "rate")
+                agent[3:6] *= kind == "rate"
+        # Off limits, so that what motors would have to give is seen.
+        run = ech.simulate(parts.replace(initial=x), settings._replace(dt=0.001, limits=False))
+        found.append(run.inputs @ MIXER.T)
+    assert min(each.min() for each in found) > 0.0
+    assert max(each.max() for each in found) < QUADROTOR.motor_thrust

@@ -1,0 +1,365 @@
+"""The independent check of saved gains: what it accepts, what it refuses, and its own algebra."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import echelon as ech
+from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.part import resolve
+from echelon.guarantees.verifier.algebra import (
+    ends_of_many,
+    grounded_rows,
+    observable,
+    rightmost,
+    spectrum,
+)
+from echelon.guarantees.verifier.enclosed import farthest_outside
+from echelon.guarantees.verifier.exact_minors import (
+    first_unproved,
+    inverse,
+    is_positive_definite,
+    product,
+    rows_of,
+)
+from echelon.guarantees.verifier.saved_gain import SavedGraph
+
+ROOT = Path(__file__).resolve().parents[2]
+LINE = ech.Graph.path(4)
+
+
+def study():
+    """The catalogue of faults, which the benchmark plants in more and larger gains."""
+    path = ROOT / "benchmarks" / "planted_faults.py"
+    spec = importlib.util.spec_from_file_location("planted_faults", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+STUDY = study()
+FAST = [
+    "given, linear",
+    "inner loop, double integrator",
+    "contraction, pendulum, proof",
+    "robust LQR, spring, samples",
+    "robust LQR, planar quadrotor, T2",
+]
+
+
+def test_the_checker_loads_nothing_of_the_synthesis():
+    code = (
+        "import sys, echelon.guarantees.verifier.verify, echelon.agents.models\nprint(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ours = {name.removeprefix("echelon.") for name in done.stdout.split() if "echelon." in name}
+    assert "verifier.exact" in ours and not ours & {"models.linearization", "models.check"}
+    # `core.program` and `core.store` keep what is found; the checker asks them for nothing.
+    shared = {"core", "core.errors", "core.kept", "core.limits", "core.numerics", "core.program"}
+    shared |= {"core.store", "core.types"}
+    assert {name for name in ours if name.split(".")[0] not in ("models", "verifier")} <= shared
+
+
+# ---- files as they are written, and with faults ----
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The file of each fast case, as JSON reads it."""
+    folder = tmp_path_factory.mktemp("gains")
+    return {name: STUDY.saved(STUDY.SMALL[name], folder) for name in FAST}
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_an_untouched_file_is_accepted_and_every_planted_fault_refused(files, name, tmp_path):
+    told, model = files[name], STUDY.own_model(STUDY.SMALL[name])
+    file = tmp_path / "gain.json"
+    file.write_text(json.dumps(told))
+    found = ech.verify(file, model)
+    assert found.holds and {each.verdict for each in found.findings} == {"holds"}
+    planted = list(STUDY.planted(told))
+    missed = [what for _, what, faulty in planted if not STUDY.refused(faulty, tmp_path, model)]
+    assert len(planted) >= 25 and missed == []
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from([1e-6, 1e-4, 1e-2]))
+def test_no_perturbation_of_the_metric_passes(files, seed, size, tmp_path_factory):
+    told = json.loads(json.dumps(files["contraction, pendulum, proof"]))
+    random = np.random.default_rng(seed)
+    # Half of the size at least in every entry, and no sign that makes up for another.
+    change = random.uniform(0.5, 1.0, (2, 2)) * random.choice([-1.0, 1.0])
+    told["P"] = (np.array(told["P"]) * (1.0 + size * 0.5 * (change + change.T))).tolist()
+    assert STUDY.refused(told, tmp_path_factory.getbasetemp(), None)
+
+
+@pytest.mark.parametrize("name", registry.MODELS)
+def test_every_bundled_model_is_made_again_from_its_file(name, tmp_path):
+    kind = resolve(registry.MODELS[name])
+    model = kind([[0.0, 1.0], [-2.0, 0.1]], [[0.0], [3.0]]) if name == "linear" else kind()
+    ech.save_gain(
+        ech.synthesize(model, LINE, ech.gains.FixedGain()), model, LINE, tmp_path / "gain.json"
+    )
+    found = ech.verify(tmp_path / "gain.json")
+    assert found.holds, found.sentence
+    assert {each.verdict for each in found.findings} == {"holds"}
+
+
+@pytest.mark.parametrize(
+    ("graph", "verdict"),
+    [(ech.Graph.path(501), "verified"), (ech.Graph.complete(80), "incomplete")],
+)
+def test_large_graphs_are_checked_as_far_as_their_edges_are_there(graph, verdict, tmp_path):
+    model = ech.models.DoubleIntegrator(1)
+    ech.save_gain(
+        ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, tmp_path / "gain.json"
+    )
+    found = ech.verify(tmp_path / "gain.json")
+    open_ = [each.claim for each in found.findings if each.verdict == "not checked"]
+    assert found.verdict == verdict and found.holds is (verdict == "verified")
+    assert open_ == ([] if found.holds else ["graph spectrum"])
+
+
+def test_a_model_of_ones_own_must_be_given_and_is_never_imported(tmp_path):
+    model, file = STUDY.Soft(), tmp_path / "gain.json"
+    ech.save_gain(ech.synthesize(model, LINE, ech.gains.Riccati()), model, LINE, file)
+    found = ech.verify(file)
+    verdicts = {each.claim: each.verdict for each in found.findings}
+    assert not found.holds and verdicts["equations of the model"] == "not checked"
+    assert (
+        found.sentence
+        == "Incomplete: 14 claims hold as stored, and could not be checked: equations of the model."
+    )
+    assert ech.verify(file, model).sentence.startswith("Verified:")
+    assert not ech.verify(file, ech.models.Pendulum()).holds
+    told = json.loads(file.read_text())
+    told["model"]["class"] = "antigravity:Thing"
+    file.write_text(json.dumps(told))
+    assert ech.verify(file).verdict == "incomplete" and "antigravity" not in sys.modules
+
+
+def test_a_proof_that_holds_is_found_again_at_its_rate_and_not_far_above(files):
+    told = files["contraction, pendulum, proof"]
+    region = told["certificate"]["region"]
+    base = np.array(region["hull"]["base"])
+    hull = np.repeat(base[None], len(region["hull"]["values"]), axis=0)
+    rows, columns = np.array(region["hull"]["places"]).T
+    hull[:, rows, columns] = region["hull"]["values"]
+    parts = (told["P"], told["model"]["B"], told["R"])
+    parts = (*map(np.array, parts), hull, np.array(region["error"]), Fraction(region["strength"]))
+    assert first_unproved(*parts, region["rate"]) is None
+    assert first_unproved(*parts, region["rate"] * (1.0 + 1e-4)) is not None
+
+
+# ---- bad input ----
+
+BROKEN = {
+    "the file must be a mapping": lambda told: [told],
+    "`P` is missing": lambda told: {key: told[key] for key in told if key != "P"},
+    "`P` must be 2 x 2 finite numbers (to 1e50)": lambda told: told | {"P": [[1.0]]},
+    "`R` must be 1 x 1 finite numbers": lambda told: told | {"R": [[float("nan")]]},
+    "`coupling` must be a finite number (to 1e50)": lambda told: told | {"coupling": float("inf")},
+    "`graph.agents` must be a whole number from 2 on (to 1e9)": lambda told: (
+        told | {"graph": told["graph"] | {"agents": True}}
+    ),
+    "`graph` must name agents from 0 to 3": lambda told: (
+        told | {"graph": told["graph"] | {"leaders": [7]}}
+    ),
+    "`graph.edges` must be null for more than 2000 edges": lambda told: (
+        told | {"graph": told["graph"] | {"edges": [[0, 1, 1.0]] * 2001}}
+    ),
+    "`certificate.region.kind` must be one of `proof`, `vertices`, `samples`": lambda told: changed(
+        told, kind="sure"
+    ),
+    "`certificate.region.hull` must be a mapping": lambda told: changed(told, hull=[]),
+    "`certificate.region.domain.lower` is missing": lambda told: changed(told, domain={}),
+    "its `format` must be `echelon gain 2`": lambda told: told | {"format": "echelon gain 1"},
+}
+
+
+def changed(told, **parts):
+    certificate = told["certificate"]
+    region = certificate["region"] | parts
+    return told | {"certificate": certificate | {"region": region}}
+
+
+@pytest.mark.parametrize("wanted", BROKEN)
+def test_what_is_no_gain_has_its_sentence(files, wanted, tmp_path):
+    file = tmp_path / "gain.json"
+    file.write_text(json.dumps(BROKEN[wanted](files["contraction, pendulum, proof"])))
+    with pytest.raises(ech.EchelonError) as caught:
+        ech.verify(file)
+    assert wanted.replace("the file must", "`the file` must") in str(caught.value)
+    assert str(caught.value).count("\n") == 0
+
+
+def places(told, path=()):
+    """The path to every part of a file."""
+    parts = told.items() if isinstance(told, dict) else enumerate(told) if path else ()
+    for key, part in parts:
+        yield (*path, key)
+        if isinstance(part, (dict, list)):
+            yield from places(part, (*path, key))
+
+
+ODD = [None, 0, -1, 1e308, -1e50, 1e-320, 10**400, 10**9, "x", [], {}, True, [[1]], 2.5]
+ODD += [
+    "echelon.agents.models.pendulum:Nope",
+    "echelon.agents.models.model_check:check_model",
+    "echelon.agents.models._x:y",
+]
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_whatever_stands_in_a_file_it_is_refused_in_words(files, data, tmp_path_factory):
+    told = json.loads(json.dumps(files[data.draw(st.sampled_from(FAST[:3]))]))
+    path = data.draw(st.sampled_from(list(places(told))))
+    value, part = data.draw(st.sampled_from(ODD)), told
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    file = tmp_path_factory.getbasetemp() / "odd.json"
+    file.write_text(json.dumps(told))
+    try:
+        found = ech.verify(file)
+    except ech.EchelonError as error:
+        assert str(error).count("\n") == 0
+    else:
+        verdicts = {each.verdict for each in found.findings}
+        wanted = "incomplete" if "not checked" in verdicts else "verified"
+        assert found.verdict == ("refused" if "refused" in verdicts else wanted)
+        assert found.sentence.startswith(found.verdict.capitalize())
+        assert found.holds is (found.verdict == "verified")
+
+
+def test_the_command_prints_a_table_and_exits_by_what_holds(files, echelon, tmp_path):
+    file, told = tmp_path / "gain.json", files["contraction, pendulum, proof"]
+    file.write_text(json.dumps(told))
+    code, out, err = echelon("verify", file)
+    assert (code, err) == (0, "") and "recomputed" in out
+    count = len(ech.verify(file).findings)
+    assert out.splitlines()[-1] == f"Verified: {count} claims hold as stored."
+    file.write_text(json.dumps(changed(told, radius=2.0)))
+    code, out, _ = echelon("verify", file, "--json")
+    told = json.loads(out)
+    assert code == 1 and not told["holds"]
+    assert told["sentence"] == "Refused: radius does not hold as stored."
+    assert [each["claim"] for each in told["findings"] if each["verdict"] == "refused"] == [
+        "radius"
+    ]
+    file.write_text("no JSON")
+    code, out, err = echelon("verify", file)
+    assert (code, out) == (2, "") and "is no JSON" in err and err.count("\n") == 1
+    code, _, err = echelon("verify", tmp_path / "nothing.json")
+    assert code == 2 and "cannot be read" in err
+
+
+# ---- its algebra ----
+
+
+@given(
+    st.integers(1, 4).flatmap(
+        lambda n: st.lists(st.lists(st.integers(-3, 3), min_size=n, max_size=n), min_size=1)
+    )
+)
+def test_a_gram_matrix_is_definite_exactly_when_its_rows_have_full_rank(rows):
+    M = np.array(rows, float)
+    gram = rows_of(M.T @ M)
+    full = np.linalg.matrix_rank(M) == M.shape[1]
+    assert is_positive_definite(gram) is bool(full)
+    if full:
+        one = product(gram, inverse(gram))
+        assert all(x == (i == j) for i, row in enumerate(one) for j, x in enumerate(row))
+
+
+def test_the_sign_of_a_minor_is_not_a_matter_of_rounding():
+    # det = (1 + e) - 1 with e half of what float64 can see beside 1, and its negative.
+    tiny = Fraction(1, 2**60)
+    assert is_positive_definite([[Fraction(1), Fraction(1)], [Fraction(1), 1 + tiny]])
+    assert not is_positive_definite([[Fraction(1), Fraction(1)], [Fraction(1), 1 - tiny]])
+    assert not is_positive_definite([[Fraction(1), Fraction(1)], [Fraction(1), Fraction(1)]])
+    assert not is_positive_definite([[Fraction(1), Fraction(0)], [tiny, Fraction(1)]])
+
+
+@pytest.mark.parametrize("followers", [3, 30, 450])
+def test_the_spectrum_of_a_chain_is_its_closed_form(followers):
+    edges = np.array([(k, k + 1, 1.0) for k in range(followers)])
+    found, bound = spectrum(SavedGraph(followers + 1, (0,), edges, np.zeros(1)), edges)
+    k = np.arange(1, followers + 1)
+    wanted = 4.0 * np.sin((2 * k - 1) * np.pi / (4 * followers + 2)) ** 2
+    assert found == pytest.approx(wanted, rel=1e-11)
+    assert found[0] == pytest.approx(wanted[0], rel=1e-13)
+    assert wanted[0] * (1.0 - 1e-11) <= bound <= wanted[0]
+    many = wanted if followers <= 400 else wanted[[0, -1]]
+    assert ends_of_many(found) == pytest.approx(many, rel=1e-11)
+
+
+def test_the_exact_laplacian_loses_no_weight():
+    edges = np.array([(0, 1, 0.1), (1, 2, 0.2), (0, 2, 0.7)])
+    rows = grounded_rows(SavedGraph(3, (0,), edges, np.zeros(1)), edges)
+    assert rows[0][0] == Fraction(0.1) + Fraction(0.2) and rows[0][1] == -Fraction(0.2)
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5), st.integers(0, 3))
+def test_the_rank_of_what_is_seen_is_that_of_the_part_that_is_built_in(seed, seen, hidden):
+    random = np.random.default_rng(seed)
+    n = seen + hidden
+    A = np.zeros((n, n))
+    # A chain is seen whole from its first state; the rest drives nothing and is never seen.
+    A[np.arange(seen - 1), np.arange(1, seen)] = random.uniform(0.5, 2.0, seen - 1)
+    A[seen:] = random.normal(size=(hidden, n))
+    turn, _ = np.linalg.qr(random.normal(size=(n, n)))
+    C = np.eye(n)[:1]
+    assert observable(turn @ A @ turn.T, C @ turn.T) == seen
+
+
+def test_the_rightmost_eigenvalue_knows_how_well_it_is_known():
+    value, slack = rightmost(np.diag([-3.0, -1.0]))
+    assert value == -1.0 and slack < 1e-13
+    value, slack = rightmost(np.array([[-1.0, 1.0], [0.0, -1.0]]))
+    assert value == pytest.approx(-1.0, abs=1e-7) and 1e-10 < slack
+
+
+@given(st.integers(0, 10**6))
+def test_combinations_lie_inside_and_points_beyond_a_corner_do_not(seed):
+    random = np.random.default_rng(seed)
+    hull = random.normal(size=(9, 2, 3))
+    hull[:, 0, 0] = 4.0
+    weights = random.dirichlet(np.ones(9), 5)
+    error = np.zeros((2, 3))
+    assert farthest_outside(hull, error, np.tensordot(weights, hull, 1)) < 1e-12
+    highest = hull[hull[:, 1, 1].argmax()]
+    beyond = highest.copy()
+    beyond[1, 1] += 0.1 * np.ptp(hull[:, 1, 1])
+    # No combination reaches beyond the highest corner, and the nearest need not be far in others.
+    assert 0.1 * (1.0 - 1e-9) <= farthest_outside(hull, error, beyond[None]) < 0.2
+    off = highest.copy()
+    off[0, 0] += 0.4
+    assert farthest_outside(hull, error, off[None]) == pytest.approx(0.1 * 1000.0)
+    error[0, 0] = 0.4
+    assert farthest_outside(hull, error, off[None]) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("summary", "sentence"),
+    [
+        ('{"promise": {', "`run/summary.json` cannot be read, or is damaged: "),
+        ("[1]", "`run/summary.json` is damaged: it holds no mapping."),
+        ('{"gain": {"coupling": 1.0}}', "`run` has lost its `gain.json`; `echelon run run --out"),
+        ('{"gain": null}', "the law of `run` left neither a gain nor a tube to verify."),
+    ],
+)
+def test_a_run_without_what_it_promised_is_told_so(echelon, here, summary, sentence):
+    (here / "run").mkdir()
+    (here / "run" / "summary.json").write_text(summary)
+    code, _, fault = echelon("verify", "run")
+    assert code == 2 and fault.startswith(f"echelon: {sentence}") and fault.count("\n") == 1

@@ -1,0 +1,346 @@
+"""Figures that a recording is drawn as again: limits, promises, distances, and sizes of a page."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from recordings import PROMISE, flown, tracked
+
+from echelon.agents.network.switching import Schedule
+from echelon.core.errors import OutputError
+from echelon.output.plots.network import curves_of
+from echelon.output.plots.run_figures import NAMES, figures
+from echelon.output.plots.style import ONE_COLUMN, TWO_COLUMNS
+
+CERTIFIED = PROMISE | {
+    "theorem": "T1",
+    "kind": "proof",
+    "certified_set": {"radius": 9.0, "kind": "proof", "why": ""},
+    "hypotheses": [{"statement": "starts in the certified set", "verdict": "holds"}],
+}
+
+
+@pytest.fixture(scope="module")
+def run():
+    own = flown(seconds=4.0)
+    rate = np.gradient(own.lyapunov, own.times)
+    return dataclasses.replace(own, tracking=tracked(own), lyapunov_rate=rate)
+
+
+@pytest.fixture(scope="module")
+def flock():
+    return flown(60, 2.0, rate=20.0, leaders=tuple(range(0, 60, 20)))
+
+
+def lines_of(figure, place=0):
+    return {line.get_label(): line.get_xydata() for line in figure.axes[place].get_lines()}
+
+
+def test_there_is_a_figure_of_each_name(run):
+    made = figures(run, NAMES)
+    assert tuple(made) == NAMES
+    for name, figure in made.items():
+        for ax in figure.axes:
+            assert ax.get_ylabel() or name in ("inputs", "network"), name
+
+
+def test_inputs_stand_in_percent_of_their_limits_which_are_drawn(run):
+    figure = figures(run, ["inputs"])["inputs"]
+    lines = lines_of(figure)
+    np.testing.assert_allclose(lines["follower 2"][:, 1], 100.0 * run.inputs[:151, 2].max(axis=1))
+    assert set(lines["limit"][:, 1]) == {100.0}
+    low, high = figure.axes[0].get_ylim()
+    assert low < 0.0 and high > 100.0
+    assert figure.axes[0].get_xlim() == (0.0, 3.0)
+
+
+def test_inputs_without_limits_have_their_names_and_units(run):
+    free = dataclasses.replace(run, bounds=None)
+    figure = figures(free, ["inputs"])["inputs"]
+    assert [ax.get_ylabel() for ax in figure.axes] == ["u0 (N)", "u1 (N)", "u2 (N)", "u3 (N)"]
+
+
+def test_the_slope_that_is_promised_is_drawn_from_the_largest_error_on(run):
+    worst = run.formation_errors.max(axis=1)
+    (t0, first), (t1, last) = lines_of(figures(run, ["formation"])["formation"])[
+        "slope promised: \u22120.5 1/s"
+    ]
+    assert first == worst.max() and t0 == run.times[worst.argmax()]
+    assert np.log(last / first) == pytest.approx(-0.5 * (t1 - t0))
+    (t0, first), (t1, last) = lines_of(figures(run, ["lyapunov"])["lyapunov"])[
+        "slope promised: \u22121 1/s"
+    ]
+    assert np.log(last / first) == pytest.approx(-1.0 * (t1 - t0))
+
+
+def test_nothing_is_drawn_of_a_promise_that_is_none(run):
+    none = dataclasses.replace(run, promise=PROMISE | {"promised": False, "rate": None})
+    for name in ("formation", "lyapunov"):
+        assert not [k for k in lines_of(figures(none, [name])[name]) if "promised" in k]
+
+
+def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_so(run):
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(12, 12))
+    P = root @ root.T + np.eye(12)
+    # Errors that shrink as promised in the metric of P, and not a bit faster.
+    shrink = np.exp(-0.5 * run.times)[:, None, None]
+    errors = shrink * rng.normal(size=(1, 4, 12))
+    errors[:, 0] = 0.0
+    proved = dataclasses.replace(run, errors=errors, metric=P, promise=CERTIFIED)
+    bound = proved.error_bound()
+    assert (bound[:, None] >= proved.formation_errors).all()
+    drawn = lines_of(figures(proved, ["formation"])["formation"])["bound, by proof (T1)"]
+    np.testing.assert_array_equal(drawn[:, 1], bound)
+    # Attained by an error along the direction in which the metric sees a position least.
+    worst = np.zeros((1, 4, 12))
+    block = np.linalg.inv(P)
+    direction = np.linalg.eigh(block[:3, :3])[1][:, -1]
+    worst[0, 1] = block[:, :3] @ direction
+    tight = dataclasses.replace(proved, errors=shrink * worst)
+    np.testing.assert_allclose(tight.error_bound(), tight.formation_errors[:, 1], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "spoiled",
+    [
+        {"limited": np.array([0.0, 0.1, 0.0, 0.0])},
+        {"metric": None},
+        {"promise": CERTIFIED | {"theorem": "T2"}},
+        {"promise": CERTIFIED | {"hypotheses": []}},
+        {"promise": CERTIFIED | {"promised": False}},
+        {"promise": CERTIFIED | {"sentence": "This is said without what the scenario adds: wind."}},
+    ],
+)
+def test_no_bound_is_drawn_that_is_not_promised_of_the_run(run, spoiled):
+    proved = dataclasses.replace(run, metric=np.eye(12), promise=CERTIFIED)
+    assert proved.error_bound() is not None
+    assert dataclasses.replace(proved, **spoiled).error_bound() is None
+
+
+def test_distances_are_those_of_linked_agents_with_those_wanted(run):
+    figure = figures(run, ["distances"])["distances"]
+    lines = lines_of(figure)
+    i, j = run.edges[1]
+    apart = np.linalg.norm(run.states[:, i, :3] - run.states[:, j, :3], axis=1)
+    np.testing.assert_allclose(lines[f"{i} to {j}"][:, 1], apart)
+    places = run.states[:, :, :3]
+    away = np.linalg.norm(places[:, :, None] - places[:, None], axis=3) + 1e9 * np.eye(4)
+    least = lines_of(figure, 1)["any two"][:, 1]
+    np.testing.assert_allclose(least, away.min(axis=(1, 2)))
+
+
+def test_the_network_has_every_edge_and_an_arrow_from_who_leads(run):
+    (ax,) = figures(run, ["network"])["network"].axes
+    (drawn,) = [part for part in ax.collections if len(part.get_segments()) == len(run.edges)]
+    places = run.offsets[:, :2]
+    np.testing.assert_allclose(np.stack(drawn.get_segments()), places[run.edges])
+    arrows = [text for text in ax.texts if getattr(text, "arrow_patch", None) is not None]
+    assert len(arrows) == sum(0 in edge for edge in run.edges.tolist())
+    assert {text.get_text() for text in ax.texts} - {""} == {"0", "1", "2", "3"}
+
+
+def test_a_graph_that_switches_has_the_links_of_each_time(run):
+    weights = np.array([[1.0, 1.0, 0.0], [0.0, 2.0, 1.0]])
+    schedule = Schedule(np.array([0.0, 2.5]), weights, None)
+    switched = dataclasses.replace(run, schedule=schedule, weights=weights.max(axis=0))
+    made = figures(switched, ["network", "distances", "trajectories"])
+    for ax, row in zip(made["network"].axes, weights, strict=True):
+        drawn = [line for part in ax.collections for line in part.get_segments()]
+        np.testing.assert_allclose(np.stack(drawn), run.offsets[run.edges[row > 0.0]][:, :, :2])
+    titles = [ax.get_title() for ax in made["network"].axes]
+    assert titles == ["from 0 to 2.5 s", "from 2.5 s on"]
+    for place, (i, j) in enumerate(run.edges):
+        shown = lines_of(made["distances"])[f"{i} to {j}"]
+        there = weights[(run.times >= 2.5).astype(int), place] > 0.0
+        np.testing.assert_array_equal(np.isfinite(shown[:, 1]), there)
+    # Of the six times of the graph three are before the switch.
+    grey = [line for line in made["trajectories"].axes[0].lines if line.get_zorder() == 3]
+    counts = [np.isfinite(np.array(line.get_data_3d())).all(axis=0).sum() for line in grey]
+    assert counts == [4] * 6
+    np.testing.assert_allclose(np.array(grey[5].get_data_3d()).T[3], run.states[-1, 0, :3])
+
+
+def test_a_flock_is_bands_a_median_and_its_worst_by_name(flock):
+    lines = lines_of(figures(flock, ["formation"])["formation"])
+    errors = flock.formation_errors[:, list(flock.followers)]
+    np.testing.assert_allclose(lines["median follower"][:, 1], np.median(errors, axis=1))
+    worst = flock.followers[int((errors**2).sum(axis=0).argmax())]
+    assert f"worst: follower {worst}" in lines
+
+
+def test_the_worst_of_a_flock_is_that_of_the_steady_window_as_in_the_table(flock):
+    errors = np.zeros_like(flock.errors)
+    errors[:, 7, 0] = np.where(flock.times < 0.8 * flock.horizon - 1e-9, 9.0, 0.1)
+    errors[:, 9, 0] = 1.0
+    told = lines_of(figures(dataclasses.replace(flock, errors=errors), ["formation"])["formation"])
+    assert "worst: follower 9" in told
+    # Ended before that window, it is the worst of all that there is.
+    early = dataclasses.replace(flock, errors=errors, horizon=9.0)
+    assert "worst: follower 7" in lines_of(figures(early, ["formation"])["formation"])
+
+
+def test_an_error_of_zero_is_no_tiny_number(flock):
+    still = dataclasses.replace(flock, errors=np.zeros_like(flock.errors))
+    (ax,) = figures(still, ["formation"])["formation"].axes
+    assert ax.get_ylim()[0] >= 1e-3
+
+
+@pytest.mark.parametrize(("page", "width"), [(ONE_COLUMN, 3.5), (TWO_COLUMNS, 7.16)])
+def test_figures_fit_the_columns_of_a_page_with_letters_of_8_points(run, flock, page, width):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    for own, names in ((run, NAMES), (flock, ("formation", "inputs", "trajectories"))):
+        for name, figure in figures(own, names, page).items():
+            assert figure.get_figwidth() == width and figure.get_figheight() <= 9.0, name
+            assert all(ax.yaxis.label.get_size() == 8.0 for ax in figure.axes)
+            renderer = FigureCanvasAgg(figure).get_renderer()
+            figure.draw(renderer)
+            for ax in figure.axes:
+                parts = [*ax._axis_map.values(), *filter(None, [ax.get_legend()])]
+                for box in filter(None, (part.get_tightbbox(renderer) for part in parts)):
+                    assert box.x0 >= -1 and box.x1 <= figure.bbox.x1 + 1, (name, own.agents)
+
+
+def test_the_last_time_stands_on_the_paper_whatever_style_draws_it(flock):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    longer = dataclasses.replace(flock, times=7.5 * flock.times, horizon=15.0)
+    figure = figures(longer, ["formation"], ONE_COLUMN)["formation"]
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    assert figure.axes[0].xaxis.get_tightbbox(renderer).x1 <= figure.bbox.x1
+
+
+def test_a_link_that_would_hide_behind_an_agent_is_bent_around_it():
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0], [1.5, 0.4]])
+    edges = np.array([[0, 1], [0, 2], [1, 3], [3, 0], [0, 4]])
+    lines = curves_of(places, edges, 0.15)
+    assert [len(line) == 2 for line in lines] == [True, False, False, False, True]
+    for edge, line in zip(edges, lines, strict=True):
+        np.testing.assert_allclose(line[[0, -1]], places[edge])
+        share = np.linspace(0.0, 1.0, len(line))
+        fine = np.stack([np.interp(np.arange(0, 1, 1e-3), share, c) for c in line.T], axis=1)
+        for other in np.delete(places, edge, axis=0):
+            assert np.linalg.norm(fine - other, axis=1).min() > 0.15
+
+
+def test_the_arrow_of_a_bent_link_lies_on_it(run):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    offsets = np.zeros_like(run.offsets)
+    offsets[:, :2] = [[0, 0], [1, 0], [2, 0], [1, 1]]
+    edges = np.array([[2, 0], [0, 1], [1, 3]])
+    straight = dataclasses.replace(run, offsets=offsets, edges=edges, heard=~np.isin(edges, [0]))
+    figure = figures(straight, ["network"])["network"]
+    (ax,) = figure.axes
+    FigureCanvasAgg(figure).draw()
+    (drawn,) = [part for part in ax.collections if len(part.get_segments()) == 3]
+    begin, *_, end = ways = ax.transData.transform(drawn.get_segments()[0])[::-1]
+    arrow = next(filter(None, (getattr(text, "arrow_patch", None) for text in ax.texts)))
+    handle = arrow.get_connectionstyle().connect(begin, end).vertices[1]
+    # Of a parabola with this handle the middle.
+    middle = 0.25 * (begin + 2.0 * handle + end)
+    np.testing.assert_allclose(middle, ways[len(ways) // 2], atol=1.0)
+    assert np.linalg.norm(middle - 0.5 * (begin + end)) > 20.0
+
+
+def test_links_past_the_palette_are_dashed_and_what_is_wanted_has_no_links_colour(run):
+    edges = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3], [3, 1]])
+    more = dataclasses.replace(
+        run, edges=edges, weights=np.ones(7), heard=np.ones((7, 2), bool), schedule=None
+    )
+    ax = figures(more, ["distances"])["distances"].axes[0]
+    named = {line.get_label(): line for line in ax.lines}
+    looks = {
+        (named[f"{i} to {j}"].get_color(), named[f"{i} to {j}"].get_linestyle()) for i, j in edges
+    }
+    assert len(looks) == 7
+    assert named["wanted"].get_color() not in {colour for colour, _ in looks}
+
+
+def test_the_start_of_a_bound_stands_within_the_axes(run):
+    proved = dataclasses.replace(run, metric=1e4 * np.diag([1.0] + [1e-4] * 11), promise=CERTIFIED)
+    bound = proved.error_bound()
+    (ax,) = figures(proved, ["formation"])["formation"].axes
+    assert bound[0] > 10.0 * run.formation_errors.max()
+    assert ax.get_ylim()[1] >= bound[0]
+
+
+def test_axes_of_derivatives_say_when_v_rises_between_frames_that_fall(run):
+    rising = dataclasses.replace(
+        run, lyapunov=np.exp(run.times), lyapunov_rate=-np.ones(len(run.times))
+    )
+    below = figures(rising, ["lyapunov"])["lyapunov"].axes[1]
+    assert "V rises in between" in below.get_title(loc="right")
+    assert not figures(run, ["lyapunov"])["lyapunov"].axes[1].get_title(loc="right")
+
+
+def test_a_figure_that_is_none_is_refused_with_a_guess(run):
+    with pytest.raises(OutputError, match="no figure `formaton` .did you mean `formation`"):
+        figures(run, ["formaton"])
+
+
+def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
+    from test_view import line
+
+    from echelon.experiments.results.recording import FORMAT
+
+    (here / "run.nc").write_bytes(stored(line(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
+    code, told, _ = echelon("plot", "run.nc", "--what", "formation,network", "--dpi", "60")
+    assert code == 0
+    assert told == ("- Written to figures: formation, network, each as PNG, PDF, SVG.\n")
+    made = sorted(path.name for path in (here / "figures").iterdir())
+    assert made == sorted(
+        f"{n}.{k}" for n in ("formation", "network") for k in ("png", "pdf", "svg")
+    )
+    assert b"<text" in (here / "figures" / "formation.svg").read_bytes()
+    assert echelon("plot", "run.nc", "--what", "network", "--out", "other", "--dpi", "60")[0] == 0
+    code, _, fault = echelon("plot", "run.nc", "--what", "network", "--out", "other")
+    assert code == 2 and "exists; choose another folder, or `--force`" in fault
+    code, _, fault = echelon("plot", "run.nc", "--dpi", "9")
+    assert code == 2 and fault == "echelon: `--dpi` is 9, and must be from 30 to 1200.\n"
+    code, _, fault = echelon("plot", "run.nc", "--what", "netwrk")
+    assert code == 2 and "(did you mean `network`?)" in fault
+
+
+def stored(run, version):
+    """A file of a recording, without V, limits and modes."""
+    import json
+
+    import xarray as xr
+
+    per_agent = ("time", "agent", "state")
+    leads = np.isin(np.arange(run.agents), run.leaders).astype(np.int8)
+    data = xr.Dataset(
+        {
+            "states": (per_agent, run.states),
+            "error": (per_agent, run.errors),
+            "inputs": (("time", "agent", "input"), run.inputs),
+            "offset": (("agent", "state"), run.offsets),
+            "saturated": ("agent", run.limited),
+            "is_leader": ("agent", leads),
+            "nearest_leader": ("agent", run.nearest),
+            "edge_agents": (("edge", "end"), run.edges),
+            "edge_weight": ("edge", run.weights),
+            "edge_heard": (("edge", "end"), run.heard.astype(np.int8)),
+        },
+        {
+            "time": run.times,
+            "state": list(run.state_names),
+            "state_unit": ("state", list(run.state_units)),
+            "input": list(run.input_names),
+            "input_unit": ("input", list(run.input_units)),
+        },
+        {
+            "model": "Own",
+            "position": " ".join(run.state_names[k] for k in run.position),
+            "format": version,
+            "leader_needs": "nothing",
+            "promise": json.dumps(run.promise),
+            "horizon": run.horizon,
+            "dt": run.dt,
+            "outcome": "completed",
+            "message": "The run reached its horizon.",
+        },
+    )
+    return bytes(data.to_netcdf(None, engine="h5netcdf"))

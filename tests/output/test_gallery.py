@@ -1,0 +1,67 @@
+"""The pictures and notebooks of the pages: their scripts make them, and they stay small."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+GALLERY = DOCS / "assets" / "gallery"
+BOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+
+
+def script(name, monkeypatch):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+LIGHT = ["flock.yaml", "oscillators.yaml", "ring.yaml", "sweep"]
+
+
+@pytest.mark.slow
+def test_the_gallery_s_script_draws(tmp_path, monkeypatch):
+    made = drawn(tmp_path, monkeypatch, *LIGHT)
+    assert len(made) == 11 and made < committed()
+
+
+@pytest.mark.study
+def test_the_gallery_s_script_draws_every_picture_of_the_page(tmp_path, monkeypatch):
+    assert drawn(tmp_path, monkeypatch) == committed()
+
+
+def drawn(folder, monkeypatch, *scenes):
+    script("draw_gallery", monkeypatch).main([*scenes, "--quick", "--out", str(folder)])
+    assert all(path.stat().st_size > 1000 for path in folder.iterdir())
+    return {path.name for path in folder.iterdir()}
+
+
+def committed():
+    return {path.name for path in GALLERY.iterdir()}
+
+
+def test_the_page_shows_every_picture():
+    page = (DOCS / "gallery.md").read_text("utf-8")
+    assert set(re.findall(r"\(assets/gallery/(\S+)\)", page)) == committed()
+
+
+def test_pictures_are_many_and_small():
+    sizes = {kind: [p.stat().st_size for p in GALLERY.glob(f"*.{kind}")] for kind in ("png", "gif")}
+    assert len(sizes["png"]) >= 12 and max(sizes["png"]) <= 100_000
+    assert len(sizes["gif"]) >= 3 and max(sizes["gif"]) <= 800_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+def test_a_notebook_runs_and_shows_what_its_page_shows(book, monkeypatch):
+    found, pictures = script("render_notebooks", monkeypatch).render(book)
+    assert found == book.with_suffix(".md").read_text("utf-8")
+    assert all((DOCS / "assets" / "notebooks" / name).is_file() for name in pictures)
+
+
+def test_there_are_three_notebooks():
+    assert len(BOOKS) >= 3

@@ -1,0 +1,466 @@
+"""The figures: they show the run's own numbers, with units, on any run, and leave no state."""
+
+import dataclasses
+import functools
+import subprocess
+import sys
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from runs import simulate
+
+import echelon as ech
+from echelon.agents.models import (
+    PlanarQuadrotor,
+    Quadrotor,
+    SingleIntegrator,
+    UnicyclePoint,
+    VanDerPol,
+)
+from echelon.agents.network.formation import Formation
+from echelon.agents.network.graph import Graph
+from echelon.agents.references import Circle, Lemniscate
+from echelon.core.errors import Outcome
+from echelon.experiments.results.dataset import dataset, summary
+from echelon.experiments.results.lyapunov import lyapunov
+from echelon.experiments.results.recording import recording
+from echelon.laws import Consensus, Tracking, TrimInput
+from echelon.output.plots.run_figures import figures, save_figures
+from echelon.output.plots.style import COLOURS, thin
+from echelon.synthesis.gains import FixedGain, Riccati
+from echelon.synthesis.gains.gain import synthesize
+
+TREE = Graph.from_edges([(0, 1), (1, 2), (1, 3)])
+POINT = FixedGain([1.0, 1.0, 0.1], coupling=2.0)
+PLAIN = FixedGain("identity", coupling=2.0)
+
+# Model, graph, method (of leader and followers alike), reference and spread.
+RUNS = {
+    "quadrotor": (Quadrotor.crazyflie(), TREE, Riccati(), Lemniscate(), {"position": 0.5}),
+    "planar": (PlanarQuadrotor(), TREE, Riccati(), Circle(), {"position": 0.5}),
+    "unicycle": (UnicyclePoint(), TREE, POINT, Circle(), {"x": 0.5}),
+    "van-der-pol": (VanDerPol(), TREE, Riccati(), None, {"position": 1.0, "velocity": 1.0}),
+    "one-axis": (SingleIntegrator(dimension=1), TREE, PLAIN, Circle(), {"position": 1.0}),
+    "swarm": (SingleIntegrator(), Graph.grid(5, 5), PLAIN, Circle(), {"position": 1.0}),
+}
+
+
+# A run in space, one without positions, one on a line; the others are drawn by the slow tests.
+QUICK = {"quadrotor", "van-der-pol", "one-axis"}
+FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in RUNS]
+
+
+def close(model, graph, method, reference, spread):
+    """A short run with one offset where the model has a position, and of synchronization else."""
+    gain = synthesize(model, graph, method)
+    offsets = {1: [1.0] * len(model.position)} if model.position else {}
+    return simulate(
+        model,
+        graph,
+        Formation.from_offsets(model, graph, offsets),
+        leader=TrimInput() if reference is None else Tracking(reference, gain),
+        follower=Consensus(gain, "relay"),
+        initial=spread,
+        start_error={model.state_names[0]: 0.2},
+        horizon=0.5,
+        dt=0.01,
+    )
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return functools.cache(lambda name: close(*RUNS[name]))
+
+
+DRAWN = {}
+
+
+def all_figures(result):
+    """The figures of a run with V, made once."""
+    if id(result) not in DRAWN:
+        # The result is kept too: its id must not be given to another.
+        DRAWN[id(result)] = (result, figures(result))
+    return DRAWN[id(result)][1]
+
+
+def drawn(result, name):
+    """The axes of a figure and its labelled lines, each as an array of coordinates (T, k)."""
+    figure = all_figures(result)[name]
+    return figure.axes, labelled(figure)
+
+
+def labelled(figure):
+    lines = [line for ax in figure.axes for line in ax.get_lines()]
+    named = [line for line in lines if not str(line.get_label()).startswith("_")]
+    return {line.get_label(): np.column_stack(coordinates(line)) for line in named}
+
+
+def coordinates(line):
+    return line.get_data_3d() if hasattr(line, "get_data_3d") else line.get_data()
+
+
+def cut(result, states, reference):
+    frames = {"times": result.times[: len(states)], "inputs": result.inputs[: len(states)]}
+    return dataclasses.replace(result, states=states, reference=reference, **frames)
+
+
+def exploded(result, factor=1e300):
+    """The same run, its agents growing to the edge of what a float can hold."""
+    growth = np.geomspace(1.0, factor, len(result.times))[:, None, None]
+    states = (result.states + 1e-3) * growth
+    return dataclasses.replace(result, states=states, outcome=Outcome.DIVERGED)
+
+
+# ---- what is drawn ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_every_figure_is_there_and_its_axes_have_names(runs, name):
+    result = runs(name)
+    made = all_figures(result)
+    expected = {"leader_3d", "trajectories", "formation", "inputs", "lyapunov"}
+    expected |= {"tracking"} if result.reference is not None else set()
+    assert set(made) == expected
+    for figure in made.values():
+        assert all(ax.get_ylabel() for ax in figure.axes)
+        assert figure.axes[-1].get_xlabel()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_nothing_is_cut_off_at_the_edge_of_the_paper(runs, name):
+    for title, figure in all_figures(runs(name)).items():
+        renderer = FigureCanvasAgg(figure).get_renderer()
+        figure.draw(renderer)
+        boxes = [part.get_tightbbox(renderer) for part in edges(figure)]
+        for box in [box for box in boxes if box is not None]:
+            assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1, title
+            assert box.y0 >= 0.0 and box.y1 <= figure.bbox.y1, title
+
+
+def edges(figure):
+    """The axes with their labels, and the legends."""
+    for ax in figure.axes:
+        yield from ax._axis_map.values()
+        yield from [ax.get_legend()] if ax.get_legend() else []
+    yield from figure.legends
+
+
+def test_the_leader_is_drawn_with_its_reference_in_space(runs):
+    result = runs("quadrotor")
+    (ax,), lines = drawn(result, "leader_3d")
+    np.testing.assert_array_equal(lines["leader 0"], result.states[:, 0, :3])
+    np.testing.assert_array_equal(lines["reference"], result.reference[:, :3])
+    np.testing.assert_array_equal(lines["start"], result.states[:1, 0, :3])
+    np.testing.assert_array_equal(lines["end"], result.states[-1:, 0, :3])
+    names = [ax.get_xlabel(), ax.get_ylabel(), ax.get_zlabel()]
+    assert names == ["x (m)", "y (m)", "z (m)"]
+
+
+def test_the_reference_of_a_leader_with_an_offset_has_the_offset(runs):
+    result = runs("unicycle")
+    offsets = result.formation.offsets + [3.0, 0.0, 0.0]
+    parts = result.parts.replace(formation=Formation(offsets))
+    moved = dataclasses.replace(result, parts=parts)
+    _, lines = drawn(moved, "leader_3d")
+    np.testing.assert_array_equal(lines["reference"], result.reference[:, :2] + [3.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [("planar", ("y (m)", "z (m)")), ("van-der-pol", ("position", "velocity"))],
+)
+def test_a_leader_is_drawn_in_its_plane_or_its_phase_plane(runs, name, labels):
+    (ax,), lines = drawn(runs(name), "leader_3d")
+    np.testing.assert_array_equal(lines["leader 0"], runs(name).states[:, 0, :2])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == labels
+
+
+def test_a_leader_on_one_axis_is_drawn_over_time(runs):
+    result = runs("one-axis")
+    (ax,), lines = drawn(result, "leader_3d")
+    expected = np.column_stack([result.times, result.states[:, 0, 0]])
+    np.testing.assert_array_equal(lines["leader 0"], expected)
+    np.testing.assert_array_equal(lines["reference"][:, 1], result.reference[:, 0])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "x (m)")
+
+
+def test_all_agents_are_drawn_and_told_apart(runs):
+    result = runs("quadrotor")
+    (ax,), lines = drawn(result, "trajectories")
+    for agent, name in enumerate(["leader 0", "follower 1", "follower 2", "follower 3"]):
+        np.testing.assert_array_equal(lines[name], result.states[:, agent, :3])
+    assert [line.get_color() for line in ax.get_lines()[:4]] == ["black", *COLOURS[:3]]
+
+
+def test_the_graph_is_drawn_six_times_from_the_first_frame_to_the_last(runs):
+    result = runs("quadrotor")
+    (ax,), lines = drawn(result, "trajectories")
+    last = result.states[-1][result.graph.edges, :3]
+    (name,) = [name for name in lines if name.startswith("graph")]
+    assert name == "graph, every 0.1 s"
+    np.testing.assert_array_equal(lines[name].reshape(-1, 3, 3)[:, :2], last)
+    edges = [line for line in ax.get_lines() if len(coordinates(line)[0]) == 9]
+    assert len(edges) == 6
+    first = np.column_stack(coordinates(edges[0])).reshape(-1, 3, 3)[:, :2]
+    np.testing.assert_array_equal(first, result.states[0][result.graph.edges, :3])
+
+
+def test_metres_are_alike_in_all_directions(runs):
+    for name in ("leader_3d", "trajectories"):
+        (plane,), _ = drawn(runs("unicycle"), name)
+        assert plane.get_aspect() == 1.0
+        (space,), _ = drawn(runs("quadrotor"), name)
+        sizes = [np.ptp(limits()) for limits in (space.get_xlim, space.get_ylim, space.get_zlim)]
+        scale = space._box_aspect / np.array(sizes)
+        np.testing.assert_allclose(scale, scale[0])
+
+
+def test_the_tracking_error_is_the_output_minus_the_reference(runs):
+    result = runs("quadrotor")
+    panels, lines = drawn(result, "tracking")
+    off = result.states[:, 0] - result.reference
+    for name, k in (("x", 0), ("y", 1), ("z", 2), ("yaw", 8)):
+        np.testing.assert_allclose(lines[name][:, 1], off[:, k], rtol=0.0, atol=1e-15)
+        np.testing.assert_array_equal(lines[name][:, 0], result.times)
+    assert [ax.get_ylabel() for ax in panels] == ["tracking error (m)", "tracking error (rad)"]
+
+
+@pytest.mark.parametrize("name", ["quadrotor", "van-der-pol"])
+def test_the_formation_error_is_the_distance_from_the_goal(runs, name):
+    result = runs(name)
+    (ax,), lines = drawn(result, "formation")
+    for agent in result.graph.followers:
+        goal = result.states[:, 0] + result.formation.offsets[agent]
+        off = (result.states[:, agent] - goal)[:, list(result.measured)]
+        error = np.sqrt((off**2).sum(axis=1))
+        np.testing.assert_allclose(lines[f"follower {agent}"][:, 1], error, rtol=1e-12)
+    assert ax.get_yscale() == "log"
+
+
+def test_a_centimetre_is_marked_where_errors_are_lengths(runs):
+    (ax,), lines = drawn(runs("quadrotor"), "formation")
+    assert set(lines["1 cm"][:, 1]) == {0.01}
+    assert ax.get_ylabel() == "formation error (m)"
+    assert ax.get_ylim()[0] <= 0.01 <= ax.get_ylim()[1]
+    (ax,), lines = drawn(runs("van-der-pol"), "formation")
+    assert "1 cm" not in lines
+    assert ax.get_ylabel() == "formation error"
+
+
+def test_errors_of_zero_leave_gaps_and_stretch_no_axis(runs):
+    result = runs("unicycle")
+    goals = np.broadcast_to(result.formation.offsets, result.states.shape)
+    (ax,), lines = drawn(dataclasses.replace(result, states=goals), "formation")
+    for agent in result.graph.followers:
+        assert np.isnan(lines[f"follower {agent} (always 0)"][:, 1]).all()
+    assert ax.get_ylim()[0] >= 1e-3
+    # At their goals from the middle on: the line ends there, and the axis at what it shows.
+    half = result.states.copy()
+    half[len(half) // 2 :] = goals[len(half) // 2 :]
+    (ax,), lines = drawn(dataclasses.replace(result, states=half), "formation")
+    for agent in result.graph.followers:
+        shown = lines[f"follower {agent}"][:, 1]
+        assert np.isnan(shown[len(half) // 2 :]).all() and (shown[: len(half) // 2] > 0).all()
+    assert ax.get_ylim()[0] >= 1e-6
+
+
+def test_v_and_its_derivative_are_drawn_as_given(runs):
+    result = runs("quadrotor")
+    v = lyapunov(result)
+    (above, below), lines = drawn(result, "lyapunov")
+    np.testing.assert_array_equal(lines["V"], np.column_stack([result.times, v.value]))
+    falls, rises = (lines.get(name) for name in ("V falls", "V rises"))
+    np.testing.assert_array_equal(falls[:, 1], np.where(v.rate < 0.0, -v.rate, np.nan))
+    assert (rises is None) == (v.rate <= 0.0).all()
+    assert [ax.get_yscale() for ax in (above, below)] == ["log", "log"]
+    assert below.get_ylabel() == "|dV/dt| (1/s)"
+
+
+def with_v(result, value, rate):
+    """The recording of a run with another V."""
+    return dataclasses.replace(recording(dataset(result)), lyapunov=value, lyapunov_rate=rate)
+
+
+def test_a_rising_v_is_told_apart(runs):
+    result = runs("van-der-pol")
+    count = len(result.times)
+    rate = np.linspace(-1.0, 2.0, count)
+    lines = labelled(figures(with_v(result, np.ones(count), rate))["lyapunov"])
+    np.testing.assert_array_equal(lines["V falls"][:, 1], np.where(rate < 0.0, -rate, np.nan))
+    np.testing.assert_array_equal(lines["V rises"][:, 1], np.where(rate > 0.0, rate, np.nan))
+
+
+def test_without_v_there_is_no_figure_of_it_and_without_motion_no_panel(runs):
+    result = runs("van-der-pol")
+    assert "lyapunov" not in figures(with_v(result, None, None))
+    still = np.zeros(len(result.times))
+    assert len(figures(with_v(result, still, still))["lyapunov"].axes) == 1
+
+
+def test_many_followers_have_no_names_and_their_worst_has(runs):
+    result = runs("swarm")
+    made = all_figures(result)
+    (ax,) = made["trajectories"].axes
+    told = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert told == ["leader 0", "graph, every 0.1 s", "start", "end"]
+    lines = labelled(made["formation"])
+    worst = next(name for name in lines if name.startswith("worst: follower "))
+    told = {worst, "median follower", "largest at each time", "1 cm"}
+    assert {name for name in lines if not name.startswith("slope promised")} == told
+    off = (result.states - result.formation.offsets)[:, :, :2]
+    errors = np.linalg.norm(off[:, 1:] - off[:, :1], axis=2)
+    np.testing.assert_allclose(lines["largest at each time"][:, 1], errors.max(axis=1), rtol=1e-12)
+    place = int(worst.split()[-1]) - 1
+    steady = errors[result.times >= result.settings.horizon - result.settings.window]
+    assert place == (steady**2).sum(axis=0).argmax()
+    np.testing.assert_allclose(lines[worst][:, 1], errors[:, place], rtol=1e-12)
+    np.testing.assert_allclose(lines["median follower"][:, 1], np.median(errors, axis=1))
+
+
+def test_all_agents_of_a_swarm_are_drawn(runs):
+    (ax,), _ = drawn(runs("swarm"), "trajectories")
+    paths = [np.column_stack(coordinates(line)) for line in ax.get_lines()[:25]]
+    np.testing.assert_array_equal(np.stack(paths, axis=1), runs("swarm").states)
+
+
+# ---- odd runs ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_a_run_that_grew_out_of_all_bounds_is_drawn_within_its_start(runs, name, tmp_path):
+    result = exploded(runs(name))
+    paths = save_figures(with_v(result, np.full(51, 1e300), np.full(51, np.inf)), tmp_path)
+    assert all(path.stat().st_size for path in paths)
+    figure = figures(result)["trajectories"]
+    for ax in figure.axes:
+        if ax.get_xlabel() == "time (s)":
+            continue
+        assert np.abs([ax.get_xlim(), ax.get_ylim()]).max() < 1e3
+    assert "not drawn" in figure.get_suptitle()
+
+
+def test_what_is_within_reach_is_drawn_and_nothing_else_changes(runs):
+    result = runs("quadrotor")
+    states = result.states.copy()
+    states[30:, 2, 0] = 1e200
+    (ax,), lines = drawn(dataclasses.replace(result, states=states), "trajectories")
+    np.testing.assert_array_equal(lines["follower 2"][:30], result.states[:30, 2, :3])
+    assert np.isnan(lines["follower 2"][30:]).all()
+    np.testing.assert_array_equal(lines["follower 1"], result.states[:, 1, :3])
+    assert ax.figure.get_suptitle()
+    assert not all_figures(result)["trajectories"].get_suptitle()
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_a_run_of_one_frame_is_drawn_as_dots(runs, name, tmp_path):
+    whole = runs(name)
+    result = cut(whole, whole.states[:1], None if whole.reference is None else whole.reference[:1])
+    assert save_figures(result, tmp_path)
+    figure = figures(result)["leader_3d"]
+    lines = [line for ax in figure.axes for line in ax.get_lines()]
+    assert all(line.get_marker() not in ("None", "", " ", None) for line in lines)
+
+
+def test_a_run_of_no_frame_has_no_figures(runs, tmp_path):
+    empty = cut(runs("quadrotor"), np.zeros((0,)), None)
+    assert figures(empty) == {}
+    assert save_figures(empty, tmp_path) == []
+
+
+def test_long_runs_are_thinned_and_keep_their_ends():
+    assert thin(2000).tolist() == list(range(2000))
+    assert len(thin(100_001)) == 2000
+    assert thin(100_001)[[0, -1]].tolist() == [0, 100_000]
+    assert np.ptp(np.diff(thin(100_001))) <= 1
+    assert len(thin(100_001, lines=1000)) == 200
+    assert thin(1).tolist() == [0]
+
+
+# ---- files and state --------------------------------------------------------------------------
+
+
+def test_each_figure_is_written_as_png_and_pdf(runs, tmp_path):
+    result = runs("quadrotor")
+    paths = save_figures(result, tmp_path)
+    names = ["leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapunov"]
+    expected = [
+        tmp_path / "figures" / f"{name}.{kind}" for name in names for kind in ("png", "pdf")
+    ]
+    assert paths == expected
+    assert sorted((tmp_path / "figures").iterdir()) == sorted(expected)
+    for png, pdf in zip(paths[::2], paths[1::2], strict=True):
+        assert png.read_bytes().startswith(b"\x89PNG")
+        assert int.from_bytes(png.read_bytes()[16:20]) == 1050  # 7 inches of 150 dots
+        assert pdf.read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.slow
+def test_the_same_run_writes_the_same_files(runs, tmp_path):
+    first = save_figures(runs("unicycle"), tmp_path / "first")
+    again = save_figures(runs("unicycle"), tmp_path / "again")
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
+
+
+def test_settings_of_matplotlib_are_left_alone(runs, tmp_path):
+    # To look the back end up would itself choose one; a copy does not.
+    before = dict(matplotlib.rcParams.copy())
+    errors = np.geterr()
+    save_figures(runs("quadrotor"), tmp_path)
+    assert dict(matplotlib.rcParams.copy()) == before
+    assert np.geterr() == errors
+
+
+def test_drawing_loads_no_pyplot(tmp_path):
+    code = f"""
+import sys
+from pathlib import Path
+import echelon as ech
+assert "matplotlib" not in sys.modules
+model, graph = ech.models.SingleIntegrator(dimension=3), ech.Graph.path(3)
+law = ech.laws.Consensus(ech.synthesize(model, graph, ech.gains.Riccati()))
+drive = ech.Laws(ech.laws.TrimInput(), law)
+parts = ech.Parts(model, graph, ech.Formation.line(model, graph), drive)
+result = ech.simulate(parts, ech.Settings(horizon=0.1, dt=0.05))
+assert len(ech.save_figures(result, Path({str(tmp_path)!r}))) == 10
+assert "matplotlib.pyplot" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def multitude():
+    """A line of 6,001 agents that a leader in its middle makes go somewhere."""
+    model, agents = ech.models.SingleIntegrator(dimension=2), 6001
+    edges = np.stack([np.arange(agents - 1), np.arange(1, agents)], axis=1)
+    graph = ech.Graph.from_edges(edges, leaders=(3000,), agents=agents)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    places = np.arange(agents)
+    formation = ech.Formation(np.stack([places - 3000.0, places % 7.0], axis=1))
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 0.3})
+    return ech.simulate(parts, ech.Settings(horizon=0.02, dt=0.01, steady_window=0.01))
+
+
+def test_a_multitude_is_drawn_by_some_and_the_graph_about_its_leader(multitude):
+    made = figures(multitude, ("trajectories", "network", "states", "distances"))
+    [ax] = made["trajectories"].axes
+    assert ax.get_title() == "1,501 of 6,001 agents"
+    starts = multitude.states[0]
+    drawn = [line.get_xydata()[0] for line in ax.lines[:1501]]
+    assert np.isin(np.array(drawn), starts).all() and np.isin(starts[3000], drawn[0]).all()
+    [ax] = made["network"].axes
+    assert ax.get_title() == "2,000 of 6,001 agents"
+    across = np.sort([line.get_xydata()[0, 0] for line in ax.lines])
+    wanted = np.sort(multitude.formation.offsets[2000:4001, 0])
+    assert len(across) == 2000 and np.isin(across, wanted).all()
+    assert max(len(ax.lines) for ax in made["states"].axes) < 2010
+
+
+def test_the_summary_of_a_multitude_names_the_best_the_median_and_the_worst(multitude):
+    told, every = summary(multitude), ech.metrics(multitude)
+    errors = np.sort([each.steady_rmse for each in every.followers])
+    assert [row["steady_rmse"] for row in told["followers"]] == errors[[0, 3000, -1]].tolist()
+    off = np.sort([each.distance_rmse for each in every.edges])
+    assert [row["distance_rmse"] for row in told["edges"]] == off[[0, 3000, -1]].tolist()

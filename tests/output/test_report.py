@@ -1,0 +1,171 @@
+"""The report: its table, and the sentences that say what happened and why."""
+
+import numpy as np
+import pytest
+from runs import made_up, simulate
+
+import echelon as ech
+from echelon.core.statement import Cause, Hypothesis, Statement
+from echelon.core.words import Kind, Verdict
+from echelon.output.reports.causes import causes
+
+
+def run(scenario, *changes):
+    return ech.run(ech.load_scenario(scenario, list(changes)))
+
+
+@pytest.fixture(scope="module")
+def literal():
+    return run("paper-literal")
+
+
+@pytest.mark.slow
+def test_the_table_stands_beside_the_papers():
+    text = ech.report(run("paper", "simulation.horizon=6", "report.steady_window=1"))
+    for printed in ("0.186", "9.289e-17", "7.692e-17", "5.207e-17", "0.0302", "0.018"):
+        assert printed in text
+    assert "multiples of 2^-53" in text
+    assert text.count("follower ") >= 3 and "within 1 cm" in text
+
+
+def test_the_literal_law_names_its_cause(literal):
+    text = " ".join(ech.report(literal).split())
+    assert "The formation error grows: 1.16 m at the start, " in text
+    assert (
+        "Cause: no input feels 8 of 12 directions of disagreement, and along `x`, `y`, `z`, `yaw` "
+        "it does not decay by itself; choose another P." in text
+    )
+    assert "Cause: the law leaves out the trim input; set `follower.trim: true`." in text
+    assert "Warning" not in text and "Assumption 5 fails" in text
+
+
+@pytest.mark.slow
+def test_the_lag_without_feed_forward_is_told():
+    text = " ".join(
+        ech.report(run("paper", "follower.feedforward=none", "simulation.horizon=20")).split()
+    )
+    assert "do not know the leader's motion and lag: 0.0" in text
+    assert "`feedforward: relay` removes the lag" in text
+    assert "Each follower is told: neighbours' states." in text
+
+
+def test_a_broken_symmetry_warns_and_names_the_agent():
+    model, graph = ech.models.Linear([[-1.0]], [[1.0]]), ech.Graph.path(2)
+    result = simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {1: [-1.0]}),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.FixedGain("identity")), "none"
+        ),
+        horizon=20.0,
+        dt=0.01,
+    )
+    text = " ".join(ech.report(result).split())
+    assert (
+        "Warning: the offset of agent 1 is no symmetry of `Linear`: it changes the drift of `x1` "
+        "by up to 1, so the agents settle off their goals." in text
+    )
+
+
+def test_coincident_goals_warn():
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.path(3)
+    result = simulate(
+        model,
+        graph,
+        ech.Formation.from_offsets(model, graph, {1: (1.0, 0.0), 2: (1.0, 0.0)}),
+        leader=ech.laws.Agreement(),
+        follower=ech.laws.Agreement(),
+        horizon=1.0,
+        dt=0.1,
+    )
+    assert result.warnings == ("agents 1 and 2 have the same goal, and would collide there.",)
+
+
+@pytest.mark.slow
+def test_a_weak_coupling_is_named_as_the_cause_of_growth():
+    result = run("paper-line", "follower.gain.coupling=0.5", "simulation.horizon=30")
+    text = " ".join(ech.report(result).split())
+    assert (
+        "Cause: coupling 0.5 is below the edge 2.524 of what this gain guarantees" in text
+        or "diverged" in text
+    )
+
+
+@pytest.mark.slow
+def test_a_swarm_shows_best_median_and_worst():
+    model, graph = ech.models.SingleIntegrator(2), ech.Graph.star(30)
+    result = simulate(
+        model,
+        graph,
+        ech.Formation.grid(model, graph),
+        leader=ech.laws.TrimInput(),
+        follower=ech.laws.Agreement(),
+        initial={"position": 1.0},
+        horizon=2.0,
+        dt=0.1,
+    )
+    text = ech.report(result)
+    for kind in ("best (follower", "median (follower", "worst (follower"):
+        assert kind in text
+
+
+def test_the_unicycles_relay_is_told_to_the_reader():
+    text = " ".join(ech.report(run("unicycle", "simulation.horizon=1")).split())
+    assert "Each follower is told: neighbours' states, the leader's input of the same step." in text
+
+
+@pytest.mark.parametrize("followers", [13, 14])
+def test_of_many_followers_the_best_the_worst_and_one_in_the_middle_are_shown(followers):
+    model, graph = ech.models.SingleIntegrator(1), ech.Graph.star(followers + 1)
+    order = np.random.default_rng(0).permutation(followers) + 1
+    errors = np.zeros((followers + 1, 1))
+    errors[order, 0] = 0.01 * np.arange(1, followers + 1)
+    states = np.broadcast_to(errors, (4, followers + 1, 1))
+    text = " ".join(ech.report(made_up(states, model, graph, window=2.0)).split())
+    middle = {order[(followers - 1) // 2], order[followers // 2]}
+    assert f"best (follower {order[0]})" in text and f"worst (follower {order[-1]})" in text
+    assert any(f"median (follower {k})" in text for k in middle)
+
+
+# ---- every cause ends in what to do ----
+
+
+def told(*changes, scenario="paper"):
+    """The causes of a short run, each as text and remedy."""
+    quick = ["simulation.horizon=2", "report.steady_window=0.5"]
+    result = run(scenario, *quick, *changes)
+    found = ech.promise(result.parts, result.settings)
+    return {each.text: each.remedy for each in causes(result, ech.metrics(result), found)}
+
+
+def test_a_horizon_shorter_than_the_slowest_mode_is_told():
+    found = told("graph={name: path, agents: 12}", "formation={name: line}", scenario="integrators")
+    [(text, remedy)] = found.items()
+    assert "the slowest mode takes" in text and "the horizon is 2 s" in text
+    assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
+
+
+@pytest.mark.slow
+def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
+    found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
+    [text] = [each for each in found if "the leader stays" in each]
+    assert "no law has integral action" in text and "`leader.gain`" in found[text]
+
+
+def test_no_failing_line_and_no_cause_is_without_a_remedy():
+    with pytest.raises(AssertionError, match="fails without a remedy"):
+        Statement(Hypothesis.STEP, Verdict.FAILS, Kind.PROOF)
+    with pytest.raises(TypeError):
+        Cause("it fails")
+
+
+def test_wind_is_not_blamed_where_the_loop_grows_by_itself():
+    wind = "disturbance={rms: {position: 0.01}}"
+    told = [
+        ech.report(ech.simulate(*ech.build(ech.load_scenario("integrators", [wind, *more]))))
+        for more in ([], ["simulation.dt=1.0", "simulation.horizon=20"])
+    ]
+    assert "the disturbance pushes it up" in told[0]
+    assert "the input is held over a `dt` too long" in told[1] and "pushes it up" not in told[1]

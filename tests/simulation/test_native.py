@@ -1,0 +1,585 @@
+"""Native steps against JAX's: states, inputs, sums and moments, for all that a run may have."""
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent import futures
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import echelon as ech
+from echelon.simulation import codegen as kernels
+from echelon.simulation.codegen import block_copy
+from echelon.simulation.engine.prepare import prepare
+from echelon.simulation.native import agent_order, buffers, schedule, threads, varying
+from echelon.simulation.native import kernel_cache as kernel_code
+from echelon.simulation.native import stepper as native_stepper
+from echelon.simulation.native.varying import Own
+from echelon.simulation.step.drive import numbers
+from echelon.simulation.step.loop import assemble
+
+QUADROTOR = ech.models.Quadrotor()
+CIRCLE = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5))
+
+
+def ready(parts, chosen, engine):
+    """Return what is to be flown and the stepper, by one of the engines."""
+    prepared = prepare(parts, chosen._replace(engine=engine))
+    return prepared, prepared.parts.drive.stepper(prepared.problem)
+
+
+def steps_of(prepared, stepper, chosen, counts):
+    """Return the chunk of some frames from the start."""
+    with jax.enable_x64(chosen.precision == "float64"):
+        times = chosen.dt * jnp.arange(int(np.sum(counts)) + 1)
+        wanted = prepared.parts.drive.reference_states(prepared.parts.model, times)
+        wanted = None if wanted is None else np.asarray(wanted, float)
+        return stepper.advance(stepper.start(), np.array(counts), wanted)
+
+
+def stepped(parts, chosen, counts, engine):
+    """Return the chunk of some frames, and the stepper, by one of the engines."""
+    prepared, stepper = ready(parts, chosen, engine)
+    return steps_of(prepared, stepper, chosen, counts), stepper
+
+
+def check_alike(parts, chosen, counts=(1, 0, 17, 60, 0), tolerance=1e-13):
+    (ours, stepper), (theirs, _) = (
+        stepped(parts, chosen, counts, name) for name in ("native", "jax")
+    )
+    assert stepper.engine == "native"
+    for a, b in ((ours.states, theirs.states), (ours.inputs, theirs.inputs)):
+        size = np.maximum(np.abs(b).max(axis=(0, 1)), 1.0)
+        assert (np.abs(a - b) / size).max() <= tolerance
+    for name, a, b in zip(ours.sums._fields, ours.sums, theirs.sums, strict=True):
+        size = np.abs(b).max(initial=1e-12)
+        np.testing.assert_allclose(a, b, rtol=0, atol=100 * tolerance * size, err_msg=name)
+    for a, b in zip(numbers(ours.now), numbers(theirs.now), strict=True):
+        assert a.shape == b.shape and np.abs(a.astype(float) - b).max(initial=0.0) <= max(
+            1e-10, tolerance
+        )
+    return ours, theirs
+
+
+def flock(graph, model=QUADROTOR, leader=CIRCLE, feedforward="relay", **more):
+    # Weak enough for the step: what grows makes any rounding large.
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.3))
+    formation = ech.Formation.circle(model, graph, spacing=1.0)
+    follower = ech.laws.Consensus(gain, feedforward=feedforward)
+    drive = ech.Laws(leader, follower)
+    more = {"initial": {"position": 0.02}} | more
+    return ech.Parts(model, graph, formation, drive, **more)
+
+
+def run_settings(**changes):
+    return ech.Settings(**{"horizon": 1.0, "dt": 0.005, "steady_window": 0.8, **changes})
+
+
+@pytest.mark.parametrize("name", ["paper", "unicycle", "van-der-pol", "planar-quadrotor"])
+def test_a_scenario_steps_as_by_jax(name):
+    check_alike(*ech.build(ech.load_scenario(name)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(ech.bundled_scenarios()))
+def test_every_scenario_steps_as_by_jax_for_a_thousand_steps(name):
+    parts, chosen = ech.build(ech.load_scenario(name))
+    # One that grows without bound makes any rounding large.
+    check_alike(parts, chosen, (200,) if name == "paper-literal" else (1000,), 1e-12)
+
+
+WEIGHTED = ech.Graph.from_edges([(0, 1, 0.5), (1, 2, 3.0), (2, 3, 1.0), (0, 4, 2.0)], (0,), 5)
+NETWORKS = {
+    "a ring": (ech.Graph.ring(11), {}),
+    "weights": (WEIGHTED, {}),
+    "the parent's input": (ech.Graph.path(12), {"feedforward": "parent"}),
+    "a relayed velocity": (ech.Graph.path(3), {"feedforward": "relay-velocity"}),
+    "nothing fed forward": (ech.Graph.star(10), {"feedforward": "none"}),
+    "several leaders": (ech.Graph.ring(9, leaders=(0, 4)), {}),
+    "a leader at its trim": (ech.Graph.grid(3, 4), {"leader": ech.laws.TrimInput()}),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_all_networks_and_feedforwards_step_as_by_jax(name):
+    graph, more = NETWORKS[name]
+    check_alike(flock(graph, **more), run_settings())
+
+
+def test_a_leader_that_reacts_hears_its_neighbours():
+    graph = ech.Graph.path(4)
+    gain = ech.synthesize(QUADROTOR, graph, ech.gains.Riccati())
+    leader = ech.laws.Tracking(ech.references.Circle(radius=0.5, rate=0.5), reaction=gain)
+    check_alike(flock(graph, leader=leader, feedforward="none"), run_settings())
+
+
+@pytest.mark.parametrize("common", [True, False])
+def test_wind_and_noise_are_those_that_jax_draws(common):
+    wind = ech.Disturbance(
+        constant={"vx": 0.1},
+        rms={"velocity": 0.3},
+        input_rms={"thrust": 0.1},
+        hold=0.05,
+        common=common,
+    )
+    # Normal draws are of single precision, and round by how XLA arranges them.
+    world = ech.World(disturbance=wind)
+    # Where frames stand at the beginning of a hold, inputs are looked at before any step is taken.
+    counts = (0, 10, 0, 1, 0, 17, 60, 0)
+    check_alike(flock(ech.Graph.ring(5), world=world), run_settings(), counts, 3e-8)
+
+
+def test_a_plant_that_is_not_the_model_moves():
+    heavy = ech.models.Quadrotor(mass=0.031)
+    check_alike(flock(ech.Graph.ring(5), world=ech.World(plant=heavy)), run_settings())
+
+
+def test_limits_that_act_are_counted_and_kept_as_by_jax():
+    parts = flock(ech.Graph.ring(5), initial={"position": 30.0, "attitude": 0.5})
+    ours, _ = check_alike(parts, run_settings(), (40,), 1e-11)
+    assert ours.sums.limited.max() > 10
+
+
+class Remembers(ech.laws.Law):
+    """Feeds back a sum of what it saw, in a memory that is a tree."""
+
+    def init(self):
+        return {"sum": jnp.zeros(2), "steps": jnp.zeros(())}
+
+    def update(self, model, view, memory):
+        total = memory["sum"] + view.disagreement
+        after = {"sum": total, "steps": memory["steps"] + 1.0}
+        return -0.3 * total[:1] - view.disagreement[1:] - 0.01 * memory["steps"], after
+
+
+def test_a_law_with_memory_remembers_the_same():
+    model, graph = ech.models.DoubleIntegrator(dimension=1), ech.Graph.path(4)
+    formation = ech.Formation(np.zeros((4, 2)))
+    drive = ech.Laws(ech.laws.TrimInput(), Remembers())
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    check_alike(parts, run_settings(dt=0.01))
+
+
+@pytest.mark.parametrize("integrator", ["euler", "printed"])
+def test_other_integrators_step_as_by_jax(integrator):
+    model, graph = ech.models.DoubleIntegrator(dimension=2), ech.Graph.ring(4)
+    parts = flock(graph, model, ech.laws.TrimInput())
+    check_alike(parts, run_settings(integrator=integrator, dt=0.01), (3, 4), 1e-12)
+
+
+def test_single_precision_is_that_of_jax_to_its_own_rounding():
+    check_alike(flock(ech.Graph.ring(20)), run_settings(precision="float32"), (1, 30), 2e-5)
+
+
+# ---- the same bits, however it is cut ----
+
+
+@pytest.fixture(scope="module")
+def six():
+    chosen = run_settings()
+    return *ready(flock(ech.Graph.path(6)), chosen, "native"), chosen
+
+
+@given(cuts=st.lists(st.integers(0, 30), min_size=1, max_size=6))
+@settings(max_examples=8)
+def test_bits_do_not_depend_on_where_a_run_is_cut(six, cuts):
+    _, stepper, _ = six
+    whole, cut = (steps_of(*six, counts) for counts in ([sum(cuts)], cuts))
+    assert cut.now.states.tobytes() == whole.now.states.tobytes()
+    with jax.enable_x64(True):
+        kept = stepper.recall(numbers(cut.now))
+        more = stepper.advance(kept, np.array([2]), np.zeros((3, 12)))
+        again = stepper.advance(cut.now, np.array([2]), np.zeros((3, 12)))
+    assert more.now.states.tobytes() == again.now.states.tobytes()
+
+
+def test_bits_do_not_depend_on_how_wide_a_vector_is(monkeypatch):
+    parts, chosen = flock(ech.Graph.ring(13)), run_settings()
+    wide, _ = stepped(parts, chosen, (5, 40), "native")
+    monkeypatch.setitem(native_stepper.LANES, 64, 4)
+    narrow, _ = stepped(parts, chosen, (5, 40), "native")
+    assert wide.states.tobytes() == narrow.states.tobytes()
+    assert wide.sums.errors.tobytes() == narrow.sums.errors.tobytes()
+
+
+def test_bits_do_not_depend_on_threads(monkeypatch):
+    monkeypatch.setattr(threads, "_SHARED", 1)  # what is read of agents is shared too
+    model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(40)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="parent"))
+    formation = ech.Formation(np.zeros((40, 2)))
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    _, stepper = stepped(parts, run_settings(), (1,), "native")
+    chunks = []
+    with jax.enable_x64(True):
+        for count in (1, 3):
+            stepper.crew = threads.Crew(stepper.places, None, count)
+            chunks.append(stepper.advance(stepper.start(), np.array([5, 40]), None))
+    alone, shared = chunks
+    assert shared.now.states.tobytes() == alone.now.states.tobytes()
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(shared.sums, alone.sums, strict=True))
+
+
+@pytest.mark.parametrize("graph", [ech.Graph.ring(200), ech.Graph.ring(200, leaders=(0, 90))])
+def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkeypatch):
+    model = ech.models.DoubleIntegrator(1)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=0.3))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain, feedforward="relay"))
+    formation = ech.Formation(np.arange(200.0)[:, None] * [[1.0, 0.0]])
+    parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
+    whole, stepper = stepped(parts, run_settings(), (5, 0, 40), "native")
+    near = stepper.places.near
+    assert near.reach < 4
+    monkeypatch.setattr(schedule, "_CACHES", (8 * near.reach * near.bytes,))
+    for count in (1, 3):
+        stepper.crew = threads.Crew(stepper.places, None, count)
+        with jax.enable_x64(True):
+            tiles = stepper.advance(stepper.start(), np.array([5, 0, 40]), None)
+        assert len(stepper.crew._turns(40, 0)) > 3 * 40
+        assert tiles.states.tobytes() == whole.states.tobytes()
+        assert tiles.inputs.tobytes() == whole.inputs.tobytes()
+        assert all(a.tobytes() == b.tobytes() for a, b in zip(tiles.sums, whole.sums, strict=True))
+
+
+@given(
+    bits=st.sampled_from([64, 32]),
+    agents=st.integers(1, 40),
+    rows=st.integers(0, 5),
+    seed=st.integers(0, 99),
+)
+def test_numbers_are_where_they_were_put_whoever_stands_where(bits, agents, rows, seed):
+    draws, lanes, kind = (
+        np.random.default_rng(seed),
+        native_stepper.LANES[bits],
+        np.dtype(f"f{bits // 8}"),
+    )
+    stand = np.resize(draws.permutation(agents), -(-agents // lanes) * lanes)
+    blocks = kernels.aligned((len(stand) // lanes, rows + 3, lanes), kind)
+    wanted = draws.normal(size=(agents, rows)).astype(kind)
+    part = blocks[:, 1 : 1 + rows]
+    kernels.move(part, stand, wanted, True, 0, len(blocks))
+    np.testing.assert_array_equal(part.transpose(0, 2, 1).reshape(len(stand), rows), wanted[stand])
+    assert not blocks[:, 0].any() and not blocks[:, 1 + rows :].any()
+    for other in (kind, np.dtype(float)):
+        found = np.full((agents, rows), np.nan, other)
+        # In pieces, as threads do.
+        for first in range(len(blocks)):
+            kernels.move(part, stand, found, False, first, first + 1)
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_native_code_is_given_arrays_of_its_own_layout_alone():
+    blocks = kernels.aligned((2, 3, native_stepper.LANES[64]), np.float64)
+    stand, wanted = (
+        np.arange(2 * native_stepper.LANES[64]),
+        np.ones((2 * native_stepper.LANES[64], 3)),
+    )
+    for name, changed in {
+        "rows": {"rows": blocks.transpose(0, 2, 1)},
+        "agents": {"agents": stand.astype(np.int32)},
+        "values": {"values": np.asfortranarray(wanted)},
+        "count": {"values": wanted[:, :2].copy()},
+        "last": {"last": 3},
+    }.items():
+        told = {"rows": blocks, "agents": stand, "values": wanted, "first": 0, "last": 2} | changed
+        with pytest.raises(ValueError, match=f"`{name}` does not fit"):
+            kernels.move(**told, inward=True)
+    with pytest.raises(ValueError, match="`values` does not fit"):
+        kernels.move(blocks, stand, wanted.astype(int), True, 0, 2)
+    assert not blocks.any()
+
+
+def test_the_code_that_moves_numbers_is_made_once_for_all_threads(monkeypatch):
+    made, begin = list[int](), threading.Barrier(4)
+
+    class Slow:
+        def __init__(self, *_):
+            made.append(1)
+            time.sleep(0.05)
+
+        def call(self, _):
+            pass
+
+    monkeypatch.setattr(block_copy, "Code", Slow)
+    block_copy._mover.cache_clear()
+    blocks, stand = kernels.aligned((1, 1, 8), np.float64), np.arange(8)
+
+    def move(_):
+        begin.wait()
+        kernels.move(blocks, stand, np.ones((8, 1)), True, 0, 1)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(move, range(4)))
+    block_copy._mover.cache_clear()
+    assert len(made) == 1
+
+
+def test_memory_is_taken_again_when_nobody_holds_any_of_it():
+    here, shape = buffers.Room(), (2**10, 2**8)
+    first = here.empty(shape, float)
+    first[:] = 1.0
+    kept, place = first[3, 5:7], first.ctypes.data
+    del first
+    second = here.empty(shape, float)
+    second[:] = 2.0
+    assert second.ctypes.data != place and (kept == 1.0).all()
+    del kept
+    assert here.empty(shape, float).ctypes.data == place
+    # Of another size there is none, and small ones are nothing to keep.
+    assert here.empty((2**19,), np.float32).shape == (2**19,)
+    assert here.empty((3, 0), float).shape == (3, 0)
+
+
+@given(keys=st.lists(st.integers(0, 9)))
+def test_keys_are_grouped_as_a_stable_sort_would(keys):
+    keys = np.array(keys, int)
+    starts, places = agent_order.grouped(keys, 10)
+    np.testing.assert_array_equal(places, np.argsort(keys, kind="stable"))
+    np.testing.assert_array_equal(np.diff(starts), np.bincount(keys, minlength=10))
+
+
+def test_threads_of_which_not_all_were_started_do_not_wait_for_the_others():
+    did = []
+
+    class Interrupted(ThreadPoolExecutor):
+        def submit(self, *args):
+            if self._threads:
+                raise KeyboardInterrupt
+            return super().submit(*args)
+
+    with Interrupted(2) as pool, pytest.raises(KeyboardInterrupt):
+        threads.share(pool, did.append, range(2))
+    # The pool has ended, and so has its thread.
+    assert did == []
+
+
+def test_what_threads_write_to_lives_until_they_end(monkeypatch):
+    did, calls = [], []
+
+    def wait(begun):
+        calls.append(len(begun))
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        futures.wait(begun)
+
+    def act(part):
+        time.sleep(0.05)
+        did.append(part)
+
+    monkeypatch.setattr(threads, "wait", wait)
+    with ThreadPoolExecutor(2) as pool:
+        with pytest.raises(KeyboardInterrupt):
+            threads.share(pool, act, range(2))
+        assert sorted(did) == [0, 1] and calls == [2, 2]
+
+
+# ---- what is told ----
+
+
+def test_long_runs_are_native_and_short_ones_are_not():
+    model = ech.models.DoubleIntegrator(dimension=2)
+    parts = flock(ech.Graph.ring(30), model, ech.laws.TrimInput(), initial={"position": 0.01})
+    long = ech.simulate(parts, run_settings(horizon=20.0, dt=0.005, store_every=100))
+    assert long.engine == "native" and long.outcome is ech.Outcome.COMPLETED
+    short = ech.simulate(parts, run_settings(horizon=0.05, steady_window=0.01))
+    assert short.engine == "jax" and not short.warnings
+
+
+class Bends(ech.laws.Law):
+    """Uses what has no native code."""
+
+    def update(self, model, view, memory):
+        return jax.scipy.special.erfinv(view.disagreement)[:1] * 0.0, memory
+
+
+def test_what_has_no_native_code_runs_by_jax_and_says_why():
+    model, graph = ech.models.Pendulum(), ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), Bends())
+    parts = ech.Parts(model, graph, ech.Formation(np.zeros((2, 2))), drive)
+    told = r"there is no native code for `erf_inv` in .*test_native\.py, line \d+"
+    with pytest.raises(ech.errors.SimulationError, match=rf"^`engine` is `native`, and {told}\.$"):
+        ech.simulate(parts, run_settings(engine="native"))
+    found = ech.simulate(parts, run_settings(horizon=600.0, dt=0.01, store_every=1000))
+    assert found.engine == "jax"
+    [warning] = [w for w in found.warnings if w.startswith("JAX steps the agents")]
+    assert "`erf_inv`" in warning
+
+
+def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():
+    model = ech.models.SingleIntegrator(dimension=1)
+    graph = ech.Graph.path(2)
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Agreement())
+    parts = ech.Parts(
+        model, graph, ech.Formation(np.zeros((2, 1))), drive, initial=np.array([[0.0], [1e6]])
+    )
+    (ours, stepper), (theirs, _) = (
+        stepped(parts, run_settings(), (10,), name) for name in ("native", "jax")
+    )
+    assert stepper.engine == "native"
+    assert ours.states.tobytes() == theirs.states.tobytes()
+    [warning] = stepper.warnings
+    assert warning == (
+        "JAX stepped the agents from t = 0 s on where a state was beyond 100000, since the sines "
+        "of native code lose digits there."
+    )
+
+
+def test_an_agent_that_is_lost_is_told_as_by_jax():
+    class Cubic(ech.ControlAffine):
+        state_names, input_names = ("x",), ("push",)
+
+        def drift(self, x):
+            return x**3
+
+        def input_map(self, x):
+            return jnp.ones((1, 1), x.dtype)
+
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.TrimInput())
+    parts = ech.Parts(
+        Cubic(),
+        ech.Graph.path(2),
+        ech.Formation(np.zeros((2, 1))),
+        drive,
+        initial=np.array([[0.0], [3.0]]),
+    )
+    found = [
+        ech.simulate(parts, ech.Settings(horizon=2.0, dt=0.01, engine=name))
+        for name in ("native", "jax")
+    ]
+    assert found[0].message == found[1].message and "follower 1" in found[0].message
+
+
+def test_where_agents_stand_changes_no_bit(monkeypatch):
+    line = np.random.default_rng(0).permutation(60)
+    graph = ech.Graph.from_edges([(line[k], line[k + 1]) for k in range(59)])
+    model = ech.models.DoubleIntegrator(1)
+    gain = ech.synthesize(model, graph, ech.gains.Riccati(coupling=1.0))
+    drive = ech.Laws(ech.laws.TrimInput(), ech.laws.Consensus(gain))
+    offsets = np.arange(60.0)[:, None] * [[1.0, 0.0]]
+    parts = ech.Parts(model, graph, ech.Formation(offsets), drive, initial={"position": 1.0})
+    (as_numbered, plain) = stepped(parts, run_settings(), (3, 20, 0), "native")
+    monkeypatch.setattr(agent_order, "_LARGE", 2)
+    (nearby, moved) = stepped(parts, run_settings(), (3, 20, 0), "native")
+    assert as_numbered.states.tobytes() == nearby.states.tobytes()
+    for name, a, b in zip(nearby.sums._fields, as_numbered.sums, nearby.sums, strict=True):
+        assert a.tobytes() == b.tobytes(), name
+
+    def apart(stepper):
+        i, j = stepper.places.of[graph.edges].T
+        return np.abs(i - j).mean()
+
+    # On a line each stands beside the next, but for the leader's block.
+    assert apart(moved) < 3.0 < 10.0 < apart(plain)
+
+
+RATE = -1.0
+
+
+class Decaying(ech.models.SingleIntegrator):
+    """Reads a number of its module."""
+
+    def drift(self, x):
+        return RATE * x
+
+
+class Tabled(ech.models.SingleIntegrator):
+    """Reads the first row of a table."""
+
+    table: np.ndarray
+
+    def __init__(self, table):
+        super().__init__(1)
+        self.table = table
+
+    def drift(self, x):
+        return x * self.table[0].sum()
+
+
+class Driven(ech.models.SingleIntegrator):
+    """Holds a function."""
+
+    rate: Callable
+
+    def __init__(self, rate):
+        super().__init__(1)
+        self.rate = rate
+
+    def drift(self, x):
+        return self.rate(x)
+
+
+def led(model):
+    """Return a leader that its drift alone moves from 1, and a follower."""
+    rest = ech.laws.TrimInput()
+    return ech.Parts(
+        model,
+        LINE,
+        ech.Formation(np.zeros((2, 1))),
+        ech.Laws(rest, rest),
+        initial=np.ones((2, 1)),
+    )
+
+
+LINE = ech.Graph.path(2)
+BRIEF = ech.Settings(0.3, 0.1, integrator="euler", engine="native")
+
+
+def test_what_a_user_s_class_reads_is_read_anew_for_each_run(monkeypatch):
+    def ended():
+        return ech.simulate(led(Decaying(1)), BRIEF).states[-1].ravel()
+
+    assert ended() == pytest.approx(0.9**3)
+    monkeypatch.setitem(globals(), "RATE", 5.0)
+    assert ended() == pytest.approx(1.5**3)
+    monkeypatch.setattr(Decaying, "drift", lambda self, x: 0.0 * x)
+    assert ended() == pytest.approx(1.0)
+
+
+def test_matrices_of_the_same_bits_and_other_shapes_are_other_models():
+    for shape, total in (((2, 3), 3.0), ((3, 2), 1.0)):
+        model = Tabled(np.arange(6.0).reshape(shape))
+        found = ech.simulate(led(model), BRIEF).states[-1].ravel()
+        assert found == pytest.approx((1.0 + 0.1 * total) ** 3)
+
+
+def own_of(model):
+    prepared = prepare(led(model), BRIEF)
+    drive = prepared.parts.drive
+    return Own([assemble(prepared.problem, drive.leader, drive.follower)])
+
+
+def test_a_program_is_known_by_shapes_and_types_and_not_where_nobody_knows_what_is_read(
+    monkeypatch,
+):
+    assert own_of(ech.models.SingleIntegrator(1)).signature is not None
+    assert own_of(Decaying(1)).signature is None
+    held = own_of(Driven(jnp.sin))
+    assert held.signature is None and not held.covers(held.loop)
+    # As of a class that may be trusted.
+    monkeypatch.setattr(varying, "is_ours", lambda loop: True)
+    assert own_of(Driven(jnp.sin)).signature is None
+    numbers = [np.arange(6.0).reshape(2, 3), np.arange(6.0).reshape(3, 2), np.arange(6.0).view(int)]
+    signatures = [own_of(Tabled(each)).signature for each in numbers]
+    assert len({*signatures, own_of(Tabled(numbers[0].copy())).signature}) == 3
+
+
+def test_a_user_s_class_is_traced_anew_and_shares_machine_code(monkeypatch):
+    made = list[str]()
+
+    def code(text, folder):
+        made.append(text)
+        return kernels.Code(text, folder)
+
+    monkeypatch.setattr(kernel_code, "KERNELS", kernel_code.Kernels())
+    monkeypatch.setattr(kernel_code, "Code", code)
+    of = kernel_code.KERNELS.of
+    one, other = (of(own_of(Decaying(1)), 64, False) for _ in range(2))
+    assert one is not other and one.code is other.code and len(made) == 1
+    plain = [of(own_of(ech.models.SingleIntegrator(1)), 64, False) for _ in range(2)]
+    assert plain[0] is plain[1]

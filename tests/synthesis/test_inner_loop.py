@@ -1,0 +1,134 @@
+"""The inner loop that makes the paper's Assumption 5 hold."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
+from runs import simulate
+
+import echelon as ech
+from echelon.agents.models.linearization import linearize
+from echelon.core.numerics import precision
+from echelon.experiments.results.metrics import formation_errors
+from echelon.synthesis.gains.inner_loop import symmetric_states
+
+AGENTS = {
+    "double integrator": ech.models.DoubleIntegrator(2),
+    "planar quadrotor": ech.models.PlanarQuadrotor(),
+    "quadrotor": ech.models.Quadrotor.crazyflie(),
+}
+
+
+def closed(model, gain):
+    """A - B K and B, in normalized inputs."""
+    A, B = linearize(model)
+    return A - B @ gain.inner, B
+
+
+@pytest.fixture(scope="module")
+def gains():
+    graph = ech.Graph.path(4)
+    return {
+        name: ech.synthesize(model, graph, ech.gains.InnerLoop()) for name, model in AGENTS.items()
+    }
+
+
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_closed_drift_is_monotone_in_p(gains, name):
+    model, gain = AGENTS[name], gains[name]
+    A, _ = closed(model, gain)
+    slope = gain.P @ A + A.T @ gain.P
+    scale = np.abs(slope).max()
+    assert np.linalg.eigvalsh(slope).max() <= 1e-12 * scale
+    with precision("float64"):
+        fixed = symmetric_states(model)
+    assert [model.state_names[k] for k in fixed] == list(model.position)
+    assert not gain.inner[:, fixed].any() and not A[:, fixed].any()
+
+
+@pytest.mark.parametrize("name", AGENTS)
+@given(
+    edges=st.sets(st.tuples(st.integers(0, 5), st.integers(0, 5))), coupling=st.floats(0.01, 100)
+)
+def test_every_coupling_and_every_connected_graph_is_stable(gains, name, edges, coupling):
+    pairs = {tuple(sorted(pair)) for pair in edges if pair[0] != pair[1]}
+    graph = ech.Graph.from_edges(sorted(pairs | {(k, k + 1) for k in range(5)}))
+    A, B = closed(AGENTS[name], gains[name])
+    for value in graph.spectrum().eigenvalues:
+        mode = A - coupling * value * B @ B.T @ gains[name].P
+        assert np.linalg.eigvals(mode).real.max() < 0.0
+
+
+@pytest.mark.slow
+def test_quadrotors_converge_by_the_relay_of_the_input_beyond_the_loop(gains):
+    model, graph = AGENTS["quadrotor"], ech.Graph.path(4)
+    result = simulate(
+        model,
+        graph,
+        ech.Formation.line(model, graph, 0.5),
+        leader=ech.laws.Tracking(ech.references.FigureEight()),
+        follower=ech.laws.Consensus(gains["quadrotor"], feedforward="relay"),
+        initial={"position": 1.0, "attitude": 0.3},
+        horizon=20.0,
+        dt=0.005,
+        store_every=20,
+    )
+    errors = formation_errors(result)
+    assert errors[-1].max() < 1e-9 and errors[0].max() > 0.5
+    started = simulate(
+        model,
+        graph,
+        ech.Formation.line(model, graph, 0.5),
+        leader=ech.laws.Tracking(ech.references.FigureEight()),
+        follower=ech.laws.Consensus(gains["quadrotor"], feedforward="relay"),
+        start_error={"x": 0.7},
+        horizon=3.0,
+        dt=0.005,
+    )
+    assert formation_errors(started).max() < 1e-13
+
+
+def test_v_never_rises_where_the_drift_is_linear():
+    model, graph = ech.models.DoubleIntegrator(2), ech.Graph.ring(5)
+    result = simulate(
+        model,
+        graph,
+        ech.Formation.circle(model, graph),
+        leader=ech.laws.Tracking(ech.references.Circle()),
+        follower=ech.laws.Consensus(
+            ech.synthesize(model, graph, ech.gains.InnerLoop()), feedforward="relay"
+        ),
+        initial={"position": 1.0, "velocity": 1.0},
+        horizon=5.0,
+        dt=0.01,
+    )
+    v = ech.lyapunov(result)
+    assert (v.drift <= 1e-9 * np.abs(v.rate).max()).all()
+    assert not v.rises().any() and v.value[-1] < v.value[0]
+
+
+def test_weights_replace_the_damping_that_the_model_brings():
+    model, graph = AGENTS["quadrotor"], ech.Graph.path(4)
+    R = 4.0 * np.diag(model.weights[1])
+    plain, heavy = (ech.synthesize(model, graph, ech.gains.InnerLoop(R=r)) for r in (None, R))
+    assert np.array_equal(plain.inner, model.damping)
+    with precision("float64"):
+        linear, fixed = linearize(model), symmetric_states(model)
+    free = [k for k in range(12) if k not in fixed]
+    A, B, Q = linear.A[np.ix_(free, free)], linear.B[free], np.diag(model.weights[0])
+    P = scipy.linalg.solve_continuous_are(A, B, Q[np.ix_(free, free)], R)
+    assert heavy.inner[:, free] == pytest.approx(np.linalg.solve(R, B.T @ P), abs=1e-9)
+    assert not heavy.inner[:, fixed].any() and heavy.certificate.stable
+    with pytest.raises(ech.EchelonError, match="`R` is not positive definite"):
+        ech.synthesize(model, graph, ech.gains.InnerLoop(R=-R))
+
+
+def test_an_agent_without_symmetric_states_is_refused():
+    graph = ech.Graph.path(3)
+    with pytest.raises(ech.EchelonError, match="`Pendulum` has no state that its dynamics ignore"):
+        ech.synthesize(ech.models.Pendulum(), graph, ech.gains.InnerLoop())
+    with pytest.raises(ech.EchelonError, match="`symmetry_weight` is -1.0, and must be one"):
+        ech.synthesize(
+            ech.models.DoubleIntegrator(2), graph, ech.gains.InnerLoop(symmetry_weight=-1.0)
+        )

@@ -1,0 +1,295 @@
+"""The house itself: floors, sizes, kinds of classes, and what an import brings along."""
+
+import ast
+import graphlib
+import importlib
+import inspect
+import itertools
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "echelon"
+
+HEAVY = ["jax", "equinox", "scipy", "networkx", "cvxpy", "casadi", "matplotlib", "xarray"]
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def module_of(path: Path) -> str:
+    """The module's name relative to echelon: `models.model`, `models` for its `__init__`."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+PATHS = {module_of(path): path for path in FILES}
+
+
+@cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(PATHS[module].read_text("utf-8"), str(PATHS[module]))
+
+
+def is_folder(module: str) -> bool:
+    return PATHS[module].name == "__init__.py"
+
+
+def statements(node: ast.AST):
+    """Yield the import statements that can run, those inside functions included."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            for other in child.orelse:
+                yield from statements(ast.Module([other], []))
+        elif isinstance(child, ast.Import | ast.ImportFrom):
+            yield child
+        else:
+            yield from statements(child)
+
+
+def origin(module: str, node: ast.ImportFrom) -> str:
+    """The absolute name of what a `from` statement imports from."""
+    if not node.level:
+        return node.module or ""
+    here = ["echelon", *module.split(".")] if module else ["echelon"]
+    package = here if is_folder(module) else here[:-1]
+    base = package[: len(package) - node.level + 1]
+    return ".".join([*base, node.module] if node.module else base)
+
+
+def targets(module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
+    """The absolute names that an import statement may load: `from a import b` may load `a.b`."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    source = origin(module, node)
+    return [f"{source}.{alias.name}" for alias in node.names]
+
+
+def inside(name: str) -> str | None:
+    """The module of echelon that an absolute name stands for or lies in, if any."""
+    if name.split(".")[0] != "echelon":
+        return None
+    relative = name.removeprefix("echelon").removeprefix(".")
+    return relative if relative in PATHS else inside(name.rpartition(".")[0])
+
+
+@cache
+def imports(module: str) -> dict[str, int]:
+    """The modules of echelon that a module imports, each with the line where it does."""
+    pairs = [
+        (inside(name), node.lineno)
+        for node in statements(tree(module))
+        for name in targets(module, node)
+    ]
+    return {target: line for target, line in pairs if target is not None}
+
+
+def loads(module: str) -> set[str]:
+    """What a module imports, and the `__init__` of other folders, which Python runs on the way."""
+    folders = {target.rpartition(".")[0] for target in imports(module)}
+    own = module if is_folder(module) else module.rpartition(".")[0]
+    return set(imports(module)) | (folders - {own, ""})
+
+
+def functions() -> list[tuple[str, int]]:
+    """Every function with its number of lines, docstring aside."""
+    return [
+        (f"{PATHS[module].relative_to(ROOT)}:{node.lineno} {node.name}", lines(node))
+        for module in PATHS
+        for node in ast.walk(tree(module))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
+
+
+def lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    total = node.end_lineno - node.lineno + 1
+    if ast.get_docstring(node) is None:
+        return total
+    return total - (node.body[0].end_lineno - node.body[0].lineno + 1)
+
+
+@cache
+def classes() -> list[type]:
+    """Every class that a module of echelon defines."""
+    members = [vars(importlib.import_module(f"echelon.{m}".rstrip("."))) for m in PATHS]
+    found = [value for values in members for value in values.values() if inspect.isclass(value)]
+    return list({cls: None for cls in found if cls.__module__.split(".")[0] == "echelon"})
+
+
+def is_abstract(cls: type) -> bool:
+    """Abstract by a method, by a field, by saying so, or as a protocol."""
+    return (
+        inspect.isabstract(cls)
+        or any(getattr(cls, name, None) for name in ("__abstractvars__", "__abstractclassvars__"))
+        or any(base.__name__ in ("ABC", "Protocol", "Enum") for base in cls.__bases__)
+    )
+
+
+def fresh(code: str) -> str:
+    """What a new Python process prints that runs the code without the settings of this one."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def loaded_after(code: str) -> set[str]:
+    """Which of the heavy libraries a new process holds after running the code."""
+    printed = fresh(f"import sys\n{code}\nprint('loaded:', *sys.modules)")
+    names = printed.rpartition("loaded:")[2].split()
+    return set(HEAVY) & set(names)
+
+
+def test_the_rooms_keep_their_contracts():
+    """Who may import whom stands in pyproject.toml; `lint-imports` reads every import."""
+    command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as c; c()"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)
+    assert done.returncode == 0, done.stdout
+
+
+def test_nothing_stands_at_the_top_but_the_door():
+    named = {path.name for path in PACKAGE.iterdir() if not path.name.startswith("__pycache__")}
+    files = {name for name in named if not (PACKAGE / name).is_dir()}
+    assert files == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
+
+
+def test_no_import_cycle():
+    sorter = graphlib.TopologicalSorter({module: loads(module) for module in PATHS})
+    assert set(sorter.static_order()) == set(PATHS)
+
+
+def test_folders_are_layers_and_packages():
+    assert max(len(path.relative_to(PACKAGE).parts) for path in FILES) <= 3
+
+
+@pytest.mark.parametrize("module", PATHS)
+def test_files_are_short(module):
+    assert len(PATHS[module].read_text("utf-8").splitlines()) <= 400
+
+
+def test_functions_are_short():
+    sizes = sorted(size for _, size in functions())
+    assert not [name for name, size in functions() if size > 56]
+    assert statistics.median(sizes) <= 6
+    assert sizes[int(len(sizes) * 0.95)] <= 22
+
+
+def test_every_class_is_abstract_or_final():
+    faults = {
+        f"{cls.__module__}.{cls.__name__} inherits from {base.__name__}, which is concrete"
+        for cls in classes()
+        for base in cls.__bases__
+        if base in classes() and not issubclass(base, BaseException) and not is_abstract(base)
+    }
+    assert not faults, "\n".join(sorted(faults))
+
+
+def test_importing_echelon_loads_nothing_heavy():
+    assert loaded_after("import echelon") == set()
+
+
+def test_the_texts_and_the_schema_load_no_jax():
+    assert "jax" not in loaded_after(
+        "from echelon.experiments.scenario import registry, scenario, yaml"
+    )
+
+
+def test_using_the_library_loads_no_optional_part():
+    every_name = "import echelon\nfor name in echelon.__all__: getattr(echelon, name)"
+    assert not {"cvxpy", "casadi"} & loaded_after(every_name)
+
+
+def test_help_loads_no_jax():
+    code = "import sys\nfrom echelon.apps.cli.app import main\nsys.argv = ['echelon', '--help']\n"
+    call = "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code, end.code"
+    assert not {"jax", "equinox", "scipy", "matplotlib", "xarray"} & loaded_after(code + call)
+
+
+def test_echelon_leaves_the_precision_of_jax_alone():
+    code = "import jax, echelon\nfor name in echelon.__all__: getattr(echelon, name)\n"
+    assert fresh(code + "print(jax.config.jax_enable_x64)").split() == ["False"]
+
+
+def test_every_public_name_is_there_and_listed():
+    echelon = importlib.import_module("echelon")
+    assert [name for name in echelon.__all__ if not hasattr(echelon, name)] == []
+    assert set(echelon.__all__) <= set(dir(echelon))
+    assert not hasattr(echelon, "no_such_name")
+
+
+def test_every_dependency_is_pinned_and_no_index_is_named():
+    text = (ROOT / "constraints.txt").read_text("utf-8")
+    extras = project()["optional-dependencies"].values()
+    required = {plain(name) for name in itertools.chain(project()["dependencies"], *extras)}
+    pinned = {plain(line) for line in text.splitlines() if "==" in line}
+    assert required - pinned == {project()["name"]}
+    assert "://" not in text and "\n-" not in text
+
+
+def test_every_dependency_is_imported_or_has_its_reason():
+    not_imported = {
+        "pyarrow": "what pandas writes Parquet with",
+    }
+    extras = project()["optional-dependencies"]
+    optional = ("certify", "cluster", "fast", "optimal", "video", "parquet")
+    names = [*project()["dependencies"], *itertools.chain(*(extras[name] for name in optional))]
+    required = {re.match(r"[\w-]+", name)[0].replace("-", "_") for name in names}
+    found = {
+        target.split(".")[0]
+        for module in PATHS
+        for node in statements(tree(module))
+        for target in targets(module, node)
+    }
+    assert required - found == set(not_imported)
+    assert set(extras) == {*optional, "all", "dev"}
+
+
+def test_every_advice_to_install_names_this_distribution():
+    """The import is `echelon`, but on the index that name is somebody else's."""
+    files = [*FILES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    advice = re.compile(r"pip install (?:-\S+ )*['\"]?([\w.-]+)(?:\[([\w,-]+)\])?")
+    named = {found for path in files for found in advice.findall(path.read_text("utf-8"))}
+    here = {(name, extra) for name, extra in named if name == "."}
+    extras = {extra for _, extra in named if extra}
+    assert {name for name, _ in named - here} == {project()["name"]}
+    assert extras and extras <= set(project()["optional-dependencies"])
+    everything = f"{project()['name']}[certify,cluster,fast,optimal,video,parquet]"
+    assert everything in project()["optional-dependencies"]["all"]
+
+
+def test_the_version_is_the_same_wherever_it_stands():
+    version, citation = project()["version"], (ROOT / "CITATION.cff").read_text("utf-8")
+    assert importlib.import_module("echelon").__version__ == version
+    assert f"\nversion: {version}\n" in citation
+
+
+def project() -> dict[str, Any]:
+    """What pyproject.toml says of the distribution."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def plain(requirement: str) -> str:
+    """The name of a requirement as installers compare it."""
+    return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
+
+
+def test_dev_needs_the_standard_library_alone():
+    nodes = statements(ast.parse((ROOT / "dev.py").read_text("utf-8")))
+    names = {name.split(".")[0] for node in nodes for name in targets("", node)}
+    assert names <= sys.stdlib_module_names
+
+
+def test_dev_refuses_a_verb_it_does_not_have():
+    command = [sys.executable, str(ROOT / "dev.py"), "dmeo"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith("dev.py: `dmeo` is no verb.")
