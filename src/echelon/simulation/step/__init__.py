@@ -1,1 +1,1 @@
-"""One step of the closed loop: what an agent knows, does and sends; how agents move; what is measured."""
+"""One step of the closed loop: what an agent knows, does and sends, and how it moves."""
