@@ -10,7 +10,7 @@ import optimization
 from pages import write_part
 
 import echelon as ech
-from echelon.experiments.studies.compare import Row
+from echelon.experiments.studies.compare import ComparisonRow
 from echelon.output.reports.comparison_report import verdict
 from echelon.output.reports.printed import PRINTED
 
@@ -31,7 +31,7 @@ def number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def cells(row: Row) -> list[str]:
+def cells(row: ComparisonRow) -> list[str]:
     """Return one method's cells."""
     if row.flight is None or row.numbers is None:
         return [row.label, *["-"] * (len(HEADS) - 1)]

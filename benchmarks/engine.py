@@ -35,9 +35,9 @@ from steppers import FORMATIONS, STEPS, Yardstick, flock, rate
 
 import echelon as ech
 from echelon.simulation.codegen import Code, program
-from echelon.simulation.engine.batch import Fleet
+from echelon.simulation.engine.batch import Batch
 from echelon.simulation.native.kernel_cache import Kernels
-from echelon.simulation.native.threads import Crew
+from echelon.simulation.native.threads import ThreadPool
 
 Row: TypeAlias = dict[str, float]
 _TURNS = 4
@@ -219,7 +219,7 @@ def scattered(agents: int) -> np.ndarray:
 
 def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     """Return the rate of a large geometric graph, what it takes to build, and two threads."""
-    from echelon.simulation.native.blocks import Swarm
+    from echelon.simulation.native.blocks import SwarmBlocks
 
     edges = scattered(_MILLION)
     agents, begin = int(edges.max()) + 1, time.process_time()
@@ -227,9 +227,9 @@ def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     built = time.process_time() - begin
     side = made.steppers(flock(graph), bits)
     begin = time.process_time()
-    Swarm(side.native.loop, side.native.places.lanes)
+    SwarmBlocks(side.native.loop, side.native.places.lanes)
     built += time.process_time() - begin
-    crews = {n: Crew(side.native.places, None, n) for n in (1, 2)}
+    crews = {n: ThreadPool(side.native.places, None, n) for n in (1, 2)}
     told = agents, [side.native.longest], side.reference, bits
 
     def fly(threads: int, clock: Callable[[], float] = time.perf_counter) -> float:
@@ -256,7 +256,7 @@ def measure_fleet(_: Yardstick | None) -> Row:
     scenario = ech.load_scenario("paper", ["simulation.horizon=5", "report.steady_window=1"])
     parts, chosen = ech.build(scenario)
     chosen = chosen._replace(precision="float32", store_every=1_000)
-    fleet, row = Fleet(1), Row()
+    fleet, row = Batch(1), Row()
     for name in ("cold", "compiled"):
         begin = time.process_time()
         for first in range(0, 10_000, 2_500):

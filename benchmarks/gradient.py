@@ -18,7 +18,7 @@ from engine import flock
 
 import echelon as ech
 from echelon.core.numerics import precision
-from echelon.simulation.engine.gradient import Native, Run, by_jax
+from echelon.simulation.engine.gradient import DifferentiableRun, Native, by_jax
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.native.stepper import NativeStepper
@@ -44,7 +44,9 @@ def ways(agents: int) -> dict[str, Callable[[], Any]]:
     stepper = NativeStepper([loop], problem.states, 64, None, threads=1)
     gain = drive.gain
     values = {"P": gain.P, "R": gain.R, "coupling": np.asarray(gain.coupling)}
-    run = Run(loop, values, problem.states, None if reference is None else reference[:_STEPS])
+    run = DifferentiableRun(
+        loop, values, problem.states, None if reference is None else reference[:_STEPS]
+    )
     count, native = np.array([_STEPS], np.int32), Native(run, _STEPS)
     return {
         "forwards": lambda: stepper.advance(stepper.start(), count, reference),

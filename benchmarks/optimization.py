@@ -13,7 +13,7 @@ import numpy as np
 import echelon as ech
 from echelon.agents.references.flatness import Targets, reference_targets, shifted_targets
 from echelon.simulation.optimal.formation_plan import plan_tracking
-from echelon.simulation.optimal.objectives import Grid, TrackingOptions, coarse, grid, tracking
+from echelon.simulation.optimal.objectives import PlanTimes, TrackingOptions, coarse, grid, tracking
 from echelon.simulation.optimal.problem import OptimalControl
 
 MODEL, LOOP = ech.models.Quadrotor.crazyflie(), ech.references.Lemniscate()
@@ -68,7 +68,7 @@ def off_goal(result: ech.Result, i: int, j: int) -> np.ndarray:
 # ---- the least possible --------------------------------------------------------------------------
 
 
-def least(start: np.ndarray, targets: Targets, times: Grid, seeds: Sequence[int]) -> float:
+def least(start: np.ndarray, targets: Targets, times: PlanTimes, seeds: Sequence[int]) -> float:
     """Return the smallest root-mean-square error found within the motors' limits.
 
     The input costs nothing, and the solver begins at the targets and at other motions.

@@ -18,7 +18,7 @@ from echelon.core.types import Array
 from echelon.experiments.results.metrics import formation_errors, metrics
 from echelon.guarantees.stopping.motor_load import motors_bear
 from echelon.guarantees.stopping.stopping_run import stopping_of
-from echelon.simulation.engine.batch import Fleet
+from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.prepare import prepare
 
@@ -70,7 +70,7 @@ def flights(count: int, *changes: str) -> Iterator[dict[str, Any]]:
     """Yield what flights of a scenario come to."""
     parts, settings = built(*changes)
     runs = [(parts, settings._replace(seed=seed, store_every=10)) for seed in range(count)]
-    for found in Fleet().fly(runs):
+    for found in Batch().fly(runs):
         if isinstance(found, Exception):
             raise found
         numbers, errors = metrics(found), formation_errors(found)

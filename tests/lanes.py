@@ -6,8 +6,8 @@ from echelon.simulation.codegen import (
     SLOTS,
     Body,
     Code,
-    Graph,
     Plan,
+    ScalarGraph,
     aligned,
     lower,
     nodes,
@@ -21,7 +21,7 @@ NOTHING = Body({}, {}, {}, {}, {}, [], [], [])
 
 def lowered(function, count, bits=64):
     """Return the graph's results of a function for JAX of `count` numbers, as nodes."""
-    graph = Graph(bits)
+    graph = ScalarGraph(bits)
     x = np.empty(count, object)
     x[:] = [graph.leaf("row", k) for k in range(count)]
     found = [node for part in lower(function, graph, [x]) for node in nodes(graph, part)]

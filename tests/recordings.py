@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from echelon.experiments.results.recording import Bounds, Modes, Recording, Tracking
+from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
 
 PROMISE = {
     "promised": True,
@@ -51,13 +51,13 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "state_units": tuple("m" if name in "xyz" else "" for name in names),
         "input_names": tuple(f"u{k}" for k in range(inputs_count)),
         "input_units": ("N",) * inputs_count,
-        "bounds": Bounds(np.eye(inputs_count), np.zeros(inputs_count), np.ones(inputs_count)),
+        "bounds": InputBounds(np.eye(inputs_count), np.zeros(inputs_count), np.ones(inputs_count)),
         "lyapunov": 0.5 * (errors**2).sum(axis=(1, 2)),
         "lyapunov_rate": None,
         "metric": None,
         "limited": np.zeros(agents),
         "tracking": None,
-        "modes": Modes(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
+        "modes": LoopPoles(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
         "promise": PROMISE,
         "horizon": float(times[-1]),
         "dt": 0.01,
@@ -84,4 +84,4 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
 def tracked(run):
     """A tracking error that shrinks, for the leaders of a recording."""
     shrinks = np.exp(-run.times)[:, None, None] * np.ones((1, len(run.leaders), 2))
-    return Tracking(shrinks, ("x", "yaw"), ("m", "rad"))
+    return TrackingErrors(shrinks, ("x", "yaw"), ("m", "rad"))

@@ -9,7 +9,7 @@ from runs import made_up
 
 import echelon as ech
 from echelon.apps.cli import tables
-from echelon.core.statement import Hypothesis, Line
+from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.experiments.scenario.keys import keys_page
 from echelon.experiments.scenario.scenario import json_schema
@@ -20,7 +20,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 TEXT = (DOCS / "glossary.md").read_text("utf-8")
 ENTRIES = re.findall(r"\*\*(.+?)\*\*", TEXT)
 WORDS = [
-    *(each.value for each in (*Hypothesis, *Line)),
+    *(each.value for each in (*Hypothesis, *Topic)),
     *map(str, (*Verdict, *Kind, *Theorem, *Feedforward)),
 ]
 

@@ -14,7 +14,7 @@ from echelon.agents.network.eigenvalues import _least
 from echelon.agents.network.hearing import heard_along
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
-from echelon.core.statement import Hypothesis, Line
+from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.check import check
 from echelon.guarantees.promises.promise import promise
@@ -297,12 +297,12 @@ def test_the_delay_that_is_left_is_that_of_the_delayed_network(graph):
     gain = ech.synthesize(CARTS, graph, ech.gains.Riccati())
     parts, settings = flown(graph, gain), ech.Settings(4.0, 0.01)
     lines = {line.statement: line for line in check(parts, settings).lines}
-    delay = lines[Line.DELAY].number
+    delay = lines[Topic.DELAY].number
     A, B = linearize(CARTS)
     L = graph.grounded_laplacian().toarray()
     network = np.kron(np.eye(3), A), np.kron(L, gain.coupling * B @ gain.R_inverse @ B.T @ gain.P)
     assert abscissa(*network, 0.98 * delay) < 0.0 < abscissa(*network, 1.02 * delay)
-    spread = lines[Line.SPREAD]
+    spread = lines[Topic.SPREAD]
     ratio = np.abs(np.linalg.eigvals(L)).max() / np.linalg.eigvals(L).real.min()
     assert spread.number == pytest.approx(ratio) and spread.fails and ratio > 4.0
     assert f"{1e3 * delay:.3g} ms old" in spread.text
@@ -313,7 +313,7 @@ def test_agreement_bears_the_delay_that_is_told():
     parts = stopping(graph)
     lines = {line.statement: line for line in check(parts, ech.Settings(4.0, dt)).lines}
     c = float(prepare(parts, ech.Settings(4.0, dt)).parts.drive.follower.strength(dt))
-    L, delay = c * graph.grounded_laplacian().toarray(), lines[Line.DELAY].number
+    L, delay = c * graph.grounded_laplacian().toarray(), lines[Topic.DELAY].number
     still = np.zeros_like(L)
     assert abscissa(still, L, 0.98 * delay) < 0.0 < abscissa(still, L, 1.02 * delay)
 
@@ -339,7 +339,7 @@ def test_what_is_promised_of_a_linear_law_on_arrows_is_its_modes():
     lines = {
         line.statement: line for line in check(flown(RING, gain), ech.Settings(4.0, 0.01)).lines
     }
-    assert lines[Line.GRAPH].fails and Line.PUSHED not in lines
+    assert lines[Topic.GRAPH].fails and Topic.PUSHED not in lines
 
 
 def test_a_region_on_arrows_is_smaller_by_their_skew_and_verified(tmp_path):

@@ -14,12 +14,12 @@ import echelon as ech
 from echelon.apps.live import live_stepper
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
-from echelon.apps.live.guarantee_status import Reach
+from echelon.apps.live.guarantee_status import GuaranteeStatus
 from echelon.apps.live.knobs import Panel
 from echelon.apps.live.promiser import badge_of, first_look
 from echelon.apps.live.server import live, serve_live
 from echelon.apps.live.session import Session
-from echelon.apps.live.swarm import Picture, Swarm
+from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import SimulationError
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.scenario.build import build
@@ -52,15 +52,15 @@ def panel():
 
 @pytest.fixture(scope="module")
 def swarm(panel):
-    return Swarm(*panel.built, panel)
+    return LiveLoop(*panel.built, panel)
 
 
 @pytest.fixture(scope="module")
 def native(panel):
     """The same loop by code for this machine."""
     parts, settings = panel.built
-    made = Swarm(parts, settings._replace(engine="native"), panel)
-    assert (made.engine, Swarm(parts, settings, panel).engine) == ("native", "jax")
+    made = LiveLoop(parts, settings._replace(engine="native"), panel)
+    assert (made.engine, LiveLoop(parts, settings, panel).engine) == ("native", "jax")
     return made
 
 
@@ -94,7 +94,7 @@ def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
 def test_a_law_that_remembers_and_signals_is_live_too():
     own = ech.load_scenario("paper-global", ["simulation.horizon=0.4", "simulation.engine=jax"])
     found = Panel(own, build(own))
-    swarm, wanted = Swarm(*found.built, found), ech.run(own).states
+    swarm, wanted = LiveLoop(*found.built, found), ech.run(own).states
     shown = flown(swarm, 10)
     # Pictures are 8 steps apart, stored frames 10.
     np.testing.assert_allclose(shown[4], wanted[4], atol=1e-9)
@@ -177,7 +177,7 @@ def test_a_graph_that_switches_is_live_by_its_schedule(monkeypatch):
     panel = Panel(own, build(own))
     # Few periods are foreseen at a time, so that the loop must look ahead again.
     monkeypatch.setattr(looked, "_AHEAD", 0.2)
-    swarm = Swarm(*panel.built, panel)
+    swarm = LiveLoop(*panel.built, panel)
     assert len(swarm.loop.switches.steps) == 10 and panel.slowest(panel.start) is None
     for knobs in (panel.start, panel.start._replace(cut=frozenset({2}))):
         parts, settings = build(panel.standing(knobs))
@@ -274,7 +274,7 @@ def test_what_was_done_is_saved_and_repeats_to_the_bit(session, swarm):
     ats = [0.08, 0.08, 0.16, 0.16, 0.24, 0.24, 0.24, 0.24, 0.28, 0.28, 0.32, 0.32]
     assert [event.at for event in again.live] == ats
     panel = Panel(again, build(again))
-    other = Session(again, panel, Swarm(*panel.built, panel))
+    other = Session(again, panel, LiveLoop(*panel.built, panel))
     for states in shown:
         other.settle()
         np.testing.assert_array_equal(other.swarm.advance().states, states)
@@ -351,7 +351,7 @@ HELD = {"state": "holds", "short": "promised", "whole": "Promised.", "rate": 1.0
 def badges_of(model, errors, pitch=None, begins=None):
     """What the badge tells over time (s) of errors, one a second, of a leader and a follower."""
     told, names = [], model.state_names
-    reach = Reach(model, ech.Graph.path(2), told.append)
+    reach = GuaranteeStatus(model, ech.Graph.path(2), told.append)
     reach.hear(HELD | {"beyond": ["what is promised does not reach this run: far"]})
     for second, error in enumerate(errors):
         if second == begins:

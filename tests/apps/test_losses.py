@@ -22,7 +22,7 @@ from echelon.core.files import write_whole
 from echelon.laws.law import Law
 from echelon.output.archive.chunks import Chunks
 from echelon.simulation.engine import simulate as engine
-from echelon.simulation.engine.grid import Grid
+from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.simulate import reassemble
 
 SCENARIO = """
@@ -138,7 +138,7 @@ def test_a_run_that_goes_on_ends_with_the_bits_of_one_that_never_ended(settings,
 @pytest.mark.parametrize(("steps", "every", "longest"), [(1, 1, 5), (10, 3, 1), (999, 7, 50),
                                                          (1000, 300, 17), (20, 50, 6)])  # fmt: skip
 def test_the_grid_visits_each_step_once_and_stores_each_frame_once(steps, every, longest):
-    grid = Grid(ech.Settings(float(steps), 1.0, store_every=every), longest)
+    grid = ChunkGrid(ech.Settings(float(steps), 1.0, store_every=every), longest)
     assert grid.longest <= longest or grid.longest == 1
     first, frames = 0, []
     while len(frames) < grid.frames:

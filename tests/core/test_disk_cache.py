@@ -20,7 +20,7 @@ from echelon.agents.models import Pendulum, VanDerPol
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.core import compiled, disk_cache, memoize
-from echelon.core.compiled import Program
+from echelon.core.compiled import CompiledFunction
 from echelon.core.memoize import stored
 from echelon.core.numerics import precision
 from echelon.experiments.scenario.user_code import own_class
@@ -60,7 +60,7 @@ def sensitivity(model, x, scale):
 def slope(monkeypatch):
     """It, as if it were echelon's."""
     monkeypatch.setattr(sensitivity, "__module__", "echelon.agents.models.linearization")
-    return lambda: Program(sensitivity)
+    return lambda: CompiledFunction(sensitivity)
 
 
 def refused(*_):
@@ -111,10 +111,10 @@ def test_code_that_calls_other_code_is_left_to_jax(folder, monkeypatch):
 
     monkeypatch.setattr(solved, "__module__", "echelon.agents.models.linearization")
     # JAX compiles what it traces itself, under a name that it finds again.
-    assert Program(solved)(np.eye(2)).shape == (2,) and len(traced) == 2
+    assert CompiledFunction(solved)(np.eye(2)).shape == (2,) and len(traced) == 2
     assert [disk_cache.read(entry) for entry in folder.iterdir()] == [b""]
     for _ in range(2):
-        assert Program(solved)(np.eye(2)).shape == (2,)
+        assert CompiledFunction(solved)(np.eye(2)).shape == (2,)
     # Nor is it traced to know of it once that is kept.
     assert len(traced) == 2
 
@@ -132,7 +132,7 @@ def test_a_program_is_compiled_for_what_is_set(monkeypatch):
         return jnp.zeros(()) + n.sum()
 
     monkeypatch.setattr(zeros, "__module__", "echelon.agents.models.linearization")
-    made, n = Program(zeros), np.arange(3, dtype=np.int32)
+    made, n = CompiledFunction(zeros), np.arange(3, dtype=np.int32)
     for name in ("float32", "float64", "float32"):
         with precision(name):
             assert made(n).dtype == name
@@ -288,7 +288,7 @@ def test_arrays_that_are_not_traced_are_known_by_their_numbers(monkeypatch):
     x = np.ones(2)
     for numbers in (np.array([1.0, 2.0]), np.array([3.0, 4.0])):
         with precision("float64"):
-            got = Program(scaled)(Still(Box(numbers)), x)
+            got = CompiledFunction(scaled)(Still(Box(numbers)), x)
         np.testing.assert_array_equal(got, numbers)
 
 

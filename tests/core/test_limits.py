@@ -10,7 +10,7 @@ from echelon.core import limits
 from echelon.core.errors import ModelError, Outcome
 from echelon.core.limits import MOST_AGENTS, MOST_STEPS, horizon_fault
 from echelon.experiments.scenario import build as scenario_build
-from echelon.simulation.engine.batch import Fleet
+from echelon.simulation.engine.batch import Batch
 from echelon.simulation.engine.prepare import check_memory
 
 HUGE = 10**23
@@ -83,7 +83,7 @@ def test_a_model_is_checked_before_its_states_are_counted_and_ends_no_other_run(
     wrong = right.replace(model=model)
     with pytest.raises(ModelError):
         ech.simulate(wrong, settings())
-    first, second = Fleet(1).fly([(wrong, settings()), (right, settings())])
+    first, second = Batch(1).fly([(wrong, settings()), (right, settings())])
     assert isinstance(first, ModelError)
     assert isinstance(second, ech.Result) and second.outcome is Outcome.COMPLETED
 

@@ -12,7 +12,7 @@ import pytest
 import echelon as ech
 from echelon.apps.cli.app import app
 from echelon.experiments.results.metrics import FollowerMetrics, LeaderMetrics, Metrics
-from echelon.experiments.studies.compare import LABELS, Comparison, Row
+from echelon.experiments.studies.compare import LABELS, Comparison, ComparisonRow
 from echelon.output.reports.comparison_report import comparison_mapping, comparison_report, verdict
 
 LAWS = ("literal", "riccati-relay", "riccati", "inner-loop")
@@ -75,7 +75,7 @@ def row_of(label, settles, effort, computing):
     """A method of one follower, with the numbers that the paragraph reads."""
     follower = FollowerMetrics(1, 0.1, 0.1, settles, effort, 0.0)
     numbers = Metrics((LeaderMetrics(None, None, {}),), (follower,), (), None, 0.0, 1.0)
-    return Row(label, types.SimpleNamespace(computing=computing), numbers)
+    return ComparisonRow(label, types.SimpleNamespace(computing=computing), numbers)
 
 
 def test_what_is_said_of_those_that_settle_is_said_to_be_of_them():

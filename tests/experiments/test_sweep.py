@@ -26,11 +26,11 @@ from echelon.experiments.sweeps.numbers import columns_of
 from echelon.experiments.sweeps.plan import Sweep
 from echelon.experiments.sweeps.sweep import _missing, compute
 from echelon.experiments.sweeps.sweep_dataset import dataset_of, share_bounds, succeeded
-from echelon.experiments.sweeps.workers import Batch
+from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.guarantees.promises.promise import promise, promises
 from echelon.output.plots.sweep_figures import sweep_figures
 from echelon.simulation.engine import batch, law_drive
-from echelon.simulation.engine.batch import Fleet
+from echelon.simulation.engine.batch import Batch
 
 SHORT = ["simulation.horizon=0.5", "simulation.dt=0.01", "report.steady_window=0.1"]
 
@@ -65,7 +65,7 @@ def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
     experiment = built(name, "simulation.horizon=2", "report.steady_window=1")
     runs = seeds(experiment, 19, engine="native", precision=precision, store_every=20)
     for threads in (1, 3):
-        found = list(Fleet(threads).fly(runs))
+        found = list(Batch(threads).fly(runs))
         for k in (0, 7, 18):
             check_same(found[k], ech.simulate(*runs[k]))
 
@@ -74,7 +74,7 @@ def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
 @pytest.mark.parametrize("name", ["paper", "planar-quadrotor", "paper-literal", "paper-line"])
 def test_every_run_among_many_has_the_bits_that_it_has_alone(name):
     runs = seeds(built(name), 20, engine="native", store_every=200)
-    found = list(Fleet().fly(runs))
+    found = list(Batch().fly(runs))
     for k in (0, 19):
         check_same(found[k], ech.simulate(*runs[k]))
 
@@ -117,7 +117,7 @@ def test_numbers_of_a_formations_own_are_its_own(name):
     runs = [
         (parts, chosen._replace(seed=k)) for k, parts in enumerate(parted(graph, gains=OWN, **more))
     ]
-    found = list(Fleet(1).fly(runs))
+    found = list(Batch(1).fly(runs))
     assert len({r.states[-1].tobytes() for r in found}) == len(runs)
     for k in (0, 5):
         # Numbers that are rows are rounded where constants would be folded.
@@ -130,7 +130,7 @@ def test_runs_that_no_program_shares_are_flown_by_themselves():
     [longer] = parted(ech.Graph.path(4), gains=[(1.0, 1.0)])
     chosen = ech.Settings(horizon=0.5, dt=0.01, store_every=10, engine="native")
     runs = [(short, chosen), (longer, chosen), (short, chosen._replace(horizon=0.2))]
-    for one, (parts, each) in zip(Fleet(1).fly(runs), runs, strict=True):
+    for one, (parts, each) in zip(Batch(1).fly(runs), runs, strict=True):
         check_same(one, ech.simulate(parts, each))
 
 
@@ -153,7 +153,7 @@ def test_one_that_is_lost_is_told_as_alone_and_loses_no_other():
     )
     chosen = ech.Settings(horizon=2.0, dt=0.01, store_every=5, engine="native")
     runs = [(parts, chosen._replace(seed=k)) for k in range(10)]
-    found = list(Fleet(1).fly(runs))
+    found = list(Batch(1).fly(runs))
     assert {r.outcome.name for r in found} == {"COMPLETED", "DIVERGED"}
     for one, run in zip(found, runs, strict=True):
         alone = ech.simulate(*run)
@@ -173,7 +173,7 @@ def test_states_beyond_the_range_of_the_sines_go_on_by_jax():
         )
         for start in starts
     ]
-    for one, run in zip(Fleet(1).fly(runs), runs, strict=True):
+    for one, run in zip(Batch(1).fly(runs), runs, strict=True):
         check_same(one, ech.simulate(*run))
 
 
@@ -203,7 +203,7 @@ def test_runs_without_native_code_are_stepped_side_by_side_and_say_why(monkeypat
         runs += [(parts, chosen._replace(seed=k)) for k in (3, 4)]
     alone = [ech.simulate(*run) for run in runs]
     monkeypatch.setattr(batch, "simulate", None)
-    for one, other in zip(Fleet(1).fly(runs), alone, strict=True):
+    for one, other in zip(Batch(1).fly(runs), alone, strict=True):
         check_same(one, other, 1e-13)
         [told] = one.warnings
         assert "no native code for `erf_inv` in" in told and "test_sweep.py, line" in told
@@ -226,12 +226,12 @@ def test_a_start_that_a_law_refuses_is_refused_among_many():
         drive = ech.Laws(ech.laws.TrimInput(), Picky(most))
         parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
         runs.append([(parts, chosen._replace(seed=k)) for k in range(12)])
-    easy, strict = (list(Fleet(1).fly(some)) for some in runs)
+    easy, strict = (list(Batch(1).fly(some)) for some in runs)
     told = {str(each) for each in strict if isinstance(each, ech.EchelonError)}
     assert told == {"agent 2 starts where its law has no meaning: too far."}
     assert any(isinstance(each, ech.Result) for each in strict)
     # Beside runs of a law that differs in its numbers it is the same.
-    both = [type(each) for each in Fleet(1).fly([*runs[0], *runs[1]])]
+    both = [type(each) for each in Batch(1).fly([*runs[0], *runs[1]])]
     assert both == [type(each) for each in [*easy, *strict]]
 
 
@@ -360,7 +360,7 @@ def test_what_is_missing_is_computed_once_in_the_batches_of_a_whole_sweep(cases,
         alike = first // seeds == (first + count - 1) // seeds
         assert alike or first % seeds == count % seeds == 0
     before = [
-        Batch(first, {"outcome": np.zeros(count)})
+        SweepBatch(first, {"outcome": np.zeros(count)})
         for k, (first, count) in enumerate(whole)
         if k in done
     ]
@@ -444,7 +444,9 @@ def test_figures_show_the_shares_that_the_batches_hold():
         }
         for k in range(12)
     ]
-    data = dataset_of(plan, [Batch(0, columns_of(rows[:5])), Batch(5, columns_of(rows[5:]))])
+    data = dataset_of(
+        plan, [SweepBatch(0, columns_of(rows[:5])), SweepBatch(5, columns_of(rows[5:]))]
+    )
     assert succeeded(data).sum("seed").values.tolist() == [[0, 0], [2, 2], [2, 2]]
     assert data["formation_rmse"].values.ravel().tolist() == [row["formation_rmse"] for row in rows]
     found = sweep_figures(data)
@@ -540,7 +542,7 @@ def test_a_sweep_writes_its_folder_and_is_complete(here):
 def test_a_cluster_gives_the_same_numbers_though_a_worker_is_killed():
     scenario = ech.load_scenario("van-der-pol", SHORT)
     plan = Sweep(scenario, axes_of({"seed": range(80), "follower.gain.coupling": [1.0, 2.0]}))
-    alone, shared = list[Batch](), list[Batch]()
+    alone, shared = list[SweepBatch](), list[SweepBatch]()
     sweeps_of = {"n_workers": 2, "threads_per_worker": 1, "processes": True}
     with distributed.LocalCluster(**sweeps_of, dashboard_address=None) as cluster:
         workers = [nanny.pid for nanny in cluster.workers.values()]

@@ -18,7 +18,7 @@ from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind, Verdict
 from echelon.guarantees.promises.promise import promise, promises
 from echelon.guarantees.stopping.chain_response import Chain
-from echelon.guarantees.stopping.motor_bounds import Asked, motors_for
+from echelon.guarantees.stopping.motor_bounds import MotorDemand, motors_for
 from echelon.guarantees.stopping.time_slices import slices_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.simulation.engine.prepare import prepare
@@ -145,7 +145,9 @@ def test_no_motion_within_bounds_asks_more_of_motors_and_the_worst_nearly_does()
                 [0, 0, 0, -3, 0, 0, 0, 0, 0], [7, 15, 120, 0, 5, 5, 30, 1, 2]
             )
             exact = [Fraction(float(x)) for x in bounds]
-            asked = Asked(tuple(exact[:3]), exact[3], exact[4], tuple(exact[5:7]), tuple(exact[7:]))
+            asked = MotorDemand(
+                tuple(exact[:3]), exact[3], exact[4], tuple(exact[5:7]), tuple(exact[7:])
+            )
             found = motors_for(QUADROTOR.airframe, asked)
             least, largest = map(float, search(jnp.asarray(bounds), draw.normal(size=(60, 12)) * 2))
             assert float(found.least) <= least and largest <= float(found.largest)

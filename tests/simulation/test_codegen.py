@@ -14,7 +14,7 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
-from echelon.simulation.codegen import Graph, Unsupported, machine_code, needed, shortened
+from echelon.simulation.codegen import ScalarGraph, Unsupported, machine_code, needed, shortened
 from echelon.simulation.codegen.scalar import OPERATIONS
 
 rng = np.random.default_rng(7)
@@ -394,14 +394,14 @@ def test_what_is_lost_is_never_brought_back_by_a_limit():
 def test_nothing_is_told_twice_and_what_is_plain_is_folded():
     [a, b] = lowered(lambda v: jnp.stack([jnp.sin(v[0]) * v[1], v[1] * jnp.sin(v[0])]), 2)
     assert a is b
-    graph = Graph()
+    graph = ScalarGraph()
     x = graph.leaf("row", 0)
     assert (x + 0.0, x * 1.0, -(-x), x - 0.0) == (x, x, x, x)
     assert (x * 0.0).value == 0.0 and (graph.constant(2.0) * 3.0).value == 6.0
 
 
 def test_a_long_chain_and_shared_numbers_are_known_not_to_be_below_0():
-    x = total = Graph().leaf("row", 0)
+    x = total = ScalarGraph().leaf("row", 0)
     assert not x.at_least_0
     total = x.graph.make("abs", x)
     for k in range(1200):
@@ -441,7 +441,7 @@ def numbers_of(results, row):
 def test_sums_of_whole_numbers_stay_the_same_with_no_more_products():
     drawn, fewer = random.Random(2), 0
     for _ in range(400):
-        graph = Graph()
+        graph = ScalarGraph()
         pool = [graph.leaf("row", k, uniform=k == 0) for k in range(4)]
         for _ in range(16):
             op = drawn.choice(["add", "add", "sub", "sub", "mul", "mul", "mul", "neg"])

@@ -20,7 +20,7 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.native import agent_order, buffers, schedule, threads, varying
 from echelon.simulation.native import kernel_cache as kernel_code
 from echelon.simulation.native import stepper as native_stepper
-from echelon.simulation.native.varying import Own
+from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.drive import numbers
 from echelon.simulation.step.loop import assemble
 
@@ -219,7 +219,7 @@ def test_bits_do_not_depend_on_threads(monkeypatch):
     chunks = []
     with jax.enable_x64(True):
         for count in (1, 3):
-            stepper.crew = threads.Crew(stepper.places, None, count)
+            stepper.crew = threads.ThreadPool(stepper.places, None, count)
             chunks.append(stepper.advance(stepper.start(), np.array([5, 40]), None))
     alone, shared = chunks
     assert shared.now.states.tobytes() == alone.now.states.tobytes()
@@ -238,7 +238,7 @@ def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkey
     assert near.reach < 4
     monkeypatch.setattr(schedule, "_CACHES", (8 * near.reach * near.bytes,))
     for count in (1, 3):
-        stepper.crew = threads.Crew(stepper.places, None, count)
+        stepper.crew = threads.ThreadPool(stepper.places, None, count)
         with jax.enable_x64(True):
             tiles = stepper.advance(stepper.start(), np.array([5, 0, 40]), None)
         assert len(stepper.crew._turns(40, 0)) > 3 * 40
@@ -321,7 +321,7 @@ def test_the_code_that_moves_numbers_is_made_once_for_all_threads(monkeypatch):
 
 
 def test_memory_is_taken_again_when_nobody_holds_any_of_it():
-    here, shape = buffers.Room(), (2**10, 2**8)
+    here, shape = buffers.BufferPool(), (2**10, 2**8)
     first = here.empty(shape, float)
     first[:] = 1.0
     kept, place = first[3, 5:7], first.ctypes.data
@@ -551,7 +551,7 @@ def test_matrices_of_the_same_bits_and_other_shapes_are_other_models():
 def own_of(model):
     prepared = prepare(led(model), BRIEF)
     drive = prepared.parts.drive
-    return Own([assemble(prepared.problem, drive.leader, drive.follower)])
+    return VaryingNumbers([assemble(prepared.problem, drive.leader, drive.follower)])
 
 
 def test_a_program_is_known_by_shapes_and_types_and_not_where_nobody_knows_what_is_read(

@@ -14,7 +14,7 @@ import echelon as ech
 from echelon.core.errors import MissingExtraError, PlanError
 from echelon.core.numerics import precision
 from echelon.simulation.optimal.formation_plan import plan_formation
-from echelon.simulation.optimal.objectives import Grid, grid
+from echelon.simulation.optimal.objectives import PlanTimes, grid
 
 QUADROTOR = ech.models.Quadrotor.crazyflie()
 LOOP = ech.references.Lemniscate()
@@ -148,7 +148,7 @@ def test_on_linear_agents_the_plans_are_least_squares():
         graph,
         formation,
         states,
-        Grid(steps, 1, dt),
+        PlanTimes(steps, 1, dt),
         reference=None,
         planning=ech.optimal.TrackingOptions(interval=dt, input_weight=0.1),
         limits=True,

@@ -35,7 +35,7 @@ class _Compiled(NamedTuple):
     tree: Any
 
 
-class _Call(NamedTuple):
+class _CallArguments(NamedTuple):
     """The arguments of a call: their arrays, and the tree in which these stand."""
 
     arrays: Sequence[Any]
@@ -57,7 +57,7 @@ class _Call(NamedTuple):
 
 
 @final
-class Program(Generic[_R]):
+class CompiledFunction(Generic[_R]):
     """A function that is compiled once for all arguments of the same shapes, as by `filter_jit`.
 
     Where compiled code is kept, neither is it traced again in the next process for arguments of
@@ -83,7 +83,7 @@ class Program(Generic[_R]):
             return self._plain(*args, **named)
         return _filled(made.tree, made.run(*call.arrays))
 
-    def _make(self, call: _Call) -> _Compiled | None:
+    def _make(self, call: _CallArguments) -> _Compiled | None:
         """Return what is kept for a call, or compile and keep it; None where JAX is to do it."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         # Places stand for what is traced; other arrays are known by their numbers.
@@ -105,17 +105,19 @@ class Program(Generic[_R]):
 
 def program(function: Callable[..., _R]) -> Callable[..., _R]:
     """Return a function that JAX compiles, of arrays of JAX's or of NumPy's."""
-    return Program(function)
+    return CompiledFunction(function)
 
 
-def _call_of(arguments: Any) -> _Call | None:
+def _call_of(arguments: Any) -> _CallArguments | None:
     """Return a call as its arrays and their places; None within a trace, of which it is a part."""
     leaves, tree = jax.tree.flatten(arguments)
     if any(isinstance(leaf, Tracer) for leaf in leaves):
         return None
     arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
     places = map(_Place, range(len(arrays)))
-    return _Call(arrays, tuple(next(places) if eqx.is_array(x) else x for x in leaves), tree)
+    return _CallArguments(
+        arrays, tuple(next(places) if eqx.is_array(x) else x for x in leaves), tree
+    )
 
 
 def _filled(tree: Any, arrays: Sequence[Any]) -> Any:
@@ -136,7 +138,7 @@ def _form(array: Any) -> tuple[tuple[int, ...], str, bool]:
 # ---- compiled code -------------------------------------------------------------------------------
 
 
-def _compile(function: Callable[..., Any], call: _Call) -> _Compiled | None:
+def _compile(function: Callable[..., Any], call: _CallArguments) -> _Compiled | None:
     """Return a function compiled for a call; None where it calls what is not JAX's, as LAPACK."""
     trees = list[Any]()
 

@@ -31,13 +31,13 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """
 
     @functools.lru_cache(_MOST)
-    def answer(call: "_Call") -> _R:
+    def answer(call: "_MemoKey") -> _R:
         name = f"{function.__module__}.{function.__qualname__}"
         return stored(lambda: function(*call.args, **call.named), name, call.args, call.named)
 
     @functools.wraps(function)
     def once(*args: _P.args, **named: _P.kwargs) -> _R:
-        call = _Call(identify((args, named)), args, named)
+        call = _MemoKey(identify((args, named)), args, named)
         try:
             hash(call)
         except TypeError:
@@ -68,7 +68,7 @@ def stored(make: Callable[[], _R], what: str, *values: Any) -> _R:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class _Call:
+class _MemoKey:
     """Arguments, equal to others where the class and the value of each part are."""
 
     value: Hashable

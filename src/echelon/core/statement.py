@@ -30,7 +30,7 @@ class Hypothesis(Word):
     CLAIMS = "claims of the gain"
 
 
-class Line(Word):
+class Topic(Word):
     """What else a check says; the value is what tables call it."""
 
     AUTONOMOUS = "Assumption 1, autonomous"
@@ -84,7 +84,7 @@ class Statement:
         reason: what the failure says against any promise; empty where it leaves one.
     """
 
-    statement: Hypothesis | Line
+    statement: Hypothesis | Topic
     verdict: Verdict
     kind: Kind
     number: float | None = None

@@ -14,7 +14,7 @@ from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.compiled import program
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, State
-from echelon.laws.flat_loop import FlatLoop, Held
+from echelon.laws.flat_loop import FlatLoop, FlatMemory
 from echelon.laws.law import Law, LocalView
 
 Speed: TypeAlias = float | tuple[float, ...]
@@ -186,25 +186,27 @@ class FlatLaw(Law):
 
     # ---- what any agent does ----
 
-    def begun(self, model: ControlAffine, x: State, ahead: jax.Array) -> Held:
+    def begun(self, model: ControlAffine, x: State, ahead: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x and follows what has these derivatives."""
         return self.ready.begun(model, x, switch_on(model, self.ready.chains, x, ahead))
 
-    def init(self) -> Held:
+    def init(self) -> FlatMemory:
         """Return a memory in its form."""
         return self.ready.nothing()
 
-    def signal(self, model: ControlAffine, x: State, offset: State, memory: Held) -> jax.Array:
+    def signal(
+        self, model: ControlAffine, x: State, offset: State, memory: FlatMemory
+    ) -> jax.Array:
         """Return zeta less the offset, (m,)."""
         return self.ready.place(model, x, offset, memory)
 
-    def message(self, model: ControlAffine, x: State, v: Input, memory: Held) -> jax.Array:
+    def message(self, model: ControlAffine, x: State, v: Input, memory: FlatMemory) -> jax.Array:
         """Return zeta', (m,)."""
         return memory.rate
 
     def settle(
-        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Held
-    ) -> Held:
+        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: FlatMemory
+    ) -> FlatMemory:
         """Return the memory with what the actuators made of the input."""
         return self.ready.settle(model, view.x, wanted, got, memory, view.period)
 

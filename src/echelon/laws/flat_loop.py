@@ -21,7 +21,7 @@ _WATCH = (16.0, 64.0)
 """Of the observer, 1/s and 1/s^2: both its modes at 8 1/s, twice as fast as a quick inner loop."""
 
 
-class Held(NamedTuple):
+class FlatMemory(NamedTuple):
     """What an agent remembers.
 
     Attributes:
@@ -69,20 +69,20 @@ class FlatLoop(eqx.Module):
 
     # ---- memory ----
 
-    def nothing(self) -> Held:
+    def nothing(self) -> FlatMemory:
         """Return a memory in its form."""
         zero = jnp.zeros(len(self.stiffness))
-        return Held(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()))
+        return FlatMemory(jnp.zeros(self.chains.size), zero, zero, zero, zero, jnp.zeros(()))
 
-    def begun(self, model: ControlAffine, x: State, chain: jax.Array) -> Held:
+    def begun(self, model: ControlAffine, x: State, chain: jax.Array) -> FlatMemory:
         """Return the memory of an agent that begins at x, the model being right."""
         zero = jnp.zeros(len(self.stiffness), x.dtype)
-        held = Held(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
+        held = FlatMemory(chain, zero, zero, zero, zero, jnp.zeros((), x.dtype))
         return held._replace(base=self._watched(model, x, held.got)[0])
 
     # ---- coordinates ----
 
-    def place(self, model: ControlAffine, x: State, offset: State, held: Held) -> jax.Array:
+    def place(self, model: ControlAffine, x: State, offset: State, held: FlatMemory) -> jax.Array:
         """Return zeta less the offset, (m,): where the agent would come to rest."""
         outputs = self.chains.outputs
         shift = flat_output(model, outputs, offset) - flat_output(model, outputs, 0.0 * offset)
@@ -92,7 +92,7 @@ class FlatLoop(eqx.Module):
         """Return zeta (m,) of flat coordinates (r, m)."""
         return (jnp.asarray(self.weights, values.dtype) * values).sum(axis=0)
 
-    def _seen(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
+    def _seen(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
         """Return the flat coordinates (r, m), and what the model lacks in them."""
         values = flatten(model, self.chains, x, held.chain).values
         if not self.observer:
@@ -106,8 +106,13 @@ class FlatLoop(eqx.Module):
     # ---- a step ----
 
     def obey(
-        self, model: ControlAffine, x: State, rate: jax.Array, held: Held, period: Scalar | float
-    ) -> tuple[Input, Held]:
+        self,
+        model: ControlAffine,
+        x: State,
+        rate: jax.Array,
+        held: FlatMemory,
+        period: Scalar | float,
+    ) -> tuple[Input, FlatMemory]:
         """Return the physical input that makes zeta move at a rate (m,), and the next memory."""
         flat, values = flatten(model, self.chains, x, held.chain), self._seen(model, x, held)
         degrees = np.array(self.chains.degrees)
@@ -137,9 +142,9 @@ class FlatLoop(eqx.Module):
         x: State,
         wanted: Input,
         got: Input,
-        held: Held,
+        held: FlatMemory,
         period: Scalar | float,
-    ) -> Held:
+    ) -> FlatMemory:
         """Return the memory once the actuators have made `got` of what was `wanted`."""
         v = model.normalized(got)
         # An integrator that goes on where an actuator stopped would wind up.
@@ -155,17 +160,17 @@ class FlatLoop(eqx.Module):
         half = 0.5 * period
         base = speed - wrong + half * pull + period * (held.push + _WATCH[0] * wrong)
         push = held.push + period * _WATCH[1] * wrong
-        return Held(chain, held.rate, v, base, push, half + 0.0 * wrong[0])
+        return FlatMemory(chain, held.rate, v, base, push, half + 0.0 * wrong[0])
 
     # ---- the observer ----
 
-    def _wrong(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
+    def _wrong(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
         """Return by how much the speed is off what the model and the estimate expect, (m,)."""
         speed, pull = self._watched(model, x, held.got)
         # A trapezoid from the start of the hold to its end, in which the input is the same.
         return speed - (held.base + held.half * pull)
 
-    def _learned(self, model: ControlAffine, x: State, held: Held) -> jax.Array:
+    def _learned(self, model: ControlAffine, x: State, held: FlatMemory) -> jax.Array:
         """Return the rate of the estimated push, (m,)."""
         return _WATCH[1] * self._wrong(model, x, held)
 

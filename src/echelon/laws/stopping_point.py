@@ -32,7 +32,7 @@ from echelon.laws.flat_law import (
     FlatLaw,
     waits_for_path,
 )
-from echelon.laws.flat_loop import Held
+from echelon.laws.flat_loop import FlatMemory
 from echelon.laws.law import Law, LocalView
 
 _INSTANT = 1e-9
@@ -47,7 +47,7 @@ def _share(links: int) -> float:
 
 
 @final
-class Reach(eqx.Module):
+class GraphDemand(eqx.Module):
     """What the graph asks of the coupling.
 
     Attributes:
@@ -64,7 +64,7 @@ class Reach(eqx.Module):
     waits: bool = False
 
     @classmethod
-    def of(cls, graph: Graph, leaderward: bool, links: int, waits: bool) -> "Reach":
+    def of(cls, graph: Graph, leaderward: bool, links: int, waits: bool) -> "GraphDemand":
         """Return it of a graph.
 
         Raises:
@@ -111,7 +111,7 @@ class StoppingPoint(FlatLaw):
         default=Feedforward.RELAY, static=True, converter=Feedforward.named
     )
     hears: Hears = eqx.field(default=Hears.ALL, static=True, converter=Hears.named)
-    reach: Reach | None = None
+    reach: GraphDemand | None = None
     ahead: Array | None = None
 
     def __check_init__(self) -> None:
@@ -146,7 +146,7 @@ class StoppingPoint(FlatLaw):
             links = int(graph.depths().max())
         loop = self.found_loop(model)
         waits = self.speed is None and waits_for_path(model)
-        reach = Reach.of(graph, self.leaderward, links, waits)
+        reach = GraphDemand.of(graph, self.leaderward, links, waits)
         speed = self.speeds_within(model, loop.chains, SPEED, _share(links), links)
         return eqx.tree_at(
             lambda law: (law.loop, law.reach, law.ahead, law.speed),
@@ -179,7 +179,7 @@ class StoppingPoint(FlatLaw):
         speed = free.speeds_within(model, self.loop.chains, SPEED, _share(links), links, slowest)
         return eqx.tree_at(lambda law: law.speed, law, speed)
 
-    def begin(self, model: ControlAffine, x: State) -> Held:
+    def begin(self, model: ControlAffine, x: State) -> FlatMemory:
         """Return the memory of an agent that begins at x, with its integrators level."""
         return self.begun(model, x, jnp.asarray(self.ahead, x.dtype))
 
@@ -194,7 +194,9 @@ class StoppingPoint(FlatLaw):
         most = 1.0 / (self.reach.heaviest * period * (1.0 + period * self.fastest))
         return jnp.minimum(2.0 * self.slowest_root / self.reach.slowest, most)
 
-    def update(self, model: ControlAffine, view: LocalView, memory: Held) -> tuple[Input, Held]:
+    def update(
+        self, model: ControlAffine, view: LocalView, memory: FlatMemory
+    ) -> tuple[Input, FlatMemory]:
         """Return the input of one agent."""
         pull = self.bounded(self.strength(view.period) * view.disagreement)
         return self.ready.obey(model, view.x, view.feedforward - pull, memory, view.period)
@@ -280,7 +282,7 @@ class StoppingLeader(FlatLaw):
         """Return the slowest mode of the leader about its reference, 1/s."""
         return -min(self.slowest_root, float(self.strength(0.0)))
 
-    def begin(self, model: ControlAffine, x: State) -> Held:
+    def begin(self, model: ControlAffine, x: State) -> FlatMemory:
         """Return the memory of a leader that begins at x, as level as its path."""
         return self.begun(model, x, self.begins(model).astype(x.dtype))
 
@@ -290,7 +292,9 @@ class StoppingLeader(FlatLaw):
             return self.coupling
         return jnp.minimum(2.0 * self.slowest_root, 1.0 / jnp.maximum(period, _INSTANT))
 
-    def update(self, model: ControlAffine, view: LocalView, memory: Held) -> tuple[Input, Held]:
+    def update(
+        self, model: ControlAffine, view: LocalView, memory: FlatMemory
+    ) -> tuple[Input, FlatMemory]:
         """Return the leader's input."""
         loop, path = self.ready, self.path(model, view.t)
         away = loop.place(model, view.x, view.offset, memory) - loop.stop(path[:-1])

@@ -17,7 +17,7 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array
 
 
-class Asked(NamedTuple):
+class ReferenceDemand(NamedTuple):
     """What a reference asks of a model over a horizon, seen at samples.
 
     Attributes:
@@ -51,7 +51,9 @@ _NEAR = 1e-3
 
 
 @kept
-def asked(model: ControlAffine, reference: Guide, horizon: float, samples: int = 1000) -> Asked:
+def asked(
+    model: ControlAffine, reference: Guide, horizon: float, samples: int = 1000
+) -> ReferenceDemand:
     """Return what a reference asks of a model that can be led along it.
 
     Args:
@@ -75,7 +77,7 @@ def asked(model: ControlAffine, reference: Guide, horizon: float, samples: int =
     away = root * np.abs(rate - wanted)
     j, i = np.unravel_index(int(away.argmax()), away.shape)
     fastest = float(np.linalg.norm(root * rate, axis=1).max())
-    return Asked(
+    return ReferenceDemand(
         speed,
         acceleration,
         float(ratios[k]),
@@ -111,7 +113,7 @@ def reference_warnings(
     return tuple(told)
 
 
-def too_fast(model: ControlAffine, found: Asked) -> str:
+def too_fast(model: ControlAffine, found: ReferenceDemand) -> str:
     """Return what a reference asks for beyond the limits, in words."""
     parts = zip(model.input_names, found.inputs, model.input_units, strict=True)
     needed = ", ".join(f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in parts)
@@ -121,7 +123,7 @@ def too_fast(model: ControlAffine, found: Asked) -> str:
     )
 
 
-def infeasible(model: ControlAffine, found: Asked) -> str:
+def infeasible(model: ControlAffine, found: ReferenceDemand) -> str:
     """Return by how much a reference is no motion of the model, in words."""
     k, away, when = found.off
     return (

@@ -11,7 +11,7 @@ from echelon.apps.cli.console import JsonOption, announce, written
 from echelon.apps.cli.stop import STOP
 
 if TYPE_CHECKING:
-    from echelon.experiments.scenario.build import Built
+    from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.experiments.studies.compare import Comparison
 
@@ -65,7 +65,7 @@ def compare(
 
 def _compare(
     scenario: "Scenario",
-    built: "Built",
+    built: "Experiment",
     folder: Path,
     labels: tuple[str, ...],
     figures: bool,

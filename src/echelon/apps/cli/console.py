@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from echelon.experiments.scenario.build import Built
+    from echelon.experiments.scenario.build import Experiment
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 ScenarioArgument = Annotated[str, typer.Argument(help="A bundled scenario's name, or a YAML file.")]
@@ -45,7 +45,7 @@ def show_progress(
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def foretell(built: "Built", quiet: bool) -> None:
+def foretell(built: "Experiment", quiet: bool) -> None:
     """Say on standard error what is promised of a run, and always if nothing is."""
     if quiet:
         return

@@ -15,20 +15,20 @@ from echelon.apps.cli.stop import STOP
 from echelon.core.errors import Outcome, OutputError
 
 if TYPE_CHECKING:
-    from echelon.apps.cli.watch import Watched
-    from echelon.experiments.scenario.build import Built
+    from echelon.apps.cli.watch import WatchedRun
+    from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.output.archive.chunks import Chunks
     from echelon.simulation.engine.record import Stretch
     from echelon.simulation.engine.result import Result
-    from echelon.simulation.engine.simulate import Underway
+    from echelon.simulation.engine.simulate import RunSoFar
 
 
-class _Job(NamedTuple):
+class _RunJob(NamedTuple):
     """A run to do, and what is computed of it already."""
 
     scenario: "Scenario"
-    built: "Built"
+    built: "Experiment"
     chunks: "Chunks"
     before: "Sequence[Stretch]" = ()
 
@@ -89,7 +89,7 @@ def run(
 
 def _begin(
     scenario: str | None, changes: Sequence[str], out: Path | None, force: bool, quiet: bool
-) -> _Job:
+) -> _RunJob:
     """Return a new run, its folder taken and its inputs kept there."""
     if scenario is None:
         raise OutputError("got no scenario, allowed is one, or `--resume` with a run's folder.")
@@ -106,10 +106,10 @@ def _begin(
     with _undone(chunks):
         chunks.begin(checked)
         foretell(built, quiet)
-    return _Job(checked, built, chunks)
+    return _RunJob(checked, built, chunks)
 
 
-def _continue(folder: Path) -> _Job:
+def _continue(folder: Path) -> _RunJob:
     """Return a run that was ended before, or leave where it is complete."""
     from echelon.experiments.scenario.scenario import KEPT, load_scenario
     from echelon.output.archive.chunks import Chunks
@@ -122,10 +122,10 @@ def _continue(folder: Path) -> _Job:
     checked = load_scenario(folder / KEPT)
     from echelon.experiments.scenario.build import build
 
-    return _Job(checked, build(checked), chunks, chunks.read())
+    return _RunJob(checked, build(checked), chunks, chunks.read())
 
 
-def _fly(job: _Job, watched: "Watched | None", quiet: bool) -> "Result":
+def _fly(job: _RunJob, watched: "WatchedRun | None", quiet: bool) -> "Result":
     """Return the run, written while it lasts."""
     from echelon.experiments.scenario import build
     from echelon.simulation.step.drive import Stopped
@@ -143,7 +143,7 @@ def _fly(job: _Job, watched: "Watched | None", quiet: bool) -> "Result":
             watched.add(stretch)
     with _undone(job.chunks), show_progress(quiet) as show:
 
-        def progress(run: "Underway") -> None:
+        def progress(run: "RunSoFar") -> None:
             if show is not None:
                 show(run.done, run.steps)
             STOP.check()

@@ -14,7 +14,7 @@ from echelon.core.errors import OutputError
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
-    from echelon.experiments.sweeps.workers import Batch
+    from echelon.experiments.sweeps.workers import SweepBatch
     from echelon.output.archive.sweep_folder import Batches
 
 
@@ -101,13 +101,13 @@ def _continue(folder: Path) -> "tuple[Sweep, Batches]":
 
 def _compute(
     plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
-) -> "list[Batch]":
+) -> "list[SweepBatch]":
     """Return the batches of a sweep, each written as soon as it is there."""
     from echelon.experiments.sweeps.sweep import compute
 
     found = batches.read()
 
-    def keep(batch: "Batch") -> None:
+    def keep(batch: "SweepBatch") -> None:
         batches.write(batch)
         found.append(batch)
 
@@ -139,7 +139,7 @@ def _undone(batches: "Batches") -> Iterator[None]:
 
 
 def _finish(
-    plan: "Sweep", batches: "Batches", done: "Sequence[Batch]", figures: bool, quiet: bool
+    plan: "Sweep", batches: "Batches", done: "Sequence[SweepBatch]", figures: bool, quiet: bool
 ) -> None:
     """Write and show what the batches hold; they stay until all runs are in the dataset."""
     from echelon.experiments.sweeps.sweep_dataset import dataset_of

@@ -11,7 +11,7 @@ from echelon.apps.cli import tables
 from echelon.apps.cli.console import JsonOption, ScenarioArgument
 
 if TYPE_CHECKING:
-    from echelon.experiments.studies.tune import Tuned
+    from echelon.experiments.studies.tune import TuneResult
 
 
 def tune(
@@ -58,7 +58,7 @@ def _tell(trial: int, cost: float) -> None:
     print(f"\rtrial {trial}, least cost {cost:.6g} ", end="", file=sys.stderr, flush=True)
 
 
-def _save(found: "Tuned", scenario: Any, out: Path) -> None:
+def _save(found: "TuneResult", scenario: Any, out: Path) -> None:
     from echelon.experiments.scenario.build import build
     from echelon.synthesis.gains.gain_file import save_gain
 
@@ -66,7 +66,7 @@ def _save(found: "Tuned", scenario: Any, out: Path) -> None:
     save_gain(found.after.gain, parts.model, parts.graph, out)
 
 
-def _as_mapping(found: "Tuned", names: list[str]) -> dict[str, Any]:
+def _as_mapping(found: "TuneResult", names: list[str]) -> dict[str, Any]:
     import numpy as np
 
     def of(tried: Any, promise: Any) -> dict[str, Any]:

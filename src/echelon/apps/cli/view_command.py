@@ -71,11 +71,11 @@ def show_page(page: bytes, port: int | None, browser: bool) -> None:
     """Serve a page until Ctrl-C."""
     from echelon.output.viewer.serve import Handler, serve
 
-    class Page(Handler):
+    class RunPage(Handler):
         """The page of this run."""
 
-    Page.page = page
-    keep_serving(serve(Page, port), port, browser)
+    RunPage.page = page
+    keep_serving(serve(RunPage, port), port, browser)
 
 
 def keep_serving(server: "ThreadingHTTPServer", port: int | None, browser: bool) -> None:

@@ -11,13 +11,13 @@ from echelon.apps.cli.view_command import show_address, wait
 from echelon.core.errors import OutputError
 
 if TYPE_CHECKING:
-    from echelon.experiments.scenario.build import Built
+    from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
     from echelon.simulation.engine.record import Stretch
 
 
 @final
-class Watched:
+class WatchedRun:
     """A run that pages are fed with; what they cannot show ends nothing.
 
     Args:
@@ -25,7 +25,7 @@ class Watched:
         built: what it builds.
     """
 
-    def __init__(self, scenario: "Scenario", built: "Built") -> None:
+    def __init__(self, scenario: "Scenario", built: "Experiment") -> None:
         """Foresee it."""
         from echelon.experiments.results.foreseen import foreseen
         from echelon.experiments.results.lyapunov import goes_both_ways, potential
@@ -64,12 +64,12 @@ class Watched:
 
 
 @contextlib.contextmanager
-def watching(scenario: "Scenario", built: "Built") -> Iterator[Watched]:
+def watching(scenario: "Scenario", built: "Experiment") -> Iterator[WatchedRun]:
     """Serve the page of a run that begins, and open a browser."""
     from echelon.output.viewer.growing import serve_growing
     from echelon.output.viewer.serve import serving
 
-    watched = Watched(scenario, built)
+    watched = WatchedRun(scenario, built)
     server = serve_growing(watched.page, None)
     with serving(server) as address:
         show_address(server, address, None, browser=True)

@@ -8,7 +8,7 @@ from echelon.agents.network.formation import Formation
 from echelon.core.errors import EchelonError, ScenarioError
 from echelon.core.types import Array
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.build import Built, build
+from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.simulation.engine.parts import Parts
 
@@ -16,7 +16,7 @@ AS_GIVEN = "scenario"
 """A choice that stands for what the scenario says."""
 
 
-def under(scenario: Scenario, law: str) -> tuple[Scenario, Built]:
+def under(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
     """Return a scenario whose followers obey another law, and what it builds.
 
     Its leaders keep their law where the followers' can do with it, or have the one by default.

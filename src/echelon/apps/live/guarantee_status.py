@@ -28,7 +28,7 @@ _DOUBT = (
 
 
 @final
-class Reach:
+class GuaranteeStatus:
     """Tells the badge of a promise, or that what is promised does not reach the state at hand.
 
     What was taken back is given again once all are in their chart and errors have halved.

@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 
 from echelon.apps.live.knobs import Panel
-from echelon.apps.live.swarm import Swarm
+from echelon.apps.live.swarm import LiveLoop
 from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.recording import Bounds, Recording
+from echelon.experiments.results.recording import InputBounds, Recording
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.replay import header, motor_loads
 from echelon.simulation.step.settings import Settings
 
 
-def live_header(swarm: Swarm, panel: Panel, name: str, badge: dict[str, Any]) -> dict[str, Any]:
+def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any]) -> dict[str, Any]:
     """Return what the page is told of a loop: agents, space, knobs."""
     run = _foreseen(swarm, name, badge)
     space = space_of(run)
@@ -35,7 +35,7 @@ def live_header(swarm: Swarm, panel: Panel, name: str, badge: dict[str, Any]) ->
     }
 
 
-def _foreseen(swarm: Swarm, name: str, badge: dict[str, Any]) -> Recording:
+def _foreseen(swarm: LiveLoop, name: str, badge: dict[str, Any]) -> Recording:
     parts, states = swarm.parts, np.asarray(swarm.states)
     return foreseen(parts, swarm.settings, states, name, _silent(badge))
 
@@ -47,7 +47,7 @@ def _silent(badge: dict[str, Any]) -> dict[str, Any]:
     return {**told, "sentence": badge["whole"], "kind": "", "hypotheses": []}
 
 
-def drawn(swarm: Swarm, settings: Settings) -> tuple[Space, Bounds | None]:
+def drawn(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
     """Return where agents are drawn, and what limits their inputs."""
     run = _foreseen(swarm, "", {"whole": ""})
     return space_of(run), run.bounds if settings.limits else None

@@ -14,7 +14,7 @@ from echelon.core.errors import SimulationError, did_you_mean, listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.build import Built, build
+from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.override import named_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml
@@ -73,7 +73,7 @@ class Panel:
         built: what it builds.
     """
 
-    def __init__(self, scenario: Scenario, built: Built) -> None:
+    def __init__(self, scenario: Scenario, built: Experiment) -> None:
         """Find out which knobs there are."""
         self.scenario, self.built, parts = scenario, built, built.parts
         self.parts, model = parts, parts.model
@@ -371,7 +371,7 @@ class Panel:
         return dump_yaml({**data, "live": [dict(event) for event in events]})
 
 
-def _coupling(built: Built) -> float | None:
+def _coupling(built: Experiment) -> float | None:
     """Return how strongly the followers agree; None of a law without such a number."""
     drive, dt = built.parts.drive, built.settings.dt
     if drive.gain is not None:

@@ -22,7 +22,7 @@ _MANY = 200
 """With more agents than this JAX steps them in float32, which takes half the time."""
 
 
-class Moved(NamedTuple):
+class LiveStep(NamedTuple):
     """A moment, the states (N, n) there, and the inputs (N, m) that are delivered from it on."""
 
     now: Moment
@@ -37,7 +37,7 @@ class Mover(abc.ABC):
     engine: str
 
     @abc.abstractmethod
-    def move(self, loop: Loop, now: Moment, count: int) -> Moved:
+    def move(self, loop: Loop, now: Moment, count: int) -> LiveStep:
         """Take so many steps in a loop from a moment on."""
 
     @abc.abstractmethod
@@ -82,7 +82,7 @@ class _Native(Mover):
             self.stepper = NativeStepper([loop], states, 64, None, unlike=unlike)
         self.loop = loop
 
-    def move(self, loop: Loop, now: Moment, count: int) -> Moved:
+    def move(self, loop: Loop, now: Moment, count: int) -> LiveStep:
         if loop is not self.loop:
             self.loop = loop
             self.stepper.turn(loop)
@@ -91,7 +91,7 @@ class _Native(Mover):
             # A frame now, from which all steps are taken, and one at their end.
             counts = np.array([count, 0] if count else [0], np.int32)
             made = self.stepper.advance(now, counts, wanted)
-        return Moved(made.now, made.states[-1], made.inputs[-1])
+        return LiveStep(made.now, made.states[-1], made.inputs[-1])
 
     def _reference(self, now: Moment, count: int) -> Array | None:
         """Return what the meter measures leaders against, which nobody asks for here."""
@@ -118,10 +118,10 @@ class _ByJax(Mover):
     def __init__(self, kind: Precision) -> None:
         self.kind = kind
 
-    def move(self, loop: Loop, now: Moment, count: int) -> Moved:
+    def move(self, loop: Loop, now: Moment, count: int) -> LiveStep:
         with precision(self.kind):
             now, inputs = _advance(loop, now, np.asarray(count, np.int32))
-            return Moved(now, np.asarray(now.states, float), np.asarray(inputs, float))
+            return LiveStep(now, np.asarray(now.states, float), np.asarray(inputs, float))
 
     def beyond(self, states: Array) -> Array:
         return ~np.isfinite(states)

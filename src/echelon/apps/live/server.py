@@ -13,7 +13,7 @@ from echelon.apps.live.header import live_header
 from echelon.apps.live.knobs import Panel
 from echelon.apps.live.promiser import asking
 from echelon.apps.live.session import Session
-from echelon.apps.live.swarm import Swarm
+from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario
@@ -37,7 +37,7 @@ def live(scenario: Scenario) -> tuple[Session, str]:
     if not isinstance(parts.drive, Laws):
         raise SimulationError("only agents under laws can be live.")
     panel = Panel(scenario, built)
-    swarm = Swarm(parts, settings, panel)
+    swarm = LiveLoop(parts, settings, panel)
     _check_speed(swarm)
     told = json.dumps(
         {**live_header(swarm, panel, scenario.name, asking()), "groups": {}}, allow_nan=False
@@ -46,7 +46,7 @@ def live(scenario: Scenario) -> tuple[Session, str]:
     return Session(scenario, panel, swarm), page(f"{scenario.name}, live", data)
 
 
-def _check_speed(swarm: Swarm) -> None:
+def _check_speed(swarm: LiveLoop) -> None:
     """Refuse a loop that cannot keep up, and say how many agents could.
 
     Raises:

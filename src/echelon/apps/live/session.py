@@ -10,11 +10,11 @@ from typing import Any, final
 import numpy as np
 
 from echelon.apps.live.choices import under
-from echelon.apps.live.guarantee_status import Reach, lost
+from echelon.apps.live.guarantee_status import GuaranteeStatus, lost
 from echelon.apps.live.header import drawn
 from echelon.apps.live.knobs import Knobs, Panel, check_choice
 from echelon.apps.live.promiser import Promiser
-from echelon.apps.live.swarm import Picture, Swarm
+from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.experiments.results.foreseen import heard_in
 from echelon.experiments.scenario.scenario import Scenario
@@ -36,7 +36,7 @@ class Session:
         swarm: that runs.
     """
 
-    def __init__(self, scenario: Scenario, panel: Panel, swarm: Swarm) -> None:
+    def __init__(self, scenario: Scenario, panel: Panel, swarm: LiveLoop) -> None:
         """Make ready; nothing runs before `start`."""
         self.scenario, self.panel, self.swarm = scenario, panel, swarm
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
@@ -50,7 +50,7 @@ class Session:
         self.first, self.loops = panel, {panel.law: (panel, swarm)}
         self.origin = swarm.states
         self._check()
-        self.reach = Reach(swarm.parts.model, swarm.parts.graph, self.say_promise)
+        self.reach = GuaranteeStatus(swarm.parts.model, swarm.parts.graph, self.say_promise)
         self.promiser = Promiser(self.reach.hear)
 
     def _check(self) -> None:
@@ -333,7 +333,7 @@ class Session:
         try:
             scenario, built = under(self.first.scenario, law)
             panel = Panel(scenario, built)
-            self.loops[law] = panel, Swarm(*built, panel)
+            self.loops[law] = panel, LiveLoop(*built, panel)
             # Whatever is compiled only when it is first used.
             self.loops[law][1].advance()
         finally:

@@ -94,7 +94,7 @@ class Picture(NamedTuple):
 
 
 @final
-class Swarm:
+class LiveLoop:
     """Agents under laws that go on for as long as someone watches.
 
     Args:

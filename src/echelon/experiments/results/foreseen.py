@@ -10,7 +10,7 @@ import numpy as np
 from echelon.agents.network.hearing import heard_along
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.experiments.results.recording import Bounds, Recording
+from echelon.experiments.results.recording import InputBounds, Recording
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.step.settings import Settings
@@ -60,7 +60,7 @@ def foreseen(
         input_names=model.input_names,
         input_units=model.input_units,
         position=model.position_indices(),
-        bounds=None if limits is None else Bounds(*(np.asarray(x, float) for x in limits)),
+        bounds=None if limits is None else InputBounds(*(np.asarray(x, float) for x in limits)),
         lyapunov=None,
         lyapunov_rate=None,
         metric=None,

@@ -22,7 +22,7 @@ FORMAT = 3
 """Of `run.nc`; another one lacks what is read here."""
 
 
-class Bounds(NamedTuple):
+class InputBounds(NamedTuple):
     """What actuators can deliver, low <= G u <= high: G (k, m), and (k,) twice."""
 
     matrix: np.ndarray
@@ -30,7 +30,7 @@ class Bounds(NamedTuple):
     high: np.ndarray
 
 
-class Tracking(NamedTuple):
+class TrackingErrors(NamedTuple):
     """Leaders' outputs minus their references', (T, L, q), with the outputs' names and units."""
 
     error: np.ndarray
@@ -38,7 +38,7 @@ class Tracking(NamedTuple):
     units: tuple[str, ...]
 
 
-class Modes(NamedTuple):
+class LoopPoles(NamedTuple):
     """Poles (K, n) of the modes looked at, each with its eigenvalue of the graph (K,)."""
 
     poles: np.ndarray
@@ -97,13 +97,13 @@ class Recording:
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
     position: tuple[int, ...]
-    bounds: Bounds | None
+    bounds: InputBounds | None
     lyapunov: np.ndarray | None
     lyapunov_rate: np.ndarray | None
     metric: np.ndarray | None
     limited: np.ndarray
-    tracking: Tracking | None
-    modes: Modes | None
+    tracking: TrackingErrors | None
+    modes: LoopPoles | None
     promise: Mapping[str, Any]
     horizon: float
     dt: float
@@ -274,20 +274,22 @@ def _schedule(values: Mapping[str, np.ndarray]) -> Schedule | None:
     return Schedule(values["stretch_start"], weights, period if np.isfinite(period) else None)
 
 
-def _bounds(values: Mapping[str, np.ndarray]) -> Bounds | None:
+def _bounds(values: Mapping[str, np.ndarray]) -> InputBounds | None:
     if "limit_matrix" not in values:
         return None
-    return Bounds(values["limit_matrix"], values["limit_low"], values["limit_high"])
+    return InputBounds(values["limit_matrix"], values["limit_low"], values["limit_high"])
 
 
-def _tracking(data: "xr.Dataset", values: Mapping[str, np.ndarray]) -> Tracking | None:
+def _tracking(data: "xr.Dataset", values: Mapping[str, np.ndarray]) -> TrackingErrors | None:
     if "tracking_error" not in values:
         return None
-    return Tracking(values["tracking_error"], _texts(data, "output"), _texts(data, "output_unit"))
+    return TrackingErrors(
+        values["tracking_error"], _texts(data, "output"), _texts(data, "output_unit")
+    )
 
 
-def _modes(values: Mapping[str, np.ndarray]) -> Modes | None:
+def _modes(values: Mapping[str, np.ndarray]) -> LoopPoles | None:
     if "pole_real" not in values:
         return None
     poles = values["pole_real"] + 1j * values["pole_imaginary"]
-    return Modes(poles, values["mode_eigenvalue"])
+    return LoopPoles(poles, values["mode_eigenvalue"])

@@ -48,7 +48,7 @@ from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.gain_file import load_gain
 
 
-class Built(NamedTuple):
+class Experiment(NamedTuple):
     """What `simulate` takes: the parts of a scenario, and how it is computed."""
 
     parts: Parts
@@ -78,7 +78,7 @@ class _Faults:
             refuse(self.found)
 
 
-def build(scenario: Scenario, to_run: bool = False) -> Built:
+def build(scenario: Scenario, to_run: bool = False) -> Experiment:
     """Return the parts and the settings of a scenario.
 
     Where it is to run as it stands, what it stores must have room, and nothing may have been done
@@ -134,7 +134,7 @@ def _check_scenario(scenario: object) -> None:
 
 def _with_laws(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Any
-) -> Built:
+) -> Experiment:
     """Return all parts, with those that need a model and a graph, with these."""
     formation = leader = follower = plant = None
     with faults.at("plant"):
@@ -167,7 +167,7 @@ def _with_laws(
     with faults.at("initial"):
         initial_states(parts, scenario.seed)
     faults.settle()
-    return Built(parts, _settings(scenario))
+    return Experiment(parts, _settings(scenario))
 
 
 def _initial(scenario: Scenario) -> Any:
@@ -179,7 +179,7 @@ def _initial(scenario: Scenario) -> Any:
 def run(
     scenario: Scenario,
     progress: Progress | None = None,
-    built: Built | None = None,
+    built: Experiment | None = None,
     keep: Keep | None = None,
     before: Sequence[Stretch] = (),
 ) -> Result:

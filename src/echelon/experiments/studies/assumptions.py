@@ -10,9 +10,9 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
-from echelon.agents.references.demand import Asked, asked, infeasible, too_fast
+from echelon.agents.references.demand import ReferenceDemand, asked, infeasible, too_fast
 from echelon.core.linear import in_words
-from echelon.core.statement import Hypothesis, Line, Statement
+from echelon.core.statement import Hypothesis, Statement, Topic
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.finite_condition import finite_condition
 from echelon.guarantees.promises.hypotheses import goal_drifts
@@ -35,7 +35,7 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     low, high = graph.spectrum().low, graph.spectrum().high
     # A model is asked for f and g without a time, so that none can break it.
     text = "f and g depend on x alone"
-    yield Statement(Line.AUTONOMOUS, _HOLDS, _PROOF, text=text)
+    yield Statement(Topic.AUTONOMOUS, _HOLDS, _PROOF, text=text)
     # The paper has unit weights; its lemmas need only that they are positive.
     unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
     text = "connected and static" + ("" if unit else "; weights need not be 1")
@@ -43,24 +43,24 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     other = _other_graph(graph)
     held = Verdict.of(not other)
     remedy = "T7 and T8 of the theory page stand in its place" if other else ""
-    yield Statement(Line.GRAPH, held, _PROOF, len(graph.edges), shown, other or text, remedy)
+    yield Statement(Topic.GRAPH, held, _PROOF, len(graph.edges), shown, other or text, remedy)
     followers, leaders = len(graph.followers), len(graph.leaders)
     shown = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
     text = who_hears_whom(graph)
-    yield Statement(Line.FOLLOWS, _HOLDS, _PROOF, leaders, shown, text)
+    yield Statement(Topic.FOLLOWS, _HOLDS, _PROOF, leaders, shown, text)
     shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
-    yield Statement(Line.GROUNDED, _HOLDS, _PROOF, low, shown, text)
+    yield Statement(Topic.GROUNDED, _HOLDS, _PROOF, low, shown, text)
     text = "no eigenvalue of any L has a smaller real part" if other else "grounded Laplacian"
-    yield Statement(Line.POSITIVE, held, _PROOF, low, f"{low:.6g}", text, remedy)
+    yield Statement(Topic.POSITIVE, held, _PROOF, low, f"{low:.6g}", text, remedy)
     text = "the LMI is not used"
-    yield Statement(Line.SCHUR, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield Statement(Topic.SCHUR, Verdict.NOT_NEEDED, _PROOF, text=text)
     # A follower beside a leader keeps the weight of that edge on its diagonal and loses the
     # leader's column, so its row sums to that weight.
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
     remedy = "nothing here rests on it: Lemma 1 serves instead"
-    yield Statement(Line.EDGES, Verdict.FAILS, _PROOF, rows, shown, text, remedy)
+    yield Statement(Topic.EDGES, Verdict.FAILS, _PROOF, rows, shown, text, remedy)
 
 
 def _other_graph(graph: Graph) -> str:
@@ -88,17 +88,17 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     both = both and monotone.verdict is Verdict.HOLDS
     text, linear = "needs Assumption 5 and symmetric offsets", Kind.LINEARIZATION
     verdict, remedy = Verdict.of(both), "" if both else "see Assumption 5 and the offsets"
-    yield Statement(Line.ALONG, verdict, linear, text=text, remedy=remedy)
+    yield Statement(Topic.ALONG, verdict, linear, text=text, remedy=remedy)
     largest = _printed_lmi(parts, promise)
     shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
     text, remedy = f"{text}block is zero", "use the finite condition"
-    yield Statement(Line.PRINTED, Verdict.FAILS, _PROOF, largest, shown, text, remedy)
+    yield Statement(Topic.PRINTED, Verdict.FAILS, _PROOF, largest, shown, text, remedy)
     yield _finite_line(parts, promise)
 
 
 def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
-    name, slow = Line.TRACKS, promise.own
+    name, slow = Topic.TRACKS, promise.own
     if slow is None:
         return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
     if not promise.linear:
@@ -112,9 +112,9 @@ def _leader_line(promise: Promise) -> Statement:
     return Statement(name, verdict, Kind.LINEARIZATION, slow, shown, text, remedy)
 
 
-def _reference_line(model: ControlAffine, found: Asked, settings: Settings) -> Statement:
+def _reference_line(model: ControlAffine, found: ReferenceDemand, settings: Settings) -> Statement:
     """Say what a leader must do to follow; no model here limits a speed but by its inputs."""
-    name, remedy = Line.ASKED, ""
+    name, remedy = Topic.ASKED, ""
     limited = settings.limits and model.input_limits is not None
     sizes = ((found.speed, "m/s"), (found.acceleration, "m/s^2"))
     # Below a micrometre and the like are the differences' rounding.
@@ -133,7 +133,7 @@ def _reference_line(model: ControlAffine, found: Asked, settings: Settings) -> S
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
-    name = Line.MONOTONE
+    name = Topic.MONOTONE
     if not promise.linear:
         return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
     A, P = promise.loop.linear.A, promise.loop.closed.P
@@ -158,10 +158,10 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
 def _flat_lines() -> Iterator[Statement]:
     """Assumption 5, Lemma 4 and the conditions on P where stopping points agree (T5)."""
     text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
-    yield Statement(Line.MONOTONE, Verdict.HOLDS, _PROOF, 0.0, "0", text)
+    yield Statement(Topic.MONOTONE, Verdict.HOLDS, _PROOF, 0.0, "0", text)
     text = "for offsets of every flat output: they are symmetries of the chains"
-    yield Statement(Line.ALONG, Verdict.HOLDS, _PROOF, text=text)
-    for name in (Line.PRINTED, Line.FINITE):
+    yield Statement(Topic.ALONG, Verdict.HOLDS, _PROOF, text=text)
+    for name in (Topic.PRINTED, Topic.FINITE):
         yield Statement(name, Verdict.NOT_NEEDED, _PROOF, text="T5 asks nothing of a P")
 
 
@@ -187,7 +187,7 @@ def _printed_lmi(parts: Parts, promise: Promise) -> float:
 
 def _finite_line(parts: Parts, promise: Promise) -> Statement:
     """Return the condition (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 on pairs of goals."""
-    P, name = promise.loop.closed.P, Line.FINITE
+    P, name = promise.loop.closed.P, Topic.FINITE
     # Any multiple of P serves the law as well, with the coupling divided by it.
     P = P / float(np.linalg.eigvalsh(P)[0])
     found = finite_condition(P, parts.model, parts.formation, parts.drive)

@@ -30,7 +30,7 @@ _STEPS = 3000
 _FARTHEST = 30.0  # in the states' units, and a half turn for angles
 
 
-class Slice(NamedTuple):
+class StateSlice(NamedTuple):
     """Starts in which all followers deviate alike from their goals, in two states, and no other.
 
     Attributes:
@@ -103,7 +103,7 @@ def trial(parts: Parts, settings: Settings) -> Trial:
     return Trial(prepared.parts, loop, dt, steps, float(np.exp(-0.5 * slow * steps * dt)))
 
 
-def slice_of(parts: Parts, states: tuple[int, int]) -> Slice:
+def slice_of(parts: Parts, states: tuple[int, int]) -> StateSlice:
     """Return the slice through the goals in two states, in the metric of the gain."""
     model, gain, followers = parts.model, parts.drive.gain, len(parts.graph.followers)
     assert gain is not None
@@ -115,7 +115,7 @@ def slice_of(parts: Parts, states: tuple[int, int]) -> Slice:
         room = 0.98 * min(high - trim[k], trim[k] - low)
         reach.append(min(room, np.pi if angle else _FARTHEST))
     # All deviate alike, so the sum over followers is one's form times their number.
-    return Slice(states, followers * gain.P[np.ix_(states, states)], np.array(reach))
+    return StateSlice(states, followers * gain.P[np.ix_(states, states)], np.array(reach))
 
 
 def side_of(followers: int) -> int:
@@ -124,7 +124,7 @@ def side_of(followers: int) -> int:
     return int(np.clip(np.sqrt(_AGENTS / followers), 11, SIDE)) // 2 * 2 + 1
 
 
-def observed_radius(run: Trial, plane: Slice) -> float:
+def observed_radius(run: Trial, plane: StateSlice) -> float:
     """Return the largest radius up to which all starts tried in a slice converge; 0 for none.
 
     The starts lie within reach on ellipses s'form s = r^2, each a fixed factor larger than the one
@@ -142,12 +142,12 @@ def observed_radius(run: Trial, plane: Slice) -> float:
     return float(radii[count - 1]) if count else 0.0
 
 
-def grid(plane: Slice, half: Array, side: int) -> tuple[Array, Array]:
+def grid(plane: StateSlice, half: Array, side: int) -> tuple[Array, Array]:
     """Return the two axes of a grid of starts, each symmetric about the goal."""
     return np.linspace(-half[0], half[0], side), np.linspace(-half[1], half[1], side)
 
 
-def converged(run: Trial, plane: Slice, starts: Array) -> Array:
+def converged(run: Trial, plane: StateSlice, starts: Array) -> Array:
     """Return for deviations (S, 2) in a slice whether the followers converge, (S,) of bool."""
     model, graph, gain = run.parts.model, run.parts.graph, run.parts.drive.gain
     assert gain is not None

@@ -12,10 +12,10 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.settings import Settings
 
-__all__ = ["Checked", "check"]
+__all__ = ["CheckResult", "check"]
 
 
-class Checked(NamedTuple):
+class CheckResult(NamedTuple):
     """All lines, the hypotheses of the promise among them, and the promise."""
 
     lines: tuple[Statement, ...]
@@ -27,7 +27,7 @@ class Checked(NamedTuple):
         return self.promise.promised
 
 
-def check(parts: Parts, settings: Settings) -> Checked:
+def check(parts: Parts, settings: Settings) -> CheckResult:
     """Walk through the paper's statements on parts, the hypotheses of their promise, and margins.
 
     Raises:
@@ -43,4 +43,4 @@ def check(parts: Parts, settings: Settings) -> Checked:
             killing_line(parts, found),
             *margin_lines(parts, settings, found),
         )
-    return Checked(lines, found)
+    return CheckResult(lines, found)

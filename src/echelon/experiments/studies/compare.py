@@ -12,7 +12,7 @@ from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.experiments.results.metrics import Metrics, metrics
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.build import Built, build
+from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.laws.consensus import Consensus
@@ -21,7 +21,7 @@ from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.result import Result
-from echelon.simulation.engine.simulate import Underway, simulate
+from echelon.simulation.engine.simulate import RunSoFar, simulate
 from echelon.simulation.optimal.drives import Plans, RecedingHorizon
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
@@ -62,7 +62,7 @@ class Flight(NamedTuple):
     solver: SolverStats | None
 
 
-class Row(NamedTuple):
+class ComparisonRow(NamedTuple):
     """A method's label, its flight and numbers; or else the reason why there are none."""
 
     label: str
@@ -119,7 +119,7 @@ class Comparison(NamedTuple):
     """
 
     scenario: str
-    rows: tuple[Row, ...]
+    rows: tuple[ComparisonRow, ...]
     horizon: float
     steady_window: float
     conditions: tuple[str, ...]
@@ -149,11 +149,11 @@ def known_labels(asked: Sequence[str] | None) -> tuple[str, ...]:
 
 def compare(
     scenario: Scenario,
-    built: Built | None = None,
+    built: Experiment | None = None,
     only: tuple[str, ...] = (*LABELS, OWN),
     began: Callable[[str], None] = lambda label: None,
     check: Callable[[], None] = lambda: None,
-    landed: Callable[[Row], None] = lambda row: None,
+    landed: Callable[[ComparisonRow], None] = lambda row: None,
 ) -> Comparison:
     """Fly each method on a scenario from the same starts, under the same limits and wind.
 
@@ -174,7 +174,7 @@ def compare(
     """
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
-    rows = list[Row]()
+    rows = list[ComparisonRow]()
 
     def fly(label: str, drive: DriveOf) -> None:
         try:
@@ -182,7 +182,9 @@ def compare(
             began(label)
             rows.append(_row(label, drive, scene, settings, check))
         except KeyboardInterrupt:
-            rows.append(Row(label, None, None, "it was not flown, since it was interrupted."))
+            rows.append(
+                ComparisonRow(label, None, None, "it was not flown, since it was interrupted.")
+            )
         landed(rows[-1])
 
     for label in (label for label in only if label != OWN):
@@ -197,12 +199,12 @@ def compare(
 
 def _row(
     label: str, drive: DriveOf, parts: Parts, settings: Settings, check: Callable[[], None]
-) -> Row:
+) -> ComparisonRow:
     try:
         flight = _fly(parts.replace(drive=drive(parts)), settings, check)
     except EchelonError as error:
-        return Row(label, None, None, str(error))
-    return Row(label, flight, metrics(flight.result))
+        return ComparisonRow(label, None, None, str(error))
+    return ComparisonRow(label, flight, metrics(flight.result))
 
 
 def _with_starts(parts: Parts, settings: Settings) -> Parts:
@@ -249,7 +251,7 @@ class _Watch:
         self.ticks: list[tuple[float, int, int]] = []
         self.check = check
 
-    def __call__(self, run: Underway) -> None:
+    def __call__(self, run: RunSoFar) -> None:
         self.ticks.append((time.perf_counter(), run.done, run.steps))
         self.check()
 
@@ -264,7 +266,7 @@ def _synthesized(method: Method) -> Callable[[Parts], Gain]:
     return lambda parts: synthesize(parts.model, parts.graph, method)
 
 
-def _own_label(parts: Parts, rows: list[Row]) -> str | None:
+def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     """Return what to call the scenario's own drive; None where a row has flown it already."""
     drive = parts.drive.prepare(parts.model, parts.graph)
     flown = (row.flight.result.drive for row in rows if row.flight is not None)

@@ -18,13 +18,13 @@ from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.build import Built, build
+from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.part import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import Fault
 from echelon.experiments.studies.speedup import speedup
-from echelon.experiments.studies.stopping_design import Stopping, design_stopping
+from echelon.experiments.studies.stopping_design import StoppingDesign, design_stopping
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.parts import Parts
@@ -101,7 +101,7 @@ class Designs(NamedTuple):
     recommended: Design | None
     because: str
     settings: Settings
-    stopping: Stopping | None = None
+    stopping: StoppingDesign | None = None
 
 
 def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
@@ -122,7 +122,7 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
             f"{did_you_mean(method, registry.METHODS)}."
         )
     spec = scenario.follower.gain if isinstance(scenario, Scenario) else None
-    built = _built(scenario) if isinstance(scenario, Scenario) else Built(*scenario)
+    built = _built(scenario) if isinstance(scenario, Scenario) else Experiment(*scenario)
     names = registry.METHODS if method is None else [method]
     methods = [resolve(registry.METHODS[name]) for name in names]
     tried = tuple(
@@ -140,7 +140,7 @@ _ALWAYS = GainSpec(method="given", P="identity")
 """A gain that there is for every model."""
 
 
-def _built(scenario: Scenario) -> Built:
+def _built(scenario: Scenario) -> Experiment:
     """Build a scenario; where its own gain alone cannot be made, with one that always can."""
     try:
         return build(scenario)
@@ -215,7 +215,7 @@ def _why(best: Design, others: list[Design], rivals: list[Design], dt: float) ->
     return text if alike == 1 else f"{text}, the fastest of {alike} by that argument"
 
 
-def _tried(method: type[Method], arguments: dict[str, Any], built: Built) -> Design:
+def _tried(method: type[Method], arguments: dict[str, Any], built: Experiment) -> Design:
     """Try one method; an optional part that is missing is a reason like any other."""
     name, (parts, settings) = method.name, built
     missing = [key for key in method.needs if key not in arguments]

@@ -6,7 +6,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import program
-from echelon.core.statement import Line, Statement
+from echelon.core.statement import Statement, Topic
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Verdict
 from echelon.guarantees.promises.promise import Promise
@@ -25,7 +25,7 @@ def killing_line(parts: Parts, promise: Promise) -> Statement:
     domain = _near(parts.model) if claim is None else claim.domain
     where = f"within {_NEAR:g} of the trim" if claim is None else "on the domain"
     residual, kind = killing_residual(parts.model, promise.loop.closed.P, domain)
-    name, shown = Line.KILLING, f"{residual:.3g} 1/s"
+    name, shown = Topic.KILLING, f"{residual:.3g} 1/s"
     if kind is Kind.PROOF:
         text = f"g is constant {where}: a region is nonlocal (T1)"
         return Statement(name, Verdict.HOLDS, kind, residual, shown, text)

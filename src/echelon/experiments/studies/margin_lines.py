@@ -7,10 +7,10 @@ import numpy as np
 
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
-from echelon.core.statement import Hypothesis, Line, Statement
+from echelon.core.statement import Hypothesis, Statement, Topic
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Verdict
-from echelon.guarantees.promises.closed_loop import Loop
+from echelon.guarantees.promises.closed_loop import LinearLoop
 from echelon.guarantees.promises.promise import Promise
 from echelon.guarantees.stopping.stopping_run import agreement_modes
 from echelon.laws.stopping_point import StoppingPoint
@@ -34,27 +34,27 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
         return
     if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
         text = "any coupling; what delay is left depends on c and the graph alone"
-        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
         yield from _stopping_lines(parts, settings)
         return
     if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
         verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
         if not promise.linear:
             verdict, text = Verdict.VACUOUS, "the model bends at the trim, and has no modes there"
-        yield Statement(Line.MARGINS, verdict, _KIND, text=text)
+        yield Statement(Topic.MARGINS, verdict, _KIND, text=text)
         return
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
         text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
-        yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
+        yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
         return
     low, high = margins.gain_margin(loop.closed)
     shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
-    yield Statement(Line.GAIN, _HOLDS, _KIND, low, shown, text)
+    yield Statement(Topic.GAIN, _HOLDS, _KIND, low, shown, text)
     delay = margins.delay_margin(loop.closed)
     shown = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
-    yield Statement(Line.DELAY, _HOLDS, _KIND, delay.delay, shown, text)
+    yield Statement(Topic.DELAY, _HOLDS, _KIND, delay.delay, shown, text)
     low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
     alike = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
     yield _spread_line(low, high, delay.delay, alike)
@@ -71,10 +71,10 @@ def _turns_lines(promise: Promise) -> Iterator[Statement]:
     if not anywhere and edge is not None and not lines[Hypothesis.DECAYS].fails:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling with which one P serves all graphs, whenever they switch"
-        yield Statement(Line.GAIN, _HOLDS, _KIND, low, f"{low:.3g} to inf", what)
+        yield Statement(Topic.GAIN, _HOLDS, _KIND, low, f"{low:.3g} to inf", what)
     text = "any coupling; " if anywhere else ""
     text += "what delay is left is of one graph, and none is known for graphs that take turns"
-    yield Statement(Line.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+    yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
 
 
 def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
@@ -86,11 +86,11 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     ratio, shown = high / low, f"{high / low:.3g}"
     if not ratio > _WIDE:
         text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
-        return Statement(Line.SPREAD, _HOLDS, _KIND, ratio, shown, text)
+        return Statement(Topic.SPREAD, _HOLDS, _KIND, ratio, shown, text)
     text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
     text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
     remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
-    return Statement(Line.SPREAD, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
+    return Statement(Topic.SPREAD, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
 
 
 def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
@@ -106,12 +106,12 @@ def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
     at, sizes = int(delays.argmin()), np.abs(values)
     shown = f"{1e3 * delays[at]:.3g} ms"
     text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"
-    yield Statement(Line.DELAY, _HOLDS, _KIND, float(delays[at]), shown, text)
+    yield Statement(Topic.DELAY, _HOLDS, _KIND, float(delays[at]), shown, text)
     best = 0.5 * np.pi / (c * float(np.real(values).min()))
     yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
 
 
-def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
+def _scaling_line(model: ControlAffine, loop: LinearLoop) -> Statement:
     # The trim input, and an inner loop's, weaken with the rest.
     slopes = trim_slopes(model) - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
     worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
@@ -121,7 +121,7 @@ def _scaling_line(model: ControlAffine, loop: Loop) -> Statement:
         f"{worst:.3g} 1/s",
     )
     remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
-    return Statement(Line.SCALING, Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
+    return Statement(Topic.SCALING, Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
 
 
 class _Push(NamedTuple):
@@ -144,23 +144,23 @@ def _push(model: ControlAffine) -> _Push:
     return _Push(np.eye(n)[:, pushed], f"1{per} on {names}", model.position_indices() or pushed)
 
 
-def _push_lines(model: ControlAffine, loop: Loop) -> Iterator[Statement]:
+def _push_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[Statement]:
     E, where, watched = _push(model)
     units = {model.state_units[k] for k in watched}
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
-    def line(name: Line, bounds: Array, text: str) -> Statement:
+    def line(name: Topic, bounds: Array, text: str) -> Statement:
         shown = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
         worst, text = float(bounds[list(watched)].max()), f"{unit}per {where}: {text}; {loop.where}"
         return Statement(name, _HOLDS, _KIND, worst, shown, text)
 
     text = "no push of that norm on all followers together takes any farther"
-    yield line(Line.PUSHED, invariant_ellipsoid(loop.closed, E), text)
+    yield line(Topic.PUSHED, invariant_ellipsoid(loop.closed, E), text)
     text = "the exact peak, for a push shaped like the worst eigenvector"
-    yield line(Line.PUSHED_MODE, peak_gain(loop.closed, E), text)
+    yield line(Topic.PUSHED_MODE, peak_gain(loop.closed, E), text)
 
 
-def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
+def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
     """On a tree with unit weights: what a chain of parents' inputs would amplify."""
     graph = parts.graph
     tree = len(graph.edges) == graph.agents - 1 and len(graph.leaders) == 1
@@ -176,4 +176,4 @@ def _string_line(parts: Parts, loop: Loop) -> Iterator[Statement]:
     if not used:
         text = "what feeding forward the parent's input would amplify; it is not used here"
     verdict = _HOLDS if used else Verdict.NOT_NEEDED
-    yield Statement(Line.STRING, verdict, _KIND, gain**depth, shown, text)
+    yield Statement(Topic.STRING, verdict, _KIND, gain**depth, shown, text)

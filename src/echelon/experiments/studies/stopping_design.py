@@ -23,7 +23,7 @@ their range."""
 _FACTORS = (1.0, 0.7, 0.5, 0.35, 0.25)
 
 
-class Stopping(NamedTuple):
+class StoppingDesign(NamedTuple):
     """Roots and speeds that are certified with motors, as a scenario has them.
 
     Attributes:
@@ -57,7 +57,7 @@ class Stopping(NamedTuple):
         return {**numbers, "promise": self.promise.as_mapping()}
 
 
-def design_stopping(parts: Parts, settings: Settings) -> Stopping | None:
+def design_stopping(parts: Parts, settings: Settings) -> StoppingDesign | None:
     """Return the laws with which these starts are soonest within 1 cm, the motors certified.
 
     None where the followers have another law, or none of what is tried bears these starts.
@@ -74,7 +74,9 @@ def design_stopping(parts: Parts, settings: Settings) -> Stopping | None:
     return min(found, key=lambda each: each.time, default=None)
 
 
-def _certified(parts: Parts, settings: Settings, rate: float, links: int) -> Iterator[Stopping]:
+def _certified(
+    parts: Parts, settings: Settings, rate: float, links: int
+) -> Iterator[StoppingDesign]:
     """Yield the fastest speeds that are certified at a rate, if any are."""
     for factor in _FACTORS:
         speed = tuple(round(factor * s / links, 4) for s in _SPEEDS)
@@ -89,7 +91,7 @@ def _certified(parts: Parts, settings: Settings, rate: float, links: int) -> Ite
             # Roots of another number than the model's, say.
             return
         if borne and promise(tried, settings).promised:
-            yield Stopping(rate, speed, leader, promise(tried, settings))
+            yield StoppingDesign(rate, speed, leader, promise(tried, settings))
             return
 
 

@@ -43,7 +43,7 @@ _LOST = 1e3
 """The logarithm of the cost of a run that is lost, beyond that of any other."""
 
 
-class Tried(NamedTuple):
+class TuneTrial(NamedTuple):
     """One choice of the parameters: them, the gain they make, and the cost of its run."""
 
     values: Mapping[str, Any]
@@ -51,11 +51,11 @@ class Tried(NamedTuple):
     cost: float
 
 
-class Tuned(NamedTuple):
+class TuneResult(NamedTuple):
     """A gain before and after, what is promised with each, and the cost after each trial."""
 
-    before: Tried
-    after: Tried
+    before: TuneTrial
+    after: TuneTrial
     promised_before: Promise
     promised_after: Promise
     costs: tuple[float, ...]
@@ -100,7 +100,7 @@ def tune(
     cost: str = "formation",
     rounds: int = 30,
     progress: Callable[[int, float], None] | None = None,
-) -> Tuned:
+) -> TuneResult:
     """Lower the cost of a scenario's run by the weights of its Riccati gain.
 
     It goes on until the cost lies still, for so many rounds at most, or until Ctrl-C; the best of
@@ -135,7 +135,7 @@ def tune(
         raise EchelonError("nothing was tried before the search was interrupted.")
     before, after = search.tried[0], min(search.tried, key=lambda each: each.cost)
     costs = tuple(each.cost for each in search.tried)
-    return Tuned(before, after, search.promise_of(before), search.promise_of(after), costs)
+    return TuneResult(before, after, search.promise_of(before), search.promise_of(after), costs)
 
 
 class _Search:
@@ -150,7 +150,7 @@ class _Search:
     ) -> None:
         _check_parameters(scenario, parameters)
         self.parts, self.settings = build(scenario)
-        self.cost, self.progress, self.tried = cost, progress, list[Tried]()
+        self.cost, self.progress, self.tried = cost, progress, list[TuneTrial]()
         self.names = [key for key in PARAMETERS if key in parameters]
         gain, spec = self.parts.drive.gain, scenario.follower.gain
         assert gain is not None
@@ -171,7 +171,7 @@ class _Search:
         assert gain is not None
         return gain.certificate.edge if PARAMETERS[2] in self.names else None
 
-    def promise_of(self, tried: Tried) -> Promise:
+    def promise_of(self, tried: TuneTrial) -> Promise:
         """Return what is promised with the gain of a trial."""
         return promise(with_gain(self.parts, tried.gain), self.settings)
 
@@ -188,7 +188,7 @@ class _Search:
         slopes = self._slopes(gain, found, values) / max(found.value, 1e-300)
         if not (np.isfinite(found.value) and np.isfinite(slopes).all()):
             return _LOST, np.zeros_like(place)
-        self.tried.append(Tried(values, gain, found.value))
+        self.tried.append(TuneTrial(values, gain, found.value))
         if self.progress is not None:
             self.progress(len(self.tried), min(each.cost for each in self.tried))
         return float(np.log(max(found.value, 1e-300))), slopes

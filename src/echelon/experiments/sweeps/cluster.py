@@ -7,19 +7,19 @@ from typing import Any
 
 from echelon.core.errors import EchelonError, MissingExtraError, OutputError
 from echelon.experiments.sweeps.plan import Sweep
-from echelon.experiments.sweeps.workers import Batch, Crew
+from echelon.experiments.sweeps.workers import SweepBatch, Workers
 
 _PATIENCE = 10.0
 """Seconds in which a scheduler must answer."""
 _LOOK = 0.2
 """Seconds between two looks at what is done, so that Ctrl-C is heard at once."""
-_crews: dict[str, Crew] = {}
+_crews: dict[str, Workers] = {}
 _one_at_a_time = threading.Lock()
 
 
 def fly_on(
     address: str, plan: Sweep, todo: Sequence[tuple[int, int]], told: Callable[[], None]
-) -> Iterator[Batch]:
+) -> Iterator[SweepBatch]:
     """Yield batches (first, count) of a sweep as the workers of a cluster have done them.
 
     A batch whose worker is lost is computed again by another, to the same bits. Workers must have
@@ -54,17 +54,17 @@ def fly_on(
         client.close()
 
 
-def _fly(name: str, plan: Sweep, first: int, count: int) -> Batch:
+def _fly(name: str, plan: Sweep, first: int, count: int) -> SweepBatch:
     """Return a batch, computed here; what was built for another of the sweep is there."""
     # The threads of a worker would else compile the same twice, and share the processors twice.
     with _one_at_a_time:
         if name not in _crews:
             _crews.clear()
-            _crews[name] = Crew(plan)
+            _crews[name] = Workers(plan)
         return _crews[name].batch(first, count, lambda done, steps: None)
 
 
-def _received(future: Any) -> Batch:
+def _received(future: Any) -> SweepBatch:
     try:
         return future.result()
     except EchelonError:

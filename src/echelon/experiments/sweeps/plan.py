@@ -15,7 +15,7 @@ NUMBERS, OF_AGENT = 16, 6
 """That are kept of a run, and of each of its agents."""
 
 
-class Run(NamedTuple):
+class SweepRun(NamedTuple):
     """A run of a sweep.
 
     Attributes:
@@ -76,15 +76,15 @@ class Sweep:
         """The axes from the slowest to the fastest, seeds last."""
         return sorted(range(len(self.axes)), key=lambda k: self.axes[k].key == SEED)
 
-    def run(self, number: int) -> Run:
+    def run(self, number: int) -> SweepRun:
         """Return a run by its number."""
         found = np.unravel_index(number, [self.shape[k] for k in self.order])
         place = dict(zip(self.order, map(int, found), strict=True))
         drawn = (int(a.values[place[k]]) for k, a in enumerate(self.axes) if a.key == SEED)
         here = tuple(place[k] for k in range(len(self.axes)))
-        return Run(here, number // self.seeds, next(drawn, None))
+        return SweepRun(here, number // self.seeds, next(drawn, None))
 
-    def runs(self, first: int, count: int) -> Iterator[Run]:
+    def runs(self, first: int, count: int) -> Iterator[SweepRun]:
         """Yield runs by their numbers."""
         return map(self.run, range(first, first + count))
 

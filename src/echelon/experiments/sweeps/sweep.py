@@ -7,14 +7,14 @@ from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.sweeps.axes import axes_of
 from echelon.experiments.sweeps.plan import Sweep
 from echelon.experiments.sweeps.sweep_dataset import dataset_of
-from echelon.experiments.sweeps.workers import Batch, Crew
+from echelon.experiments.sweeps.workers import SweepBatch, Workers
 
 if TYPE_CHECKING:
     import xarray as xr
 
 Progress: TypeAlias = Callable[[int, int], None]
 """Called between two stretches of computing, with the runs done and the runs in all."""
-Keep: TypeAlias = Callable[[Batch], None]
+Keep: TypeAlias = Callable[[SweepBatch], None]
 """Called with every batch as soon as it is there."""
 
 
@@ -38,7 +38,7 @@ def sweep(
         ScenarioError: a key is unknown, a value is no value of it, or there are too many runs.
     """
     plan = Sweep(scenario, axes_of(over))
-    batches = list[Batch]()
+    batches = list[SweepBatch]()
     compute(plan, batches.append, threads=threads)
     return dataset_of(plan, batches)
 
@@ -47,7 +47,7 @@ def compute(
     plan: Sweep,
     keep: Keep,
     progress: Progress | None = None,
-    before: Sequence[Batch] = (),
+    before: Sequence[SweepBatch] = (),
     threads: int | None = None,
     cluster: str | None = None,
 ) -> None:
@@ -66,7 +66,7 @@ def compute(
         KeyboardInterrupt: Ctrl-C; all batches that were kept are whole.
         EchelonError: the cluster cannot be reached, or gives up.
     """
-    crew, done = Crew(plan, threads), sum(batch.runs for batch in before)
+    crew, done = Workers(plan, threads), sum(batch.runs for batch in before)
 
     def told(_: int = 0, __: int = 0) -> None:
         if progress is not None:
@@ -74,7 +74,7 @@ def compute(
 
     told()
     todo = list(_missing(plan.count, before, crew.size, plan.seeds))
-    made: Iterator[Batch] = (crew.batch(*each, told) for each in todo)
+    made: Iterator[SweepBatch] = (crew.batch(*each, told) for each in todo)
     if cluster is not None:
         # Here, since it comes with an extra.
         from echelon.experiments.sweeps.cluster import fly_on
@@ -87,7 +87,7 @@ def compute(
 
 
 def _missing(
-    runs: int, before: Sequence[Batch], size: int, seeds: int = 1
+    runs: int, before: Sequence[SweepBatch], size: int, seeds: int = 1
 ) -> Iterator[tuple[int, int]]:
     """Yield the batches (first, count) that are to do, of so many runs.
 

@@ -24,7 +24,7 @@ from echelon.experiments.sweeps.plan import Sweep
 if TYPE_CHECKING:
     import xarray as xr
 
-    from echelon.experiments.sweeps.workers import Batch
+    from echelon.experiments.sweeps.workers import SweepBatch
 
 _Z = 1.96
 """Of a normal distribution, within which 95 % lie."""
@@ -50,7 +50,7 @@ _WHAT = {
 }
 
 
-def dataset_of(plan: Sweep, batches: "Sequence[Batch]") -> "xr.Dataset":
+def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
     """Return the batches of a sweep as a dataset; runs that none holds are `missing`.
 
     Dimensions are the keys that vary, in their order, and `agent`. `outcome` is a number whose

@@ -5,12 +5,12 @@ from itertools import groupby
 from typing import Any, NamedTuple, final
 
 from echelon.core.errors import EchelonError, Outcome
-from echelon.experiments.scenario.build import Built, build
+from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
-from echelon.experiments.sweeps.plan import Run, Sweep
+from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.guarantees.promises.promise import Promise, promises
 from echelon.simulation.codegen import is_installed
-from echelon.simulation.engine.batch import Fleet, Told
+from echelon.simulation.engine.batch import Batch, Told
 from echelon.simulation.engine.result import Result
 
 _AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
@@ -21,7 +21,7 @@ _FRAMES = 20
 """That a run is looked at: for what is not finite, or beyond the range of native code."""
 
 
-class Batch(NamedTuple):
+class SweepBatch(NamedTuple):
     """Some runs of a sweep, one after the other: the number of the first, and what they came to."""
 
     first: int
@@ -34,7 +34,7 @@ class Batch(NamedTuple):
 
 
 @final
-class Crew:
+class Workers:
     """Computes the runs of a sweep, batch by batch; a case is built once for its seeds.
 
     Args:
@@ -44,15 +44,15 @@ class Crew:
 
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
         """Build the first case."""
-        self.plan, self.fleet = plan, Fleet(threads)
+        self.plan, self.fleet = plan, Batch(threads)
         first = build(plan.case((0,) * len(plan.axes)))
-        self._last: tuple[int, Built | str] = 0, first
+        self._last: tuple[int, Experiment | str] = 0, first
         settings, graph = first.settings, first.parts.graph
         fast = settings.engine != "jax" and is_installed()
         most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
         self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
 
-    def batch(self, first: int, count: int, told: Told) -> Batch:
+    def batch(self, first: int, count: int, told: Told) -> SweepBatch:
         """Return what some runs come to; `told` is called several times a second.
 
         Raises:
@@ -72,13 +72,13 @@ class Crew:
             else:
                 rows.append(refused(str(before if isinstance(found, Result) else found)))
             told(0, 0)
-        return Batch(first, columns_of(rows))
+        return SweepBatch(first, columns_of(rows))
 
-    def _built(self, run: Run) -> Built | str:
+    def _built(self, run: SweepRun) -> Experiment | str:
         """Return the parts and settings of a run, or why they cannot be made."""
         if self._last[0] != run.case:
             try:
-                made: Built | str = build(self.plan.case(run.place))
+                made: Experiment | str = build(self.plan.case(run.place))
             except EchelonError as error:
                 made = str(error)
             self._last = run.case, made
@@ -87,10 +87,10 @@ class Crew:
             return made
         settings = made.settings
         settings = settings if run.seed is None else settings._replace(seed=run.seed)
-        return Built(made.parts, settings._replace(store_every=-(-settings.steps // _FRAMES)))
+        return Experiment(made.parts, settings._replace(store_every=-(-settings.steps // _FRAMES)))
 
 
-def _promised(built: Sequence[Built]) -> Iterator[Promise | EchelonError]:
+def _promised(built: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:
     """Yield what is promised of runs, of which neighbours often differ in the seed alone."""
     for _, alike in groupby(built, key=lambda each: id(each.parts)):
         runs = list(alike)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 from echelon.agents.models.linearization import at_trim
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
-from echelon.guarantees.promises.closed_loop import Loop
-from echelon.guarantees.promises.frozen_laws import Frozen
+from echelon.guarantees.promises.closed_loop import LinearLoop
+from echelon.guarantees.promises.frozen_laws import FrozenLaws
 from echelon.guarantees.promises.leaders import Leaders
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -30,11 +30,11 @@ class Case(NamedTuple):
 
     parts: Parts
     settings: Settings
-    loop: Loop
+    loop: LinearLoop
     leaders: Leaders
     region: RegionCertificate | None
     beside: Array | None
-    frozen: Frozen | None
+    frozen: FrozenLaws | None
 
     @property
     def domain(self) -> Domain | None:

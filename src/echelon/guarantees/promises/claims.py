@@ -5,7 +5,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.words import Kind, Verdict
-from echelon.guarantees.promises.closed_loop import Loop, grounded_slowest
+from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest
 from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.certificates.certificate import RegionCertificate
 from echelon.synthesis.gains.gain import Gain
@@ -15,7 +15,7 @@ _SAME = 1e-6
 _ROUNDING = 1e-9  # of the fastest mode, in the slowest
 
 
-def claims_line(parts: Parts, loop: Loop, found: RegionCertificate | None) -> Statement:
+def claims_line(parts: Parts, loop: LinearLoop, found: RegionCertificate | None) -> Statement:
     """Return whether the certificate that a gain carries is of what runs.
 
     Args:
@@ -33,7 +33,7 @@ def claims_line(parts: Parts, loop: Loop, found: RegionCertificate | None) -> St
     return Statement(Hypothesis.CLAIMS, verdict, Kind.LINEARIZATION, text=text, remedy=remedy)
 
 
-def _difference(parts: Parts, gain: Gain, loop: Loop, found: RegionCertificate | None) -> str:
+def _difference(parts: Parts, gain: Gain, loop: LinearLoop, found: RegionCertificate | None) -> str:
     """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:

@@ -31,7 +31,7 @@ _SLACK = 1e-9
 """Relative; what a solver leaves of the inequality behind an edge, which is often tight."""
 
 
-class Loop(NamedTuple):
+class LinearLoop(NamedTuple):
     """The law near the trim, on the graph that runs.
 
     Attributes:
@@ -91,7 +91,7 @@ class Loop(NamedTuple):
         return Linearization(self.linear.A + self.linear.B @ self.inner, self.linear.B)
 
 
-class Modes(NamedTuple):
+class NetworkModes(NamedTuple):
     """What the disagreement splits by.
 
     Attributes:
@@ -105,7 +105,7 @@ class Modes(NamedTuple):
     what: str = "eigenvalues"
 
 
-def loop_of(parts: Parts) -> Loop:
+def loop_of(parts: Parts) -> LinearLoop:
     """Return the closed loop of prepared parts."""
     model, gain = parts.model, parts.drive.gain
     n, m = len(model.state_names), len(model.input_names)
@@ -125,7 +125,9 @@ def loop_of(parts: Parts) -> Loop:
     if parts.graph.schedule is not None and gain is not None:
         common = _common(parts, gain, linear)
     every = slowest < 0.0
-    return Loop(linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common)
+    return LinearLoop(
+        linear, inner, closed, where, modes.symmetric, every, slowest, certificate, common
+    )
 
 
 def _common(parts: Parts, gain: Gain, linear: Linearization) -> float:
@@ -136,7 +138,7 @@ def _common(parts: Parts, gain: Gain, linear: Linearization) -> float:
     return rate_of(gain.P, linear.A[None], linear.B, gain.R, 2.0 * gain.coupling * weakest)
 
 
-def modes_of(parts: Parts) -> Modes:
+def modes_of(parts: Parts) -> NetworkModes:
     """Return what the disagreement of prepared parts splits by.
 
     Where the leaders obey the followers' law, nobody is grounded: the disagreement obeys the
@@ -146,17 +148,17 @@ def modes_of(parts: Parts) -> Modes:
     """
     graph = parts.graph
     if parts.drive.feedforward is Feedforward.PARENT:
-        return Modes(graph.parent_spectrum(), False, "edges' weights")
+        return NetworkModes(graph.parent_spectrum(), False, "edges' weights")
     if not all_alike(parts.drive, parts.model):
-        return Modes(graph.spectrum(), not graph.directed and graph.schedule is None)
+        return NetworkModes(graph.spectrum(), not graph.directed and graph.schedule is None)
     if graph.directed:
-        return Modes(_of_all(graph), False)
+        return NetworkModes(_of_all(graph), False)
     if graph.agents <= _DENSE:
         whole = np.linalg.eigvalsh(graph.laplacian().toarray())[1:]
-        return Modes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
+        return NetworkModes(Spectrum(whole, len(whole), graph.spectrum().proved), False)
     degrees = graph.laplacian().diagonal()
     ends = np.array([graph.spectrum().low, degrees[graph.edges].sum(axis=1).max()])
-    return Modes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
+    return NetworkModes(Spectrum(ends, graph.agents - 1, graph.spectrum().proved), False)
 
 
 def _of_all(graph: Graph) -> Spectrum:
@@ -210,7 +212,7 @@ def telling(values: Array, count: int) -> Array:
     return np.unique([*few, *(k for mark in marks for k in np.argsort(mark)[: count // 2])])
 
 
-def _representatives(modes: Modes) -> tuple[Array, str]:
+def _representatives(modes: NetworkModes) -> tuple[Array, str]:
     """Return the eigenvalues that stand for a spectrum in the margins, and say which they are."""
     (values, total, *_), _, what = modes
     if np.iscomplexobj(values):

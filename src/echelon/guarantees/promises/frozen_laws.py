@@ -18,8 +18,8 @@ from echelon.core.compiled import program
 from echelon.core.linear import exponential, held_radius, held_step
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
-from echelon.guarantees.promises.closed_loop import Loop, telling
-from echelon.guarantees.promises.leader_path import MOMENTS, Route, Rows, route_of
+from echelon.guarantees.promises.closed_loop import LinearLoop, telling
+from echelon.guarantees.promises.leader_path import MOMENTS, LeaderPath, PathSamples, route_of
 from echelon.guarantees.promises.leaders import Leaders
 from echelon.laws.law import Law, LocalView, gain_of, without_certificates
 from echelon.simulation.engine.law_drive import Laws
@@ -54,7 +54,7 @@ class Growth(NamedTuple):
         return not (self.rate < 0.0 and self.most < _TENFOLD)
 
 
-class Slopes(NamedTuple):
+class ModeMatrices(NamedTuple):
     """An agent's motion about K states, and what its law feeds back there in L modes.
 
     Attributes:
@@ -71,9 +71,9 @@ class Slopes(NamedTuple):
         """Return the eigenvalues of all loops, (K, L, n)."""
         return np.linalg.eigvals(self.A[:, None] - self.B[:, None] @ self.gains)
 
-    def stable(self) -> "Slopes":
+    def stable(self) -> "ModeMatrices":
         """Return those that decay if the input is not held: no step helps the others."""
-        return Slopes(*(part[self.growth() < 0.0] for part in self))
+        return ModeMatrices(*(part[self.growth() < 0.0] for part in self))
 
     def growth(self) -> Array:
         """Return the slowest mode about each state, (K,), 1/s."""
@@ -103,11 +103,11 @@ class Slopes(NamedTuple):
         radii = np.abs(np.linalg.eigvals(product)).max(axis=1)
         return float((logs + np.log(radii)).max() / (span * len(J)))
 
-    def hardest(self) -> "Slopes":
+    def hardest(self) -> "ModeMatrices":
         """Return the few states about which modes are fastest."""
         fastest = np.abs(self.modes()).max(axis=(1, 2))
         few = np.argsort(fastest)[-_HARDEST:]
-        return Slopes(*(part[few] for part in self))
+        return ModeMatrices(*(part[few] for part in self))
 
     def radius(self, settings: Settings) -> float:
         """Return the largest spectral radius of a step of the integrator that runs; 0 of none."""
@@ -131,7 +131,7 @@ class Slopes(NamedTuple):
         return linear.longest_step(A[:, None], B[:, None], gains, settings.integrator)
 
 
-class Frozen(NamedTuple):
+class FrozenLaws(NamedTuple):
     """The laws frozen away from the trim.
 
     Attributes:
@@ -145,14 +145,14 @@ class Frozen(NamedTuple):
     """
 
     times: Array
-    along: Slopes
-    leader: Slopes | None
-    starts: Slopes
+    along: ModeMatrices
+    leader: ModeMatrices | None
+    starts: ModeMatrices
     blamed: str
     turns: tuple[float, ...] = ()
 
     @property
-    def travelled(self) -> tuple[Slopes, ...]:
+    def travelled(self) -> tuple[ModeMatrices, ...]:
         """The laws along the path; none where there is no path."""
         both = (self.along, self.leader)
         return tuple(each for each in both if each is not None) if len(self.times) else ()
@@ -176,7 +176,7 @@ class Frozen(NamedTuple):
         return min(each.stable().longest_step(settings) for each in all_)
 
 
-def longest_step(loop: Loop, frozen: Frozen | None, settings: Settings) -> float:
+def longest_step(loop: LinearLoop, frozen: FrozenLaws | None, settings: Settings) -> float:
     """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
     steps = [loop.longest_step(settings)]
     # The printed step is of Algorithm 1 as it stands, and never made shorter.
@@ -186,8 +186,8 @@ def longest_step(loop: Loop, frozen: Frozen | None, settings: Settings) -> float
 
 
 def frozen_of(
-    parts: Parts, settings: Settings, loop: Loop, leaders: Leaders, states: Array
-) -> Frozen | None:
+    parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders, states: Array
+) -> FrozenLaws | None:
     """Return the laws of prepared parts frozen where they go, agents starting in states (N, n).
 
     None where nobody leaves the trim, or the agents obey no law that is known.
@@ -200,20 +200,22 @@ def frozen_of(
         return None
     few = starts[_few(starts)]
     both = zip(path.rows, path.at_start(parts.model, few), strict=True)
-    rows = Rows._make(map(np.concatenate, both))
+    rows = PathSamples._make(map(np.concatenate, both))
     count, all_ = len(path.times), _followers(parts, loop, rows)
-    along, begun = (Slopes(*(x[part] for x in all_)) for part in (slice(count), slice(count, None)))
+    along, begun = (
+        ModeMatrices(*(x[part] for x in all_)) for part in (slice(count), slice(count, None))
+    )
     turns = path.extreme_rates()
     own = _leader(parts, path.own_headings(parts), along)
-    found = Frozen(path.times, along, own, begun, "", turns)
+    found = FrozenLaws(path.times, along, own, begun, "", turns)
     if not count or not found.growth().lost:
         return found
     return found._replace(blamed=_blamed(parts, loop, path, found))
 
 
 def frozen_at(
-    parts: Parts, settings: Settings, loop: Loop, leaders: Leaders, states: Array
-) -> Slopes:
+    parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders, states: Array
+) -> ModeMatrices:
     """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
 
     They are those of `frozen_of`, the same number of each run after the other.
@@ -224,10 +226,10 @@ def frozen_at(
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
     found = [
-        _followers(parts, loop, Rows._make(part[k : k + size] for part in rows))
+        _followers(parts, loop, PathSamples._make(part[k : k + size] for part in rows))
         for k in range(0, len(rows.times), size)
     ]
-    return Slopes._make(map(np.concatenate, zip(*found, strict=True)))
+    return ModeMatrices._make(map(np.concatenate, zip(*found, strict=True)))
 
 
 def _few(starts: Array) -> Array:
@@ -238,7 +240,7 @@ def _few(starts: Array) -> Array:
 # ---- the laws there -----------------------------------------------------------------------------
 
 
-def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
+def _followers(parts: Parts, loop: LinearLoop, rows: PathSamples) -> ModeMatrices:
     """Return the followers' law about each agent's state, in a few modes of the graph."""
     assert isinstance(parts.drive, Laws)
     count = len(rows.times)
@@ -253,7 +255,7 @@ def _followers(parts: Parts, loop: Loop, rows: Rows) -> Slopes:
         A = A - rows.rates[:, None, None] * state_turn(parts.model).slope
     values = loop.closed.eigenvalues
     few = values[telling(values, _MODES)]
-    return Slopes(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
+    return ModeMatrices(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
 
 
 @program
@@ -282,7 +284,7 @@ def _about(
     return jax.vmap(one)(t, x, v, y)
 
 
-def _leader(parts: Parts, headings: Array, along: Slopes) -> Slopes | None:
+def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices | None:
     """Return the leader's own law along its path; None where it has no gain."""
     assert isinstance(parts.drive, Laws)
     model, gain = parts.model, gain_of(parts.drive.leader)
@@ -296,14 +298,14 @@ def _leader(parts: Parts, headings: Array, along: Slopes) -> Slopes | None:
     return along._replace(gains=fed_back[:, None])
 
 
-def _blamed(parts: Parts, loop: Loop, path: Route, found: Frozen) -> str:
+def _blamed(parts: Parts, loop: LinearLoop, path: LeaderPath, found: FrozenLaws) -> str:
     """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
     n, k = len(trim), int(np.flatnonzero(path.times == found.growth().when)[0])
     there = np.tile(path.states[k], (n, 1))
     np.fill_diagonal(there, trim)
-    here = Rows(*(np.repeat(part[k : k + 1], n, axis=0) for part in path.rows))
+    here = PathSamples(*(np.repeat(part[k : k + 1], n, axis=0) for part in path.rows))
     slopes = _followers(parts, loop, here._replace(leaders=there, states=there))
     own = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
     growth = slopes.growth() if own is None else np.maximum(slopes.growth(), own.growth())

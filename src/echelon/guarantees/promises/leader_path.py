@@ -19,7 +19,7 @@ MOMENTS = 192
 _SHORT = 1e-6  # s, over which a path's velocity is taken
 
 
-class Rows(NamedTuple):
+class PathSamples(NamedTuple):
     """What K agents are asked with: times, their leader's states and inputs, their own states."""
 
     times: Array
@@ -29,7 +29,7 @@ class Rows(NamedTuple):
     rates: Array
 
 
-class Route(NamedTuple):
+class LeaderPath(NamedTuple):
     """Moments (K,), the leader's states (K, n) then, its normalized inputs (K, m), and its trim.
 
     A law that turns sees them in the axes of the headings (K,), which turn at rates (K,).
@@ -43,9 +43,9 @@ class Route(NamedTuple):
     rates: Array
 
     @property
-    def rows(self) -> Rows:
+    def rows(self) -> PathSamples:
         """What followers at the leader's own states are asked with."""
-        return Rows(self.times, self.states, self.inputs, self.states, self.rates)
+        return PathSamples(self.times, self.states, self.inputs, self.states, self.rates)
 
     def extreme_rates(self) -> tuple[float, ...]:
         """Return the least and the largest rate, rad/s, once where they are one; no zero."""
@@ -62,19 +62,19 @@ class Route(NamedTuple):
             return np.zeros(len(self.times))
         return self.states[:, heading_index(parts.model)] - rest_heading(parts.model)
 
-    def at_start(self, model: ControlAffine, states: Array) -> Rows:
+    def at_start(self, model: ControlAffine, states: Array) -> PathSamples:
         """Return what followers in states (K, n) are asked with at the beginning."""
         count = len(states)
         if not len(self.times):
             still, sent = np.zeros(count), np.zeros((count, self.inputs.shape[1]))
-            return Rows(still, np.tile(self.trim, (count, 1)), sent, states, still)
-        first = Rows(*(np.repeat(part[:1], count, axis=0) for part in self.rows))
+            return PathSamples(still, np.tile(self.trim, (count, 1)), sent, states, still)
+        first = PathSamples(*(np.repeat(part[:1], count, axis=0) for part in self.rows))
         away = np.repeat(self.headings[:1], count)
         seen = _turned_back(model, states, away) if away.any() else states
         return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
-def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> Route:
+def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderPath:
     """Return where the leader goes: its reference, or by itself where its input rests."""
     model, times = parts.model, np.linspace(0.0, settings.horizon, MOMENTS)
     trim, m = np.asarray(model.trim[0], float), len(model.input_names)
@@ -94,11 +94,11 @@ def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> Route:
     return _seen(parts, times, own[frames, 0], np.zeros((MOMENTS, m)))
 
 
-def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> Route:
+def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
     """Return a path as a law that turns with the heading sees it, or as it is."""
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
-    path = Route(times, states, inputs, np.asarray(model.trim[0], float), still, still)
+    path = LeaderPath(times, states, inputs, np.asarray(model.trim[0], float), still, still)
     if not (parts.drive.follower.turning and len(times)):
         return path
     away = states[:, heading_index(model)] - rest_heading(model)

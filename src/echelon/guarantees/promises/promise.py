@@ -23,10 +23,10 @@ from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.certified_set import CertifiedSet, certified_set, set_lines
 from echelon.guarantees.promises.claims import claims_line
-from echelon.guarantees.promises.closed_loop import Loop, loop_of
+from echelon.guarantees.promises.closed_loop import LinearLoop, loop_of
 from echelon.guarantees.promises.frozen_laws import (
-    Frozen,
-    Slopes,
+    FrozenLaws,
+    ModeMatrices,
     frozen_at,
     frozen_of,
     longest_step,
@@ -37,7 +37,7 @@ from echelon.guarantees.promises.modes import held
 from echelon.guarantees.promises.region import region_of, slopes_beside, weaken
 from echelon.guarantees.promises.turning import slowest_in_turns, turns_in_words
 from echelon.guarantees.stopping.stopping_run import (
-    Stopping,
+    StoppingRun,
     condition_lines,
     drift_reason,
     stopping_of,
@@ -73,7 +73,7 @@ class Promise:
         slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
     """
 
-    loop: Loop
+    loop: LinearLoop
     region: RegionCertificate | None
     certified: CertifiedSet | None
     hypotheses: Mapping[Hypothesis, Statement]
@@ -81,7 +81,7 @@ class Promise:
     condition: str
     without: str
     own: float | None
-    frozen: Frozen | None
+    frozen: FrozenLaws | None
     turns: str = ""
     tube: Tube | None = None
     hold: float | None = None
@@ -329,7 +329,9 @@ def _alike(
             decays = slopes.decaying(settings[0]).reshape(len(states), -1)
     case = Case(prepared.parts, settings[0], first.loop, leaders, first.region, None, first.frozen)
     for k, each in enumerate(settings):
-        began = None if slopes is None else Slopes(*(_part(x, k, len(states)) for x in slopes))
+        began = (
+            None if slopes is None else ModeMatrices(*(_part(x, k, len(states)) for x in slopes))
+        )
         yield _started(first, case._replace(settings=each), states[k], began, bool(decays[k].all()))
 
 
@@ -339,7 +341,7 @@ def _part(array: Array, k: int, parts: int) -> Array:
 
 
 def _started(
-    first: Promise, case: Case, states: Array, began: Slopes | None, decays: bool
+    first: Promise, case: Case, states: Array, began: ModeMatrices | None, decays: bool
 ) -> Promise:
     """Return a promise as it is where agents start in other states (N, n)."""
     lines, frozen = dict(first.hypotheses), first.frozen
@@ -355,7 +357,7 @@ def _started(
     return dataclasses.replace(first, hypotheses=told, frozen=frozen)
 
 
-def _asks_where(parts: Parts, loop: Loop) -> bool:
+def _asks_where(parts: Parts, loop: LinearLoop) -> bool:
     """Tell whether laws are looked at away from the trim."""
     # What does not decay at the trim has nothing to lose elsewhere.
     return loop.every and parts.drive.metric(parts.model) is not None
@@ -398,7 +400,7 @@ def _compute(prepared: Prepared, settings: Settings, briefly: bool = False) -> P
     )
 
 
-def _anywhere(run: Stopping, case: Case, briefly: bool) -> Promise:
+def _anywhere(run: StoppingRun, case: Case, briefly: bool) -> Promise:
     """Return what is promised under the law `stopping-point`."""
     found, drifts = tube_of(run, briefly), drift_reason(run)
     lines = [*agent_lines(case), *condition_lines(run), *found.lines]

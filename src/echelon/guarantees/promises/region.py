@@ -23,7 +23,7 @@ from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.certificates.certificate import RegionCertificate
 from echelon.synthesis.certificates.domain import Domain
 from echelon.synthesis.certificates.domain_metrics import (
-    Pairs,
+    DomainPairs,
     contracting_region,
     drift_region,
     pairs_on,
@@ -107,7 +107,7 @@ def slopes_beside(parts: Parts) -> Array | None:
         return None
 
 
-def _with_inner(parts: Parts, gain: Gain, pairs: Pairs) -> Pairs | None:
+def _with_inner(parts: Parts, gain: Gain, pairs: DomainPairs) -> DomainPairs | None:
     """Return the slopes with a gain's inner loop closed; None where g turns what the loop does."""
     if gain.inner is None:
         return pairs
@@ -119,7 +119,9 @@ def _with_inner(parts: Parts, gain: Gain, pairs: Pairs) -> Pairs | None:
     return pairs._replace(A=closed, found=pairs.found._replace(matrices=closed))
 
 
-def _contraction(parts: Parts, gain: Gain, pairs: Pairs, exact: bool) -> RegionCertificate | None:
+def _contraction(
+    parts: Parts, gain: Gain, pairs: DomainPairs, exact: bool
+) -> RegionCertificate | None:
     """Return what a gain's metric contracts at its coupling; None for nothing."""
     B, spectrum = linearize(parts.model).B, parts.graph.spectrum()
     return contracting_region(pairs, gain.P, B, gain.R, exact, gain.coupling, spectrum)

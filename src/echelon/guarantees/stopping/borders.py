@@ -11,15 +11,15 @@ from echelon.core.errors import GainError, listing
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_clearance import (
+    Clearance,
     Push,
-    Room,
     length_room_of,
     room_of,
     root_above,
 )
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.path_bounds import Least, least_on_path
-from echelon.guarantees.stopping.stopping_run import Stopping
+from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _ROUNDED = Fraction(1, 10**6)
 """Of a derivative of a flat output: a thousand times what floats leave of it at a start."""
@@ -77,7 +77,7 @@ class Border(NamedTuple):
         return f"the length of ({each})" if self.many else each
 
 
-def border_of(run: Stopping, bound: FlatBound) -> Border:
+def border_of(run: StoppingRun, bound: FlatBound) -> Border:
     """Return how near to a border the agents of a run may come.
 
     Raises:
@@ -106,14 +106,14 @@ def border_of(run: Stopping, bound: FlatBound) -> Border:
     return known._replace(left=left, steepest=steepest, turn=turn, told=told)
 
 
-def _is_on_path(run: Stopping, places: list[int]) -> bool:
+def _is_on_path(run: StoppingRun, places: list[int]) -> bool:
     """Tell whether leaders start as their path moves, in all that the inner loop lets go by."""
     leads, degree = list(run.parts.graph.leaders), run.law.ready.chains.degrees[places[0]]
     off = (run.flat[leads] - run.ahead)[:, 1:degree, places]
     return bool(np.abs(off).max(initial=0.0) < _LEVEL)
 
 
-def _turn(run: Stopping, places: list[int], chord: float) -> float:
+def _turn(run: StoppingRun, places: list[int], chord: float) -> float:
     """Return the angle (deg) between velocities of the leader's size that are a chord apart."""
     size = float(np.linalg.norm(run.ahead[1, places]))
     return math.degrees(2.0 * math.asin(min(1.0, 0.5 * chord / size))) if size > 0.0 else math.inf
@@ -122,7 +122,7 @@ def _turn(run: Stopping, places: list[int], chord: float) -> float:
 class _Asked(NamedTuple):
     """A border with what it is computed of: bounds of |w| of leader and agent, what is allowed."""
 
-    run: Stopping
+    run: StoppingRun
     bound: FlatBound
     places: list[int]
     chain: Chain
@@ -155,7 +155,7 @@ def _told(asked: _Asked, least: Least, left: Fraction) -> dict[str, Any]:
     }
 
 
-def _upward(asked: _Asked) -> tuple[list[Room], dict[str, Any]]:
+def _upward(asked: _Asked) -> tuple[list[Clearance], dict[str, Any]]:
     """Return the rooms of one output, which may go far on its other side, and the starts."""
     run, [k], chain = asked.run, asked.places, asked.chain
     leads, p = list(run.parts.graph.leaders), len(chain.powers)
@@ -178,7 +178,7 @@ def _upward(asked: _Asked) -> tuple[list[Room], dict[str, Any]]:
     return rooms, {name: starts[:, 1 : p + 1].tolist() for name, starts in told.items()}
 
 
-def _along(asked: _Asked) -> tuple[list[Room], dict[str, Any]]:
+def _along(asked: _Asked) -> tuple[list[Clearance], dict[str, Any]]:
     """Return the rooms of several outputs, and the starts against the leader's path."""
     run, p = asked.run, len(asked.chain.powers)
     away = (run.flat - run.ahead)[:, 1 : p + 1, asked.places].swapaxes(1, 2)

@@ -30,7 +30,7 @@ class Push(NamedTuple):
     speed: Fraction
 
 
-class Room(NamedTuple):
+class Clearance(NamedTuple):
     """How far a derivative of outputs may go from that of the leader's path, at most.
 
     Attributes:
@@ -42,7 +42,7 @@ class Room(NamedTuple):
     steepest: Fraction
 
 
-def room_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction) -> Room:
+def room_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction) -> Clearance:
     """Return how far v^(order) falls under all pushes together, and the start that is left.
 
     Args:
@@ -68,7 +68,7 @@ def length_room_of(
     starts: Sequence[Sequence[Fraction]],
     speed: Fraction,
     allowed: Fraction,
-) -> Room:
+) -> Clearance:
     """Return how long the vector of v^(order) gets, of outputs whose chains are alike.
 
     Args:
@@ -103,7 +103,7 @@ def _room(
     left: Callable[[Fraction, Fraction], Fraction],
     speed: Fraction,
     allowed: Fraction,
-) -> Room:
+) -> Clearance:
     """Return the room, where `left` is what the starts leave on a piece of 0 < x <= 1, at most."""
     fall, steepest = Fraction(0), None
     for low, high, moved, either in _pieces(chain, order):
@@ -112,7 +112,7 @@ def _room(
         if either > 0:
             own = (allowed - down) / either
             steepest = own if steepest is None else min(steepest, own)
-    return Room(fall, max(steepest or Fraction(0), Fraction(0)))
+    return Clearance(fall, max(steepest or Fraction(0), Fraction(0)))
 
 
 class _Piece(NamedTuple):

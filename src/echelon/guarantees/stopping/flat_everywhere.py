@@ -10,7 +10,7 @@ import numpy as np
 from echelon.agents.models.chains import Chains, derivatives_of
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.memoize import kept
-from echelon.simulation.codegen import Graph, Node, Unsupported, lower, needed, nodes
+from echelon.simulation.codegen import Node, ScalarGraph, Unsupported, lower, needed, nodes
 
 _PARTIAL = {"exponent", "mantissa", "root_guess"}
 """Operations that are not defined for all numbers; quotients and roots are not for some."""
@@ -72,7 +72,7 @@ def _traced(
     Raises:
         Unsupported: the trace has what is no scalar operation, or not defined everywhere.
     """
-    graph, n = Graph(), len(model.state_names)
+    graph, n = ScalarGraph(), len(model.state_names)
     leaves = [graph.leaf("row", place) for place in range(n + chains.size)]
     x, e = (np.array(part, object) for part in (leaves[:n], leaves[n:]))
     order, m = max(chains.degrees), len(chains.degrees)

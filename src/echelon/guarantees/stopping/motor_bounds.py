@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 from echelon.agents.models.airframe import Airframe
 from echelon.core.enclosure.interval import ELEMENTARY, point
-from echelon.guarantees.stopping.time_slices import Slice, rounded_up
+from echelon.guarantees.stopping.time_slices import TimeSlice, rounded_up
 
 _HALF = Fraction(1, 2)
 
 
-class Asked(NamedTuple):
+class MotorDemand(NamedTuple):
     """Bounds of a path's derivatives, sizes all: horizontal (norm), vertical, and of the yaw.
 
     Attributes:
@@ -71,7 +71,10 @@ class Motors(NamedTuple):
 
 
 def motors_of(
-    frame: Airframe, slices: Sequence[Slice], path: Sequence[Asked], pushes: Sequence[Pushed]
+    frame: Airframe,
+    slices: Sequence[TimeSlice],
+    path: Sequence[MotorDemand],
+    pushes: Sequence[Pushed],
 ) -> Motors:
     """Return what the motors of an agent give on a path, pushed off it.
 
@@ -93,14 +96,14 @@ def motors_of(
 
 
 def motors_suffice(
-    frame: Airframe, slices: Sequence[Slice], path: Sequence[Asked], push: Pushed
+    frame: Airframe, slices: Sequence[TimeSlice], path: Sequence[MotorDemand], push: Pushed
 ) -> bool:
     """Tell whether the motors give all that is asked of an agent on a path, pushed off it."""
     most, pairs = Fraction(frame.motor_thrust), zip(slices, path, strict=True)
     return all(motors_for(frame, add_pushes(*pair, (push,))).within(most) for pair in pairs)
 
 
-def add_pushes(piece: Slice, asked: Asked, pushes: Sequence[Pushed]) -> Asked:
+def add_pushes(piece: TimeSlice, asked: MotorDemand, pushes: Sequence[Pushed]) -> MotorDemand:
     """Return what is asked on a slice of agents that are pushed off the path."""
     aside, up, turn = list(asked.sideways), [Fraction(0)] * 3, list(asked.turn)
     for push in pushes:
@@ -110,7 +113,7 @@ def add_pushes(piece: Slice, asked: Asked, pushes: Sequence[Pushed]) -> Asked:
             up[k] += piece.whole.of(k + 1, push.upward, upward)
         for k in range(2):
             turn[k] += piece.first.of(k, push.turn, around)
-    return Asked(
+    return MotorDemand(
         (aside[0], aside[1], aside[2]),
         asked.low - up[0],
         asked.high + up[0],
@@ -119,7 +122,7 @@ def add_pushes(piece: Slice, asked: Asked, pushes: Sequence[Pushed]) -> Asked:
     )
 
 
-def motors_for(frame: Airframe, asked: Asked) -> Motors:
+def motors_for(frame: Airframe, asked: MotorDemand) -> Motors:
     """Return what the motors give while a path's derivatives are within bounds."""
     low = asked.low + Fraction(frame.gravity)
     if low <= 0:

@@ -16,7 +16,7 @@ from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.motor_bounds import (
-    Asked,
+    MotorDemand,
     Motors,
     Pushed,
     add_pushes,
@@ -24,7 +24,7 @@ from echelon.guarantees.stopping.motor_bounds import (
     motors_suffice,
 )
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
-from echelon.guarantees.stopping.stopping_run import Stopping
+from echelon.guarantees.stopping.stopping_run import StoppingRun
 from echelon.guarantees.stopping.time_slices import rounded_up, slices_of
 from echelon.laws.stopping_point import StoppingLeader
 
@@ -68,7 +68,7 @@ class Alone(NamedTuple):
         )
 
 
-class Strain(NamedTuple):
+class MotorLoad(NamedTuple):
     """What the motors give from the starts of a run, and from which others they would do.
 
     Attributes:
@@ -103,14 +103,14 @@ class Strain(NamedTuple):
         return {**numbers, "most": self.most, "alone": alone, **self.told}
 
 
-class Strained(NamedTuple):
+class LoadLine(NamedTuple):
     """The strain, if it is known and the motors bear it, and the line that says so."""
 
-    strain: Strain | None
+    strain: MotorLoad | None
     line: Statement
 
 
-class _Case(NamedTuple):
+class _MotorCase(NamedTuple):
     """What the motors of a run are asked for.
 
     Attributes:
@@ -128,11 +128,11 @@ class _Case(NamedTuple):
     path: "_Path"
     led: Pushed
     speeds: tuple[Fraction, Fraction, Fraction]
-    base: tuple[Asked, ...]
+    base: tuple[MotorDemand, ...]
     starts: Sequence[Pushed]
 
     @classmethod
-    def of(cls, run: Stopping, frame: Airframe) -> "_Case":
+    def of(cls, run: StoppingRun, frame: Airframe) -> "_MotorCase":
         """Return it of a run."""
         chain, graph = run.chain(0), run.parts.graph
         speeds = _speeds([run.speed(k) for k in range(4)])
@@ -146,22 +146,22 @@ class _Case(NamedTuple):
         return cls(frame, chain, path, led, speeds, base, starts)
 
 
-def motors_bear(run: Stopping) -> bool:
+def motors_bear(run: StoppingRun) -> bool:
     """Tell whether the motors are certified from the starts of a run."""
     frame = run.parts.model.airframe
     if frame is None or _beyond(run):
         return False
-    case = _Case.of(run, frame)
+    case = _MotorCase.of(run, frame)
     return _from(case)[0].within(Fraction(frame.motor_thrust))
 
 
-def strain_of(run: Stopping) -> Strained:
+def strain_of(run: StoppingRun) -> LoadLine:
     """Return whether the motors of a run's agents suffice, by T5 with limits."""
     frame, reason = run.parts.model.airframe, _beyond(run)
     if frame is None or reason:
         text = reason or _UNKNOWN
-        return Strained(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
-    case = _Case.of(run, frame)
+        return LoadLine(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
+    case = _MotorCase.of(run, frame)
     found, starts = _from(case)
     kind, shown, most = case.path.kind, _shown(found), Fraction(frame.motor_thrust)
     if not found.within(most):
@@ -169,9 +169,9 @@ def strain_of(run: Stopping) -> Strained:
         text += f": {shown}" if shown else ", and the thrust not to vanish"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
-        return Strained(None, _line(Verdict.FAILS, kind, found, shown, text, remedy))
+        return LoadLine(None, _line(Verdict.FAILS, kind, found, shown, text, remedy))
     ahead = _ahead(frame, run.ahead)
-    strain = Strain(
+    strain = MotorLoad(
         kind,
         _floor(found.least),
         -_floor(-found.largest),
@@ -181,10 +181,10 @@ def strain_of(run: Stopping) -> Strained:
         _told(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors give what is asked from these starts, all the way"
-    return Strained(strain, _line(Verdict.HOLDS, kind, found, shown, text))
+    return LoadLine(strain, _line(Verdict.HOLDS, kind, found, shown, text))
 
 
-def _beyond(run: Stopping) -> str:
+def _beyond(run: StoppingRun) -> str:
     """Return why nothing is to be asked of motors, or nothing is known; empty where it is."""
     chains = run.law.ready.chains
     if not run.settings.limits or run.parts.model.input_limits is None:
@@ -221,7 +221,7 @@ def _floor(x: Fraction) -> float:
 
 class _Path(NamedTuple):
     kind: Kind
-    asked: tuple[Asked, ...]
+    asked: tuple[MotorDemand, ...]
 
 
 @kept
@@ -232,7 +232,7 @@ def _path(leader: StoppingLeader, model: ControlAffine, horizon: float, chain: C
     return _Path(pieces.kind, tuple(_asked(pieces, *span) for span in spans))
 
 
-def _asked(pieces: Pieces, begin: Fraction, end: Fraction | None) -> Asked:
+def _asked(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand:
     """Return what a path asks in a stretch of time."""
     rows = pieces.between(begin, end)
 
@@ -242,7 +242,7 @@ def _asked(pieces: Pieces, begin: Fraction, end: Fraction | None) -> Asked:
     low = min(row[2][2].lo for row in rows)
     high = max(row[2][2].hi for row in rows)
     sideways = (most(2, 0, 1), most(3, 0, 1), most(4, 0, 1))
-    return Asked(sideways, low, high, (most(3, 2), most(4, 2)), (most(1, 3), most(2, 3)))
+    return MotorDemand(sideways, low, high, (most(3, 2), most(4, 2)), (most(1, 3), most(2, 3)))
 
 
 def _size(x: Interval) -> Fraction:
@@ -282,15 +282,15 @@ def _largest(starts: Sequence[Pushed]) -> Pushed:
 
 @kept
 def _pushed(
-    chain: Chain, path: tuple[Asked, ...], led: Pushed, speeds: tuple[Fraction, ...]
-) -> tuple[Asked, ...]:
+    chain: Chain, path: tuple[MotorDemand, ...], led: Pushed, speeds: tuple[Fraction, ...]
+) -> tuple[MotorDemand, ...]:
     """Return what is asked of agents that start as their leader, on each slice."""
     own = _STILL._replace(speeds=speeds)
     pairs = zip(slices_of(chain), path, strict=True)
     return tuple(add_pushes(piece, asked, (led, own)) for piece, asked in pairs)
 
 
-def _from(case: _Case) -> tuple[Motors, Sequence[Pushed]]:
+def _from(case: _MotorCase) -> tuple[Motors, Sequence[Pushed]]:
     """Return what motors give from any of the starts, and which are looked at for that."""
     frame, slices, starts = case.frame, slices_of(case.chain), case.starts
     largest = _largest(starts)
@@ -333,7 +333,9 @@ def _ahead(frame: Airframe, path: Array) -> _Ahead:
 
 
 @kept
-def _alone(frame: Airframe, chain: Chain, base: tuple[Asked, ...], path: _Ahead) -> Alone | None:
+def _alone(
+    frame: Airframe, chain: Chain, base: tuple[MotorDemand, ...], path: _Ahead
+) -> Alone | None:
     """Return how far one thing may be off at a start that is else the leader's."""
     slices = slices_of(chain)
 
@@ -367,7 +369,7 @@ def _farthest(fits: Callable[[Fraction], bool], most: Fraction) -> float:
 
 
 def _told(
-    case: _Case, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
+    case: _MotorCase, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
 ) -> dict[str, Any]:
     """Return what the strain was computed of, ready for JSON."""
     return {

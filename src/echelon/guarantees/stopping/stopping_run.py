@@ -26,7 +26,7 @@ from echelon.simulation.step.settings import Settings
 _PROOF = Kind.PROOF
 
 
-class Stopping(NamedTuple):
+class StoppingRun(NamedTuple):
     """A run under the law, as its theorem sees it.
 
     Attributes:
@@ -120,7 +120,7 @@ class Stopping(NamedTuple):
         return min(self.leader.speed_of(output), c * float(away))
 
 
-def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | None:
+def stopping_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun | None:
     """Return what T5 speaks of; None under another law."""
     drive = parts.drive
     if not isinstance(drive, Laws) or not isinstance(drive.follower, StoppingPoint):
@@ -128,7 +128,7 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> Stopping | N
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))
-    return Stopping(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
+    return StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
 
 
 @program
@@ -148,7 +148,7 @@ def _flat(
 # ---- what else it rests on -----------------------------------------------------------------------
 
 
-def condition_lines(run: Stopping) -> Iterator[Statement]:
+def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     """Yield the conditions of T5 beside the tube."""
     n = len(run.parts.model.state_names)
     text = "of the flat outputs they are; those of other states are none"
@@ -183,7 +183,7 @@ def condition_lines(run: Stopping) -> Iterator[Statement]:
     yield Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, _PROOF, text="there is no gain")
 
 
-def _switching_line(run: Stopping) -> Statement:
+def _switching_line(run: StoppingRun) -> Statement:
     """Say along which edges the leader reaches everybody: checked when the graph was made."""
     schedule = run.parts.graph.schedule
     assert schedule is not None
@@ -194,7 +194,7 @@ def _switching_line(run: Stopping) -> Statement:
     return Statement(Hypothesis.SWITCHING, Verdict.HOLDS, _PROOF, run.rate, "", text)
 
 
-def _moves_others(run: Stopping) -> str:
+def _moves_others(run: StoppingRun) -> str:
     """Return the first state with an offset that is no flat output; empty without one."""
     outputs, model = run.law.ready.chains.outputs, run.parts.model
     for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0)):
@@ -203,7 +203,7 @@ def _moves_others(run: Stopping) -> str:
     return ""
 
 
-def _step_line(run: Stopping) -> Statement:
+def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
     assert run.law.reach is not None
     name, dt, c = Hypothesis.STEP, run.settings.dt, run.coupling
@@ -228,14 +228,14 @@ def _step_line(run: Stopping) -> Statement:
     return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, share, shown, text, remedy, text)
 
 
-def _radius(run: Stopping) -> float:
+def _radius(run: StoppingRun) -> float:
     """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
     led = np.array([run.leader.strength(run.settings.dt)])
     followed = _held(run, run.law.ready, run.coupling * _strengths(run))
     return max(followed, _held(run, run.leader.ready, led))
 
 
-def _held(run: Stopping, loop: FlatLoop, strengths: Array) -> float:
+def _held(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
     """Return the same of agents that feel what is off by so much each (K,), 1/s."""
     found = 0.0
     for k, degree in enumerate(loop.chains.degrees):
@@ -248,7 +248,7 @@ def _held(run: Stopping, loop: FlatLoop, strengths: Array) -> float:
     return found
 
 
-def _strengths(run: Stopping) -> Array:
+def _strengths(run: StoppingRun) -> Array:
     """Return eigenvalues of the followers' Laplacian that stand for all, (K,)."""
     graph, reach = run.parts.graph, run.law.reach
     assert reach is not None
@@ -270,7 +270,7 @@ def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
     return values[np.abs(values) > 1e-12 * np.abs(values).max()]
 
 
-def drift_reason(run: Stopping) -> Statement | None:
+def drift_reason(run: StoppingRun) -> Statement | None:
     """Return why what lasts carries the leader away for ever; None where it does not."""
     world, model, loop = run.parts.world, run.parts.model, run.leader.ready
     if world.ideal:

@@ -23,7 +23,7 @@ def rounded_up(x: Fraction) -> Fraction:
     return Fraction(math.ceil(x * _FINE), _FINE)
 
 
-class Reach(NamedTuple):
+class DerivativeBounds(NamedTuple):
     """How far the derivatives of v go on a slice.
 
     Attributes:
@@ -41,7 +41,7 @@ class Reach(NamedTuple):
         return rounded_up(left + self.driven[order] * speed)
 
 
-class Slice(NamedTuple):
+class TimeSlice(NamedTuple):
     """A slice of time from `begin` to `end` (s; None is for ever) and what chains do in it.
 
     Attributes:
@@ -51,19 +51,19 @@ class Slice(NamedTuple):
 
     begin: Fraction
     end: Fraction | None
-    whole: Reach
-    first: Reach
+    whole: DerivativeBounds
+    first: DerivativeBounds
 
 
 @functools.lru_cache(32)
-def slices_of(chain: Chain) -> tuple[Slice, ...]:
+def slices_of(chain: Chain) -> tuple[TimeSlice, ...]:
     """Return the slices of all time, for a chain of one root or more."""
     first = Chain(chain.powers[:1], chain.unit)
     count = 1 << _HALVINGS
     times = [_time(chain, Fraction(k, count)) for k in range(count, 0, -1)]
     ends = [high for _, high in times[1:]]
     begins = [low for low, _ in times]
-    return tuple(map(Slice, begins, [*ends, None], _reaches(chain), _reaches(first)))
+    return tuple(map(TimeSlice, begins, [*ends, None], _reaches(chain), _reaches(first)))
 
 
 def _time(chain: Chain, x: Fraction) -> tuple[Fraction, Fraction]:
@@ -72,7 +72,7 @@ def _time(chain: Chain, x: Fraction) -> tuple[Fraction, Fraction]:
     return -log.hi / chain.unit, -log.lo / chain.unit
 
 
-def _reaches(chain: Chain) -> list[Reach]:
+def _reaches(chain: Chain) -> list[DerivativeBounds]:
     """Return how far a chain goes on each slice, the first one in time first."""
     size, count = len(chain.powers), 1 << _HALVINGS
     orders = range(size + 1)
@@ -84,7 +84,7 @@ def _reaches(chain: Chain) -> list[Reach]:
     ]
     grown = [_grown(chain, order) for order in orders]
     return [
-        Reach(
+        DerivativeBounds(
             tuple(tuple(rounded_up(column[k]) for column in row) for row in free),
             tuple(row[k] for row in grown),
         )

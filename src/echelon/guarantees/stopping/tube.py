@@ -13,8 +13,8 @@ from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.guarantees.stopping.arrival import Arrival, arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
-from echelon.guarantees.stopping.motor_load import Strain, strain_of
-from echelon.guarantees.stopping.stopping_run import Stopping
+from echelon.guarantees.stopping.motor_load import MotorLoad, strain_of
+from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _PROOF = Kind.PROOF
 
@@ -48,7 +48,7 @@ class Tube(NamedTuple):
     arrival: Arrival | None
     who: str
     borders: tuple[dict[str, Any], ...]
-    strain: Strain | None
+    strain: MotorLoad | None
     graphs: tuple[str, str] = _ANY
 
     @property
@@ -94,7 +94,7 @@ class _Found(NamedTuple):
     lines: tuple[Statement, ...]
 
 
-def tube_of(run: Stopping, briefly: bool = False) -> _Found:
+def tube_of(run: StoppingRun, briefly: bool = False) -> _Found:
     """Return what T5 promises, and its lines: the inner gains, the set, and the starts.
 
     And when agents arrive and what motors give, which is most of the work and on which nothing else
@@ -135,7 +135,7 @@ def tube_of(run: Stopping, briefly: bool = False) -> _Found:
     return _Found(tube._replace(arrival=arrival, strain=strain), (*lines, line))
 
 
-def _graphs(run: Stopping) -> tuple[str, str]:
+def _graphs(run: StoppingRun) -> tuple[str, str]:
     """Return of which graphs T5 speaks, and how this one is called."""
     schedule, law = run.parts.graph.schedule, run.law
     if law.feedforward is Feedforward.PARENT:
@@ -165,7 +165,7 @@ def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
 _NO_BORDER = "no border of flat coordinates can be met"
 
 
-def _set_lines(run: Stopping, borders: Sequence[Border], kind: Kind) -> Iterator[Statement]:
+def _set_lines(run: StoppingRun, borders: Sequence[Border], kind: Kind) -> Iterator[Statement]:
     """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
         text = "its flat coordinates have no border: any state is a start"
@@ -188,7 +188,7 @@ def _set_lines(run: Stopping, borders: Sequence[Border], kind: Kind) -> Iterator
     yield Statement(Hypothesis.STARTS, holds, kind, far, shown, text, remedy, reason)
 
 
-def _room_line(run: Stopping, border: Border, kind: Kind) -> Statement:
+def _room_line(run: StoppingRun, border: Border, kind: Kind) -> Statement:
     """Say how far starts may be off behind a leader that keeps to its path."""
     bound, steepest, text = border.bound, border.steepest, ""
     remedy, shown = "", f"{steepest:.3g} off"
@@ -209,7 +209,7 @@ def _room_line(run: Stopping, border: Border, kind: Kind) -> Statement:
     return Statement(Hypothesis.SET, holds, kind, steepest, shown, text, remedy, reason)
 
 
-def _who(run: Stopping, borders: Sequence[Border]) -> str:
+def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
     """Return which starts are meant, in words."""
     if not borders:
         return "any state of any agent"
@@ -232,7 +232,7 @@ def _turned(border: Border) -> str:
     return f" (at its speed, {border.turn:.3g} deg to either side)"
 
 
-def _positions(run: Stopping) -> tuple[int, ...]:
+def _positions(run: StoppingRun) -> tuple[int, ...]:
     """Return which outputs are a position."""
     outputs, position = run.law.ready.chains.outputs, run.parts.model.position
     return tuple(k for k, name in enumerate(outputs) if name in position)

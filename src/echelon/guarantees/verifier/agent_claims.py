@@ -184,7 +184,7 @@ def _normals(metric: Array, sizes: Array) -> Array:
     return np.where(which == 0, single, np.where(which == 1, mixed, metric))
 
 
-def _decay(facts: Facts, region: SavedRegion, steps: Array) -> enclosed.Bounds:
+def _decay(facts: Facts, region: SavedRegion, steps: Array) -> enclosed.SupportBounds:
     """Return what d'P (v(x) - v(y)) may be at most, by a rate and the strongest of the feedbacks.
 
     P A + A'P - strength P W P + 2 rate P <= 0, integrated from y to x = y + d.
@@ -194,4 +194,6 @@ def _decay(facts: Facts, region: SavedRegion, steps: Array) -> enclosed.Bounds:
     pulled, rate = steps @ saved.P, region.rate * (1.0 - _SAMPLED)
     held = 0.5 * region.strength * np.einsum("kn,hnm,km->kh", pulled, W, pulled).max(axis=1)
     size = np.einsum("kn,kn->k", pulled, steps)
-    return enclosed.Bounds(np.full(len(steps), -np.inf), held - rate * size, held + rate * size)
+    return enclosed.SupportBounds(
+        np.full(len(steps), -np.inf), held - rate * size, held + rate * size
+    )

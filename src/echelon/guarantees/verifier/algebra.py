@@ -35,14 +35,14 @@ def grounded_rows(graph: SavedGraph, edges: Array) -> list[list[Fraction]]:
     return [[rows[i][j] for j in kept] for i in kept]
 
 
-class Spectrum(NamedTuple):
+class CheckedSpectrum(NamedTuple):
     """Eigenvalues of the grounded Laplacian, ascending, and what the smallest is no less than."""
 
     values: Array
     bound: float
 
 
-def spectrum(graph: SavedGraph, edges: Array) -> Spectrum:
+def spectrum(graph: SavedGraph, edges: Array) -> CheckedSpectrum:
     """Return all eigenvalues of the grounded Laplacian; 0 first where an agent is not reached."""
     (i, j), weights, kept = edges[:, :2].astype(int).T, edges[:, 2], followers(graph)
     W = np.zeros((graph.agents, graph.agents))
@@ -50,7 +50,7 @@ def spectrum(graph: SavedGraph, edges: Array) -> Spectrum:
     apart, led = W[np.ix_(kept, kept)], W[np.ix_(kept, graph.leaders)].sum(axis=1)
     values = scipy.linalg.eigvalsh(np.diag(apart.sum(axis=1) + led) - apart)
     values[0], bound = _least(apart, led)
-    return Spectrum(values, bound)
+    return CheckedSpectrum(values, bound)
 
 
 def ends_of_many(values: Array) -> Array:

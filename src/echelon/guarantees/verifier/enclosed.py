@@ -49,7 +49,7 @@ def farthest_outside(hull: Array, error: Array, samples: Array) -> float:
     return worst
 
 
-class Bounds(NamedTuple):
+class SupportBounds(NamedTuple):
     """What p'(v(x) - v(y)) may be at K pairs: from `low` to `high`, (K,); `size` of its terms."""
 
     low: Array
@@ -57,7 +57,7 @@ class Bounds(NamedTuple):
     size: Array
 
 
-def support(hull: Array, error: Array, normals: Array, steps: Array) -> Bounds:
+def support(hull: Array, error: Array, normals: Array, steps: Array) -> SupportBounds:
     """Return the range of p'A d over a hull (H, n, n) up to an error, for normals p and steps d.
 
     A velocity v with Jacobians in the hull has v(x) - v(y) = A (x - y), A a mean of Jacobians.
@@ -69,7 +69,7 @@ def support(hull: Array, error: Array, normals: Array, steps: Array) -> Bounds:
         found = np.einsum("khn,kn->kh", found, normals)
         low, high = np.minimum(low, found.min(axis=1)), np.maximum(high, found.max(axis=1))
     size = np.einsum("kn,nm,km->k", np.abs(normals), np.abs(hull).max(axis=0), np.abs(steps))
-    return Bounds(low - spread, high + spread, size)
+    return SupportBounds(low - spread, high + spread, size)
 
 
 def steepest(
@@ -77,7 +77,7 @@ def steepest(
     x: Array,
     y: Array,
     normals: Array,
-    bounds: Bounds,
+    bounds: SupportBounds,
 ) -> float:
     """Return how far p'(v(x) - v(y)) leaves its bounds at the worst pair, in parts of its size.
 

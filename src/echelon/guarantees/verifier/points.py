@@ -81,7 +81,7 @@ def _corners(ends: Array, random: np.random.Generator) -> Array:
     return np.take_along_axis(ends, picks, axis=0)
 
 
-class Pairs(NamedTuple):
+class StatePairs(NamedTuple):
     """Two deviations (K, n) each of one domain, and the input (K, m) that both have."""
 
     ones: Array
@@ -89,7 +89,7 @@ class Pairs(NamedTuple):
     inputs: Array
 
 
-def pairs(saved: SavedGain, region: SavedRegion, known: Points) -> Pairs:
+def pairs(saved: SavedGain, region: SavedRegion, known: Points) -> StatePairs:
     """Return pairs of states: of any two points, and close about the trim and about a lattice."""
     random, n = np.random.default_rng(1), len(saved.P)
     box, count = _box(region), len(known.states)
@@ -102,4 +102,4 @@ def pairs(saved: SavedGain, region: SavedRegion, known: Points) -> Pairs:
     step = 10.0 ** random.uniform(_NEAR, 0.0, (count, 1)) * random.normal(size=(count, n)) * width
     for found, sign in ((ones, 0.5), (others, -0.5)):
         found[close] = np.clip(centre + sign * step, box.low[:n], box.high[:n])[close]
-    return Pairs(ones, others, known.inputs)
+    return StatePairs(ones, others, known.inputs)

@@ -25,7 +25,7 @@ from echelon.guarantees.verifier.tube_claims import read_tube, tube_findings
 _SKEW = 1e-12
 
 
-class Verified(NamedTuple):
+class Verification(NamedTuple):
     """All findings, what they come to, and that in a sentence.
 
     Attributes:
@@ -45,7 +45,7 @@ class Verified(NamedTuple):
         return self.verdict == "verified"
 
 
-def verify(path: PathLike, model: ControlAffine | None = None) -> Verified:
+def verify(path: PathLike, model: ControlAffine | None = None) -> Verification:
     """Recompute what a saved gain, or a run under the law `stopping-point`, promises.
 
     Args:
@@ -94,18 +94,18 @@ def _findings(saved: SavedGain, model: ControlAffine | None) -> Iterator[Finding
         yield from equations(known, model)
 
 
-def _verdict(findings: tuple[Finding, ...]) -> Verified:
+def _verdict(findings: tuple[Finding, ...]) -> Verification:
     refused = [each.claim for each in findings if each.verdict == "refused"]
     open_ = [each.claim for each in findings if each.verdict == "not checked"]
     count = f"{len(findings) - len(open_)} claims hold as stored"
     if refused:
         does = "does" if len(refused) == 1 else "do"
         text = f"Refused: {'; '.join(refused)} {does} not hold as stored."
-        return Verified(findings, "refused", text)
+        return Verification(findings, "refused", text)
     if open_:
         text = f"Incomplete: {count}, and could not be checked: {'; '.join(open_)}."
-        return Verified(findings, "incomplete", text)
-    return Verified(findings, "verified", f"Verified: {count}.")
+        return Verification(findings, "incomplete", text)
+    return Verification(findings, "verified", f"Verified: {count}.")
 
 
 def _without_decay(saved: SavedGain) -> str:

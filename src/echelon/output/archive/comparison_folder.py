@@ -6,7 +6,7 @@ from typing import Any, final
 
 from echelon.core.files import write_whole
 from echelon.experiments.results.dataset import save_dataset
-from echelon.experiments.studies.compare import Comparison, Row
+from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.output.archive.folder import RUNS, unwritable
 
 
@@ -23,7 +23,7 @@ class Flights:
         self.folder = folder
         self.error: OSError | None = None
 
-    def write(self, row: Row) -> None:
+    def write(self, row: ComparisonRow) -> None:
         """Write what a method flew; where that fails, the comparison goes on."""
         # A method that was refused or failed to begin has no run, and a row all the same.
         if row.flight is None:

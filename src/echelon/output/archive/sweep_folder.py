@@ -8,7 +8,7 @@ from echelon.core.files import write_whole
 from echelon.experiments.scenario.scenario import KEPT, load_scenario
 from echelon.experiments.sweeps.axes import read_axes
 from echelon.experiments.sweeps.plan import Sweep
-from echelon.experiments.sweeps.workers import Batch
+from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import BATCHES, INPUTS, unwritable
 
@@ -49,7 +49,7 @@ class Batches:
         over = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
         return Sweep(load_scenario(self.folder / KEPT), read_axes(over))
 
-    def write(self, batch: Batch) -> None:
+    def write(self, batch: SweepBatch) -> None:
         """Write a batch, whole or not at all.
 
         Raises:
@@ -60,12 +60,12 @@ class Batches:
         except OSError as error:
             raise unwritable(self.folder, error) from error
 
-    def read(self) -> list[Batch]:
+    def read(self) -> list[SweepBatch]:
         """Return the batches that are whole."""
         names = (file.stem for file in self.chunks.place.glob("*.npz"))
         firsts = sorted(int(name) for name in names if name.isdigit())
         stored = ((first, self.chunks.stored(first)) for first in firsts)
-        return [Batch(first, columns) for first, columns in stored if columns is not None]
+        return [SweepBatch(first, columns) for first, columns in stored if columns is not None]
 
 
 def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = True) -> None:

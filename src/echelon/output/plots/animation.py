@@ -16,12 +16,12 @@ _FEW = 60
 _LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
-def moving_of(ax: Any, run: Recording, space: Space, camera: Camera) -> "Moving":
+def moving_of(ax: Any, run: Recording, space: Space, camera: Camera) -> "MovingScene":
     """Return what draws the agents of a run on axes of pixels."""
-    return (_Vehicles if run.agents <= _FEW else _Flock)(ax, run, space, camera)
+    return (_Vehicles if run.agents <= _FEW else _Dots)(ax, run, space, camera)
 
 
-class Moving(abc.ABC):
+class MovingScene(abc.ABC):
     """Draws a moment.
 
     Attributes:
@@ -87,7 +87,7 @@ class Moving(abc.ABC):
 
 
 @final
-class _Vehicles(Moving):
+class _Vehicles(MovingScene):
     """Agents few enough to be seen one by one."""
 
     trail, points = 4.0, 60
@@ -150,7 +150,7 @@ class _Vehicles(Moving):
 
 
 @final
-class _Flock(Moving):
+class _Dots(MovingScene):
     """So many agents that each is a dot, as large as it is near; leaders lie on top."""
 
     trail, points = 1.0, 8

@@ -7,7 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.results.metrics import SETTLED, formation_errors, output_errors
-from echelon.experiments.studies.compare import Comparison, Row
+from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
 from echelon.simulation.engine.result import Result
@@ -43,14 +43,14 @@ def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
     save(comparison_figures(comparison), folder / "figures")
 
 
-_Flown = list[tuple[int, Row]]
+_Flown = list[tuple[int, ComparisonRow]]
 
 
-def _frames(row: Row) -> bool:
+def _frames(row: ComparisonRow) -> bool:
     return row.flight is not None and len(row.flight.result.times) > 1
 
 
-def _result(row: Row) -> Result:
+def _result(row: ComparisonRow) -> Result:
     assert row.flight is not None
     return row.flight.result
 

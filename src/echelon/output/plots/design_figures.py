@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.experiments.results.recording import Modes
+from echelon.experiments.results.recording import LoopPoles
 from echelon.experiments.studies.basin import (
     Radii,
-    Slice,
+    StateSlice,
     Trial,
     chosen_slice,
     converged,
@@ -51,7 +51,7 @@ def save_design_figures(
     sliced = asked is not None or len(parts.model.state_names) > 1
     states = chosen_slice(parts.model, asked) if sliced else None
     with draw.style():
-        made["modes"] = poles(Modes(loop.poles, loop.eigenvalues))
+        made["modes"] = poles(LoopPoles(loop.poles, loop.eigenvalues))
         if states is not None and loop.every and len(parts.graph.followers) <= _MOST:
             made["certified_set"], radii = _certified_set(parts, settings, states)
     return save(made, folder), radii
@@ -95,7 +95,7 @@ def _certified_set(
     return figure, radii
 
 
-def _starts(ax: Any, run: Trial, plane: Slice, half: Array) -> None:
+def _starts(ax: Any, run: Trial, plane: StateSlice, half: Array) -> None:
     """Colour a grid of starts by whether they converge."""
     from matplotlib.colors import ListedColormap
 
@@ -110,7 +110,7 @@ def _starts(ax: Any, run: Trial, plane: Slice, half: Array) -> None:
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
 
 
-def _ellipses(ax: Any, plane: Slice, radii: Radii, half: Array) -> None:
+def _ellipses(ax: Any, plane: StateSlice, radii: Radii, half: Array) -> None:
     """Draw the certified and the observed set where they fit into the axes."""
     shown: list[Any] = [(radii.observed, _OBSERVED, (0, (5, 2)), "none")]
     if radii.certified and radii.certified < np.inf:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.experiments.results.recording import Modes, Recording
+from echelon.experiments.results.recording import LoopPoles, Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import MOST, pen_of, told_of
 
@@ -24,7 +24,7 @@ def modes(run: Recording) -> "Figure | None":
     return None if run.modes is None else poles(run.modes)
 
 
-def poles(found: Modes) -> "Figure":
+def poles(found: LoopPoles) -> "Figure":
     """Return poles in the complex plane, coloured by the eigenvalue of the graph."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure

@@ -35,7 +35,7 @@ USUAL = ("leader_3d", "trajectories", "tracking", "formation", "inputs", "lyapun
 
 
 def figures(
-    run: Result | Recording, what: Sequence[str] = USUAL, page: draw.Page = draw.SCREEN
+    run: Result | Recording, what: Sequence[str] = USUAL, page: draw.FigureSize = draw.SCREEN
 ) -> "dict[str, Figure]":
     """Return the figures that make sense for a run, by name.
 

@@ -30,7 +30,7 @@ _POINTS = 2000  # a line's, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
 
 
-class Page(NamedTuple):
+class FigureSize(NamedTuple):
     """Where a figure will stand: its width, what a space may fill of it (in), its letters (pt)."""
 
     width: float
@@ -43,11 +43,11 @@ class Page(NamedTuple):
         return self.width < 5.0
 
 
-SCREEN = Page(7.0, 4.3, 10.0)
-ONE_COLUMN, TWO_COLUMNS = Page(3.5, 2.6, 8.0), Page(7.16, 4.4, 8.0)
+SCREEN = FigureSize(7.0, 4.3, 10.0)
+ONE_COLUMN, TWO_COLUMNS = FigureSize(3.5, 2.6, 8.0), FigureSize(7.16, 4.4, 8.0)
 """Of a page of a journal."""
 
-_page: ContextVar[Page] = ContextVar("page", default=SCREEN)
+_page: ContextVar[FigureSize] = ContextVar("page", default=SCREEN)
 _STYLE: dict[Any, Any] = {
     "font.family": "STIXGeneral",
     "mathtext.fontset": "stix",
@@ -70,7 +70,7 @@ _STYLE: dict[Any, Any] = {
 
 
 @contextmanager
-def style(page: Page = SCREEN) -> Iterator[None]:
+def style(page: FigureSize = SCREEN) -> Iterator[None]:
     """Draw in echelon's style for a page, and put matplotlib's settings back."""
     import matplotlib
 
@@ -87,7 +87,7 @@ def style(page: Page = SCREEN) -> Iterator[None]:
         _page.reset(token)
 
 
-def page() -> Page:
+def page() -> FigureSize:
     """Return the page that is drawn for."""
     return _page.get()
 

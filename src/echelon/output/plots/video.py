@@ -15,7 +15,7 @@ from echelon.core.types import Array
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import pen_of
-from echelon.output.plots.animation import Moving, moving_of
+from echelon.output.plots.animation import MovingScene, moving_of
 from echelon.output.plots.camera import Camera, camera_for
 from echelon.output.plots.space import Space, clipped_places, space_of
 
@@ -120,7 +120,7 @@ class _Film:
         self.ax.axis("off")
         draw_floor(self.ax, self.camera, self.space)
         self.cursors = _curves(self.figure, run)
-        self.moving: Moving = moving_of(self.ax, run, self.space, self.camera)
+        self.moving: MovingScene = moving_of(self.ax, run, self.space, self.camera)
 
     def pictures(self, times: Array) -> Iterator[bytes]:
         """Yield the pixels at each time."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from echelon.core.errors import Outcome
-from echelon.experiments.studies.compare import Comparison, Row
+from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
 from echelon.output.reports.run_report import say
@@ -82,7 +82,7 @@ def _followers(comparison: Comparison) -> Sequence[int]:
     return flown[0].followers if flown and len(flown[0].followers) <= _NAMED else ()
 
 
-def _errors(row: Row, named: bool) -> Iterator[str]:
+def _errors(row: ComparisonRow, named: bool) -> Iterator[str]:
     """Yield the cells of one method: whole-run errors, steady errors, settling time."""
     if row.flight is None or row.numbers is None:
         return
@@ -146,7 +146,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def _remarks(row: Row) -> Iterator[str]:
+def _remarks(row: ComparisonRow) -> Iterator[str]:
     """Yield what a row's numbers cannot say: why it did not fly, how it ended, its solver."""
     if row.flight is None:
         yield row.reason
@@ -199,11 +199,11 @@ def _of_those(some: bool, sentence: str) -> str:
     return f"Of those that settle, {sentence.replace('All ', 'all ', 1)}"
 
 
-def _effort(row: Row) -> float | None:
+def _effort(row: ComparisonRow) -> float | None:
     return row.effort
 
 
-def _lost(flown: Sequence[Row], stayed: Sequence[Row]) -> str:
+def _lost(flown: Sequence[ComparisonRow], stayed: Sequence[ComparisonRow]) -> str:
     lost = [row.label for row in flown if row not in stayed]
     if not lost:
         return f"All {len(flown)} methods bring every follower within 1 cm."
@@ -211,7 +211,7 @@ def _lost(flown: Sequence[Row], stayed: Sequence[Row]) -> str:
     return f"{_listed(lost)} {verb} not bring every follower within 1 cm."
 
 
-def _closest(rows: Sequence[Row]) -> str:
+def _closest(rows: Sequence[ComparisonRow]) -> str:
     """Tell who ends closest; errors at the level of rounding are a tie."""
     known = {row.label: row.steady for row in rows if row.steady is not None}
     if not known:
@@ -222,7 +222,9 @@ def _closest(rows: Sequence[Row]) -> str:
     return _best(rows, "ends closest", lambda row: row.steady, "m")
 
 
-def _best(rows: Sequence[Row], what: str, of: Callable[[Row], float | None], unit: str) -> str:
+def _best(
+    rows: Sequence[ComparisonRow], what: str, of: Callable[[ComparisonRow], float | None], unit: str
+) -> str:
     """Tell who has the least of a number, and how far the next is behind."""
     # Of NaN `>=` says no, and it would break the order.
     known = sorted(
@@ -237,7 +239,7 @@ def _best(rows: Sequence[Row], what: str, of: Callable[[Row], float | None], uni
     return text + ")."
 
 
-def _leader(rows: Sequence[Row]) -> str:
+def _leader(rows: Sequence[ComparisonRow]) -> str:
     known = {row.label: row.numbers.leader.rmse for row in rows if row.numbers is not None}
     values = {label: value for label, value in known.items() if value is not None}
     if not values:
@@ -252,7 +254,7 @@ def _leader(rows: Sequence[Row]) -> str:
     )
 
 
-def _cheapest(rows: Sequence[Row]) -> str:
+def _cheapest(rows: Sequence[ComparisonRow]) -> str:
     known = {row.label: row.flight.computing for row in rows if row.flight is not None}
     if len(known) < 2:
         return ""
@@ -286,7 +288,7 @@ def comparison_mapping(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _row_mapping(row: Row) -> dict[str, Any]:
+def _row_mapping(row: ComparisonRow) -> dict[str, Any]:
     if row.flight is None or row.numbers is None:
         return {"reason": row.reason}
     result, numbers = row.flight.result, row.numbers

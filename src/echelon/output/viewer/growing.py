@@ -90,7 +90,7 @@ def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
         OutputError: no port is free.
     """
 
-    class Watched(Handler):
+    class GrowingRun(Handler):
         """The page of this run, and its stretches by number."""
 
         def do_GET(self) -> None:
@@ -112,4 +112,4 @@ def serve_growing(run: Growing, port: int | None) -> ThreadingHTTPServer:
                 code = 205 if block is None else 200 if block else 204
                 self.send(block or b"", "application/octet-stream", code)
 
-    return serve(Watched, port)
+    return serve(GrowingRun, port)

@@ -7,7 +7,7 @@ from echelon.simulation.codegen.ir_blocks import SLOTS, TURN, Body, Plan, stride
 from echelon.simulation.codegen.kernel_text import program
 from echelon.simulation.codegen.lowering import lower
 from echelon.simulation.codegen.machine_code import Code, aligned, is_installed, vectors
-from echelon.simulation.codegen.scalar import Graph, Node, needed
+from echelon.simulation.codegen.scalar import Node, ScalarGraph, needed
 from echelon.simulation.codegen.tape import fed_widths, from_tape
 from echelon.simulation.codegen.traced_entries import Unsupported, nodes
 from echelon.simulation.codegen.uniform_values import shared
@@ -17,7 +17,7 @@ __all__ = [
     "TURN",
     "Body",
     "Code",
-    "Graph",
+    "ScalarGraph",
     "Node",
     "Plan",
     "Unsupported",

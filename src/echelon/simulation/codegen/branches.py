@@ -12,7 +12,7 @@ _MANY = 40
 
 
 @final
-class Arm:
+class Branch:
     """What only one side of the choices by one truth needs.
 
     Attributes:
@@ -32,7 +32,7 @@ def choices(results: Sequence[Node]) -> list[tuple[Node, bool]]:
     return [(arm.which, arm.side) for arm in arms(nodes, results)]
 
 
-def arms(nodes: list[Node], results: Sequence[Node]) -> list[Arm]:
+def arms(nodes: list[Node], results: Sequence[Node]) -> list[Branch]:
     """Return the arms that are worth a branch; none within another."""
     users: dict[Node, list[Node]] = {node: [] for node in nodes}
     for node in nodes:
@@ -45,7 +45,7 @@ def arms(nodes: list[Node], results: Sequence[Node]) -> list[Arm]:
         if node.op == "select" and not node.args[0].uniform:
             for side in (True, False):
                 choices.setdefault((node.args[0], side), []).append(node)
-    found, taken = list[Arm](), set[Node]()
+    found, taken = list[Branch](), set[Node]()
     # Those of the later choices hold those of the earlier ones, and are worth more.
     for (which, side), selects in sorted(choices.items(), key=lambda c: -c[1][0].number):
         arm = _exclusive(users, outside, which, side, selects)
@@ -53,20 +53,20 @@ def arms(nodes: list[Node], results: Sequence[Node]) -> list[Arm]:
         if len(arm) >= _MANY and not taken.intersection([*arm, *selects, which]):
             inside = set(arm)
             left = [n for n in arm if any(u not in inside for u in users[n])]
-            found.append(Arm(which, side, arm, left))
+            found.append(Branch(which, side, arm, left))
             taken.update(arm)
     return _without_circles(nodes, found)
 
 
-def _without_circles(nodes: list[Node], found: list[Arm]) -> list[Arm]:
+def _without_circles(nodes: list[Node], found: list[Branch]) -> list[Branch]:
     """Return the arms that can be written in one piece each.
 
     One that needs the result of a choice which itself reads the arm cannot; its nodes then stand
     among the others.
     """
     while found:
-        owner: dict[Node, Node | Arm] = {node: arm for arm in found for node in arm.nodes}
-        needs: dict[Node | Arm, set[Node | Arm]] = {
+        owner: dict[Node, Node | Branch] = {node: arm for arm in found for node in arm.nodes}
+        needs: dict[Node | Branch, set[Node | Branch]] = {
             arm: {owner.get(arm.which, arm.which)} for arm in found
         }
         for node in nodes:

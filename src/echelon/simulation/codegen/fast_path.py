@@ -10,12 +10,12 @@ usual. What both make is the same to the bit.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
-from echelon.simulation.codegen.scalar import Graph, Node, needed
+from echelon.simulation.codegen.scalar import Node, ScalarGraph, needed
 
 Instead: TypeAlias = "Callable[[Node, Sequence[Node]], Node | float | bool | None]"
 
 
-class Usual(NamedTuple):
+class FastPath(NamedTuple):
     """What usually is.
 
     Attributes:
@@ -32,7 +32,7 @@ def whole(results: Sequence[Node]) -> Mapping[Node, Node]:
     return rewritten(results, lambda node, args: True if node.op == "rare" else None)
 
 
-def usual(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> Usual:
+def usual(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
     """Return what nodes are where nothing happens that is rare.
 
     Args:
@@ -60,7 +60,7 @@ def usual(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> Usua
 
     made = rewritten(results, assume)
     levels = [[n for d, n in found if d == depth] for depth in sorted({d for d, _ in found})]
-    return Usual(made, [list(dict.fromkeys(level)) for level in levels])
+    return FastPath(made, [list(dict.fromkeys(level)) for level in levels])
 
 
 def rewritten(results: Sequence[Node], instead: Instead) -> dict[Node, Node]:
@@ -79,5 +79,5 @@ def rewritten(results: Sequence[Node], instead: Instead) -> dict[Node, Node]:
     return made
 
 
-def _node(graph: Graph, entry: Node | float | bool) -> Node:
+def _node(graph: ScalarGraph, entry: Node | float | bool) -> Node:
     return entry if isinstance(entry, Node) else graph.constant(entry)

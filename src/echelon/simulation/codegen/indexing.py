@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from echelon.core.jaxpr import Algebra, apply, each, walk
-from echelon.simulation.codegen.scalar import Graph, Node
+from echelon.simulation.codegen.scalar import Node, ScalarGraph
 from echelon.simulation.codegen.traced_entries import (
     LARGEST,
     LONGEST,
@@ -26,7 +26,7 @@ from echelon.simulation.codegen.traced_entries import (
 
 
 def placed(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return what is read or written at places that agents differ in: each place is tried."""
     rows, ends = _rows(equation, operands), _ends(equation, operands)
@@ -79,7 +79,7 @@ def _at(
     return apply(equation, known, algebra)[0]
 
 
-def _is(graph: Graph, entries: tuple[Any, ...], place: tuple[int, ...]) -> Any:
+def _is(graph: ScalarGraph, entries: tuple[Any, ...], place: tuple[int, ...]) -> Any:
     """Tell whether numbers are those of a place."""
     same = [graph.make("eq", entry(e), float(p)) for e, p in zip(entries, place, strict=True)]
     return all_of(graph, same)
@@ -117,7 +117,7 @@ def _ends(equation: Any, operands: list[np.ndarray]) -> list[int]:
     return [shape[k] - 1 for k in numbers.scatter_dims_to_operand_dims]
 
 
-def _clipped(graph: Graph, numbers: np.ndarray, end: int) -> np.ndarray:
+def _clipped(graph: ScalarGraph, numbers: np.ndarray, end: int) -> np.ndarray:
     def one(e: Any) -> Any:
         return graph.make("min", graph.make("max", entry(e), 0.0), float(end))
 
@@ -134,7 +134,7 @@ def _spread(equation: Any, there: np.ndarray, axes: int) -> np.ndarray:
 # ---- cases ---------------------------------------------------------------------------------------
 
 
-def one_of(graph: Graph, which: Any, *cases: Any) -> Any:
+def one_of(graph: ScalarGraph, which: Any, *cases: Any) -> Any:
     """Return the case whose number is chosen; JAX numbers them from zero, and clips."""
     if not isinstance(which, Node):
         return cases[min(max(int(which), 0), len(cases) - 1)]
@@ -147,7 +147,7 @@ def one_of(graph: Graph, which: Any, *cases: Any) -> Any:
 
 
 def cond(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return what all branches make, entry by entry that of the one that is taken."""
     which, *rest = operands
@@ -167,12 +167,12 @@ def cond(
 # ---- order ---------------------------------------------------------------------------------------
 
 
-def less(graph: Graph, a: Any, b: Any) -> Any:
+def less(graph: ScalarGraph, a: Any, b: Any) -> Any:
     """Return whether one number stands before another, where what is no number stands last."""
     return graph.make("or", graph.make("lt", entry(a), entry(b)), _is_lost(graph, b, a))
 
 
-def _is_lost(graph: Graph, a: Any, b: Any) -> Any:
+def _is_lost(graph: ScalarGraph, a: Any, b: Any) -> Any:
     """Tell whether the first is no number, and the second is one."""
     lost, there = (graph.make(op, entry(x), entry(x)) for op, x in (("ne", a), ("eq", b)))
     return graph.make("and", lost, there)
@@ -182,7 +182,7 @@ def extreme(before: Callable[[Any, Any], tuple[Any, Any]]) -> Written:
     """Return the rule of the place of the first largest or smallest; what is no number wins."""
 
     def find(
-        graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+        graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
     ) -> list[np.ndarray]:
         [x] = operands
         [axis] = equation.params["axes"]
@@ -209,7 +209,7 @@ def extreme(before: Callable[[Any, Any], tuple[Any, Any]]) -> Written:
 
 
 def ordered(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return arrays in the order of the first of them, by exchanges of neighbours."""
     axis, n = equation.params["dimension"], operands[0].shape[equation.params["dimension"]]
@@ -232,7 +232,7 @@ def ordered(
 
 
 def converted(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return entries under another type; a whole number is a number without a fraction."""
     [x], [given] = operands, equation.invars
@@ -250,7 +250,7 @@ def converted(
     return [each(one, x)]
 
 
-def _whole(graph: Graph, e: Any, to: np.dtype, of: np.dtype, at: str) -> Any:
+def _whole(graph: ScalarGraph, e: Any, to: np.dtype, of: np.dtype, at: str) -> Any:
     """Return a number as a whole one, as XLA makes it: towards 0, nothing beyond, 0 of none."""
     if of.kind == "f":
         down, up = (graph.make(op, entry(e)) for op in ("floor", "ceil"))
@@ -266,7 +266,7 @@ def _whole(graph: Graph, e: Any, to: np.dtype, of: np.dtype, at: str) -> Any:
 
 
 def divided(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return quotients; those of whole numbers are whole, towards 0."""
     whole = np.dtype(equation.outvars[0].aval.dtype).kind in "iu"
@@ -285,7 +285,7 @@ def logical(name: str) -> Written:
     """Return the rule of an operation on truths; on the bits of whole numbers there is none."""
 
     def make(
-        graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+        graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
     ) -> list[np.ndarray]:
         if np.dtype(equation.outvars[0].aval.dtype).kind != "b":
             raise Unsupported(f"`{name}` of whole numbers{where(equation)}")

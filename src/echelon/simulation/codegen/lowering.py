@@ -18,7 +18,7 @@ from echelon.core.numerics import precision
 from echelon.core.trace import in_short
 from echelon.simulation.codegen import elementary
 from echelon.simulation.codegen.indexing import PICKED, RUNNING, less, one_of
-from echelon.simulation.codegen.scalar import Graph, Node
+from echelon.simulation.codegen.scalar import Node, ScalarGraph
 from echelon.simulation.codegen.small_linear_systems import cholesky, factored, solve, triangular
 from echelon.simulation.codegen.traced_entries import (
     LONGEST,
@@ -32,7 +32,9 @@ from echelon.simulation.codegen.traced_entries import (
 )
 
 
-def lower(function: Callable[..., Any], graph: Graph, arguments: Sequence[Any]) -> list[np.ndarray]:
+def lower(
+    function: Callable[..., Any], graph: ScalarGraph, arguments: Sequence[Any]
+) -> list[np.ndarray]:
     """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
 
     Args:
@@ -75,7 +77,7 @@ def _within(equation: Any) -> Iterator[None]:
         raise Unsupported(f"{error}{where(equation)}") from None
 
 
-def _algebra(graph: Graph) -> Algebra:
+def _algebra(graph: ScalarGraph) -> Algebra:
     def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
         name = equation.primitive.name
         if name in _WRITTEN:
@@ -88,7 +90,7 @@ def _algebra(graph: Graph) -> Algebra:
     return algebra
 
 
-def _rules(graph: Graph) -> dict[str, Rule]:
+def _rules(graph: ScalarGraph) -> dict[str, Rule]:
     def op(name: str) -> Callable[..., Node]:
         return lambda *args: graph.make(name, *map(entry, args))
 
@@ -138,7 +140,7 @@ _ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "logi
 _ELEMENTARY += ("cbrt", "rsqrt", "sign")
 
 
-def _round(graph: Graph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def _round(graph: ScalarGraph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     to_even = int(params["rounding_method"]) == 1
     if to_even:
         return each(lambda e: graph.make("rint", e), x)
@@ -149,7 +151,7 @@ def _round(graph: Graph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray
 
 
 def _scan(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return what a loop of known length makes, written out."""
     params, body = equation.params, equation.params["jaxpr"]
@@ -169,7 +171,7 @@ def _scan(
 
 
 def _while(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return what a loop makes whose end does not depend on the agents."""
     params = equation.params

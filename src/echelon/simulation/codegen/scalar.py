@@ -88,7 +88,7 @@ class Node:
     __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
 
     def __init__(
-        self, graph: "Graph", op: str, args: tuple["Node", ...], value: Any, uniform: bool
+        self, graph: "ScalarGraph", op: str, args: tuple["Node", ...], value: Any, uniform: bool
     ) -> None:
         self.graph, self.number, self.op = graph, len(graph.nodes), op
         self.args, self.value, self.uniform = args, value, uniform
@@ -137,7 +137,7 @@ def _is_at_least_0(op: str, args: tuple[Node, ...], value: Any) -> bool:
 
 
 @final
-class Graph:
+class ScalarGraph:
     """Nodes, each once.
 
     Args:

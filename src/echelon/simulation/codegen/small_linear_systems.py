@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from echelon.core.jaxpr import Algebra, walk
-from echelon.simulation.codegen.scalar import Graph
+from echelon.simulation.codegen.scalar import ScalarGraph
 from echelon.simulation.codegen.traced_entries import (
     LARGEST,
     Missing,
@@ -19,7 +19,7 @@ from echelon.simulation.codegen.traced_entries import (
 
 
 def solve(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the solution of linear equations, whose matrix is what they do to unit vectors."""
     jaxprs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
@@ -54,7 +54,7 @@ def _parts(rows: np.ndarray) -> list[list[int]]:
     return [np.flatnonzero(label == k).tolist() for k in range(count)]
 
 
-def _eliminate(graph: Graph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _eliminate(graph: ScalarGraph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solution by Gauss's method."""
     both, n = np.column_stack([matrix, right]), len(matrix)
     for k in range(n):
@@ -65,7 +65,7 @@ def _eliminate(graph: Graph, matrix: np.ndarray, right: np.ndarray) -> np.ndarra
     return _by_triangle(both[:, :n], both[:, n], lower=False, unit=False)
 
 
-def _pivot(graph: Graph, rows: np.ndarray, k: int, n: int) -> Any:
+def _pivot(graph: ScalarGraph, rows: np.ndarray, k: int, n: int) -> Any:
     """Exchange row k for that of the largest entry below, and return which that was."""
     largest, place = graph.make("abs", rows[k, k]), graph.constant(float(k))
     for i in range(k + 1, n):
@@ -90,7 +90,7 @@ def _by_triangle(A: np.ndarray, right: np.ndarray, lower: bool, unit: bool) -> n
     return b
 
 
-def cholesky(graph: Graph, params: Mapping[str, Any], matrix: np.ndarray) -> np.ndarray:
+def cholesky(graph: ScalarGraph, params: Mapping[str, Any], matrix: np.ndarray) -> np.ndarray:
     """Return L with L L' a matrix."""
     n = matrix.shape[-1]
     if matrix.ndim != 2 or n > LARGEST:
@@ -106,7 +106,7 @@ def cholesky(graph: Graph, params: Mapping[str, Any], matrix: np.ndarray) -> np.
 
 
 def triangular(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the solution X of A X = B, or of X A = B, for a triangle A."""
     A, B = (np.asarray(x, object) for x in operands)
@@ -125,7 +125,7 @@ def triangular(
 
 
 def factored(
-    graph: Graph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
+    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
 ) -> list[np.ndarray]:
     """Return L and U in one matrix, the row that each step brought up, and the order of the rows.
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from echelon.core.errors import EchelonError
 from echelon.core.jaxpr import Algebra
-from echelon.simulation.codegen.scalar import Entry, Graph, Node
+from echelon.simulation.codegen.scalar import Entry, Node, ScalarGraph
 
 LONGEST = 64
 """Rounds of a loop that are written out, and places of a table that are looked through."""
 LARGEST = 6
 """Unknowns of a system of equations that is solved, and entries that are sorted."""
 
-Written: TypeAlias = "Callable[[Graph, Algebra, Any, list[np.ndarray]], list[np.ndarray]]"
+Written: TypeAlias = "Callable[[ScalarGraph, Algebra, Any, list[np.ndarray]], list[np.ndarray]]"
 """(graph, algebra, equation, operands) -> results: a primitive that needs more than parameters."""
 
 
@@ -71,27 +71,27 @@ def entry(value: Any) -> Entry:
     return value if isinstance(value, Node) else _plain(value)
 
 
-def node(graph: Graph, value: Any) -> Node:
+def node(graph: ScalarGraph, value: Any) -> Node:
     """Return an entry as a node."""
     return value if isinstance(value, Node) else graph.constant(_plain(value))
 
 
-def nodes(graph: Graph, entries: np.ndarray) -> list[Node]:
+def nodes(graph: ScalarGraph, entries: np.ndarray) -> list[Node]:
     """Return the entries of an array as nodes, row by row."""
     return [node(graph, e) for e in entries.flat]
 
 
-def number(graph: Graph, value: Any) -> Any:
+def number(graph: ScalarGraph, value: Any) -> Any:
     """Return an entry as a number: 1 for true."""
     return graph.make("select", entry(value), 1.0, 0.0) if is_truth(value) else value
 
 
-def chosen(graph: Graph, which: Any, a: Any, b: Any) -> Any:
+def chosen(graph: ScalarGraph, which: Any, a: Any, b: Any) -> Any:
     """Return one entry where a truth holds, else another."""
     return graph.make("select", entry(which), entry(a), entry(b))
 
 
-def all_of(graph: Graph, truths: list[Any]) -> Any:
+def all_of(graph: ScalarGraph, truths: list[Any]) -> Any:
     """Return whether all truths hold."""
     first: Any = True
     return functools.reduce(lambda a, b: graph.make("and", entry(a), entry(b)), truths, first)

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import final
 
-from echelon.simulation.codegen.branches import Arm, arms
+from echelon.simulation.codegen.branches import Branch, arms
 from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.scheduling import lateness, one_by_one
 
@@ -350,7 +350,7 @@ class Emitter:
         owned = {node: arm for arm in arms(nodes, results) for node in arm.nodes}
         self._write_in_order(nodes, owned)
 
-    def _write_in_order(self, nodes: Iterable[Node], owned: Mapping[Node, Arm]) -> None:
+    def _write_in_order(self, nodes: Iterable[Node], owned: Mapping[Node, Branch]) -> None:
         """Write nodes that no arm owns; before what reads of an arm, the arm behind its branch."""
         for node in nodes:
             if node in owned or node in self.values:
@@ -363,7 +363,7 @@ class Emitter:
                     self._branch(arm)
             self._write([node])
 
-    def _branch(self, arm: Arm) -> None:
+    def _branch(self, arm: Branch) -> None:
         """Write an arm behind a branch, and what it leaves as values that hold after it."""
         w, which = self.writer, self.value(arm.which)
         truths = f"<{w.lanes} x i1>"

@@ -17,7 +17,7 @@ import numpy as np
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.engine.grid import Grid
+from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
@@ -27,7 +27,7 @@ from echelon.simulation.engine.record import Record, Recorder, Stretch, complete
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
 from echelon.simulation.native.kernel_cache import KERNELS
-from echelon.simulation.native.program_key import Families
+from echelon.simulation.native.program_key import ProgramKeys
 from echelon.simulation.native.stepper import NativeStepper, beyond
 from echelon.simulation.native.threads import processors
 from echelon.simulation.step.drive import Chunk, Stepper
@@ -42,7 +42,7 @@ _SMALL = 64
 """Agents of a formation that is stepped beside others though they do not fill a vector."""
 
 
-class _Case(NamedTuple):
+class _SharedRun(NamedTuple):
     """What runs share that differ in the seed alone."""
 
     prepared: Prepared
@@ -51,17 +51,17 @@ class _Case(NamedTuple):
     family: Hashable
 
 
-class _Job(NamedTuple):
+class _BatchJob(NamedTuple):
     """A run with all that its steps rest on."""
 
     place: int
-    case: _Case
+    case: _SharedRun
     prepared: Prepared
     loop: Loop
 
 
 @final
-class Fleet:
+class Batch:
     """Flies many runs; what is prepared and compiled for one is there for the next.
 
     Args:
@@ -73,8 +73,8 @@ class Fleet:
         """Begin with nothing prepared."""
         self.threads = threads or processors()
         self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
-        self.kinds = Families()
-        self._cases: WeakKeyDictionary[Parts, dict[Settings, _Case]] = WeakKeyDictionary()
+        self.kinds = ProgramKeys()
+        self._cases: WeakKeyDictionary[Parts, dict[Settings, _SharedRun]] = WeakKeyDictionary()
 
     def fly(self, runs: Sequence[Run], told: Told | None = None) -> Iterator[Result | EchelonError]:
         """Yield what each run comes to, in their order, as `simulate` would have it.
@@ -91,9 +91,9 @@ class Fleet:
 
     # ---- what belongs together ----
 
-    def _families(self, runs: Sequence[Run]) -> list[list[_Job]]:
+    def _families(self, runs: Sequence[Run]) -> list[list[_BatchJob]]:
         """Return the runs that can be stepped together, family by family."""
-        cases: dict[int, tuple[_Case, list[int]]] = {}
+        cases: dict[int, tuple[_SharedRun, list[int]]] = {}
         for place, (parts, settings) in enumerate(runs):
             try:
                 case = self._case(parts, settings)
@@ -101,13 +101,13 @@ class Fleet:
                 continue  # `simulate` says it again
             if case.loop is not None and settings.devices == 1:
                 cases.setdefault(id(case), (case, []))[1].append(place)
-        families: dict[Hashable, list[_Job]] = {}
+        families: dict[Hashable, list[_BatchJob]] = {}
         for case, places in cases.values():
             jobs = _jobs(case, places, [runs[place][1] for place in places])
             families.setdefault(case.family, []).extend(jobs)
         return [jobs for jobs in families.values() if jobs and _fit(jobs)]
 
-    def _case(self, parts: Parts, settings: Settings) -> _Case:
+    def _case(self, parts: Parts, settings: Settings) -> _SharedRun:
         known, alike = self._cases.setdefault(parts, {}), settings._replace(seed=0)
         if alike not in known:
             prepared = prepare(parts, settings, to_store=True)
@@ -117,12 +117,14 @@ class Fleet:
                 if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
                     family = self.kinds.of(loop, alike)
-                known[alike] = _Case(prepared, Starts(prepared.parts), loop, family)
+                known[alike] = _SharedRun(prepared, Starts(prepared.parts), loop, family)
         return known[alike]
 
     # ---- flights ----
 
-    def _together(self, jobs: list[_Job], told: Told | None) -> dict[int, Result | EchelonError]:
+    def _together(
+        self, jobs: list[_BatchJob], told: Told | None
+    ) -> dict[int, Result | EchelonError]:
         """Return what a family comes to; nothing where its runs cannot go together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
@@ -136,7 +138,9 @@ class Fleet:
                     lambda: NativeStepper(loops, states, bits, None, *pool),
                     lambda why: JaxFormations(loops, states, why),
                 )
-                record = _Flock(len(jobs), Grid(settings, stepper.longest), jobs[0].prepared, bits)
+                record = _BatchRecord(
+                    len(jobs), ChunkGrid(settings, stepper.longest), jobs[0].prepared, bits
+                )
                 record.fly(stepper, told)
             except (SimulationError, TypeError):
                 # A model that wants its numbers as numbers is traced for each of them.
@@ -148,10 +152,10 @@ class Fleet:
 
 
 @final
-class _Flock:
+class _BatchRecord:
     """What is kept of formations that fly together."""
 
-    def __init__(self, count: int, grid: Grid, first: Prepared, bits: int) -> None:
+    def __init__(self, count: int, grid: ChunkGrid, first: Prepared, bits: int) -> None:
         self.count, self.grid, self.first, self.bits = count, grid, first, bits
         self.times, self._states = list[Array](), list[Array]()
         self._inputs, self._references = list[Array](), list[Array]()
@@ -247,7 +251,7 @@ def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | Eche
         return error
 
 
-def _jobs(case: _Case, places: Sequence[int], chosen: Sequence[Settings]) -> list[_Job]:
+def _jobs(case: _SharedRun, places: Sequence[int], chosen: Sequence[Settings]) -> list[_BatchJob]:
     """Return the runs of a case whose starts the laws take."""
     parts = case.prepared.parts
     assert isinstance(parts.drive, Laws)
@@ -261,7 +265,7 @@ def _jobs(case: _Case, places: Sequence[int], chosen: Sequence[Settings]) -> lis
         return [_job(case, *its) for k, its in enumerate(each) if k not in refused]
 
 
-def _job(case: _Case, place: int, settings: Settings, states: Array) -> _Job:
+def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _BatchJob:
     prepared, loop = case.prepared, case.loop
     assert loop is not None
     problem = prepared.problem._replace(settings=settings, states=states)
@@ -269,10 +273,10 @@ def _job(case: _Case, place: int, settings: Settings, states: Array) -> _Job:
         motion = Motion.of(problem.model, prepared.parts.world, settings)
         problem = problem._replace(motion=motion)
         loop = eqx.tree_at(lambda x: x.motion, loop, motion)
-    return _Job(place, case, prepared._replace(problem=problem), loop)
+    return _BatchJob(place, case, prepared._replace(problem=problem), loop)
 
 
-def _fit(jobs: list[_Job]) -> bool:
+def _fit(jobs: list[_BatchJob]) -> bool:
     """Tell whether runs are worth stepping together: long enough, and filling their vectors."""
     problem = jobs[0].prepared.problem
     agents, settings = len(problem.states), problem.settings

@@ -22,7 +22,7 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.native.backward import Backward, Wants
-from echelon.simulation.native.varying import Own, alike, bare
+from echelon.simulation.native.varying import VaryingNumbers, alike, bare
 from echelon.simulation.step.drive import Drive, Problem
 from echelon.simulation.step.loop import Loop, Moment, assemble, begin, control, step
 from echelon.simulation.step.meter import Sums, distance_of, reference_at
@@ -89,7 +89,7 @@ def gradient(parts: Parts, settings: Settings, cost: Cost, wrt: Sequence[str]) -
     return found
 
 
-class Run(NamedTuple):
+class DifferentiableRun(NamedTuple):
     """A loop, what the cost is differentiated by, the starts (N, n), what the leaders follow."""
 
     loop: Loop
@@ -139,7 +139,7 @@ class _Ready:
         values = _values(self.problem, self.drive, wrt)
         loop = assemble(self.problem, self.drive.leader, self.drive.follower)
         reference = sample_reference(prepared, 0, settings.steps)
-        self.run = Run(loop, values, self.problem.states, reference)
+        self.run = DifferentiableRun(loop, values, self.problem.states, reference)
         self.gain, self._native = identify(parts.drive.gain), None
 
     def turn(self, parts: Parts) -> bool:
@@ -193,7 +193,7 @@ class Native:
         steps: how many.
     """
 
-    def __init__(self, run: Run, steps: int) -> None:
+    def __init__(self, run: DifferentiableRun, steps: int) -> None:
         """Find the numbers of the gain along which there are slopes."""
         self.run, self.steps = run, steps
         names = [part for name in run.values for part in _PARTS.get(name, ())]
@@ -201,7 +201,7 @@ class Native:
         self._sums = tuple(np.shape(part) for part in run.loop.meter.nothing())
         self._ways = dict[bool, Backward | Unsupported]()
 
-    def turn(self, run: Run) -> bool:
+    def turn(self, run: DifferentiableRun) -> bool:
         """Take another gain; tell whether its numbers alone are others."""
         if not self._own.covers(run.loop):
             return False
@@ -258,7 +258,7 @@ def _is_spaced(cost: Cost, shapes: tuple[tuple[int, ...], ...]) -> bool:
     return Sums(*read_by(cost, Sums(*map(np.zeros, shapes)))).spacing
 
 
-def _own(loop: Loop, names: Sequence[str]) -> tuple[Own, list[str]]:
+def _own(loop: Loop, names: Sequence[str]) -> tuple[VaryingNumbers, list[str]]:
     """Return the numbers of the followers' gain under some names, and those in their order."""
 
     def places(loop: Loop) -> list[Any]:
@@ -266,11 +266,11 @@ def _own(loop: Loop, names: Sequence[str]) -> tuple[Own, list[str]]:
         return [getattr(law.gain, name) for name in names]
 
     if not names:
-        return Own([loop]), []
+        return VaryingNumbers([loop]), []
     # Twice as much is another number wherever there is one; zeros stay, and fold.
     unlike = eqx.tree_at(places, loop, [2.0 * np.asarray(part) for part in places(loop)])
     marked = jax.tree.leaves(eqx.tree_at(places, bare(loop), list(names)))
-    return Own([loop], unlike), [leaf for leaf in marked if isinstance(leaf, str)]
+    return VaryingNumbers([loop], unlike), [leaf for leaf in marked if isinstance(leaf, str)]
 
 
 @program
@@ -285,7 +285,7 @@ def _slopes_of(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
 # ---- by JAX --------------------------------------------------------------------------------------
 
 
-def by_jax(run: Run, steps: int, cost: Cost, instead: str = "") -> Gradient:
+def by_jax(run: DifferentiableRun, steps: int, cost: Cost, instead: str = "") -> Gradient:
     """Return the gradient by JAX's reverse mode over steps of JAX, `instead` of native code."""
     (value, sums), slopes = _differentiate(*run, steps, cost)
     found = {name: _symmetric(name, np.asarray(slope)) for name, slope in slopes.items()}

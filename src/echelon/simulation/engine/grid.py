@@ -12,7 +12,7 @@ _CHUNKS = 100
 
 
 @final
-class Grid:
+class ChunkGrid:
     """How a run is cut into chunks, each of some points with steps after them.
 
     By its settings alone and never by the clock: sums are made chunk by chunk, and another cut

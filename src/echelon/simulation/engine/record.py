@@ -7,7 +7,7 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array
-from echelon.simulation.engine.grid import Grid
+from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.step.drive import Chunk, Problem, numbers
 from echelon.simulation.step.meter import ALWAYS, Meter, Sums, outside
 
@@ -76,7 +76,7 @@ class Recorder:
     """Collects the stretches of a run, after those that were computed before."""
 
     def __init__(
-        self, problem: Problem, grid: Grid, nothing: Sums, before: Sequence[Stretch] = ()
+        self, problem: Problem, grid: ChunkGrid, nothing: Sums, before: Sequence[Stretch] = ()
     ) -> None:
         """Begin; `nothing` are the sums of no step."""
         self.problem, self.grid, self.stretches = problem, grid, list(before)

@@ -12,7 +12,7 @@ import numpy as np
 from echelon.core.errors import Outcome, SimulationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.engine.grid import Grid
+from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.record import Record, Recorder, Stretch, join
@@ -24,7 +24,7 @@ from echelon.simulation.step.solver_stats import SolverStats
 
 
 @final
-class Underway:
+class RunSoFar:
     """A run on its way, as it is when it tells of itself.
 
     Attributes:
@@ -55,7 +55,7 @@ class Underway:
         return dataclasses.replace(found, message=told) if under else found
 
 
-Progress: TypeAlias = Callable[[Underway], None]
+Progress: TypeAlias = Callable[[RunSoFar], None]
 """Called between chunks with the run on its way."""
 Keep: TypeAlias = Callable[[Stretch], None]
 """Called with every stretch of a run while it lasts, each following the one before.
@@ -129,7 +129,7 @@ def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -
 
 def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Stretch]) -> Recorder:
     problem = prepared.problem
-    grid = Grid(problem.settings, stepper.longest)
+    grid = ChunkGrid(problem.settings, stepper.longest)
     return Recorder(problem, grid, on_host(problem.meter.nothing(np)), before)
 
 
@@ -185,7 +185,7 @@ class _Flight:
                     if time.perf_counter() - self.gave > _SECONDS:
                         self._give(keep)
                     if progress is not None:
-                        progress(Underway(self.prepared, self.recorder, self.stepper))
+                        progress(RunSoFar(self.prepared, self.recorder, self.stepper))
             self._give(keep)
         except Stopped as reason:
             self.recorder.stop(f"The run was stopped, since {reason}")

@@ -13,12 +13,12 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.simulation.codegen import Body, Graph, Node, Unsupported, lower, nodes, shortened
-from echelon.simulation.native.varying import Own
+from echelon.simulation.codegen import Body, Node, ScalarGraph, Unsupported, lower, nodes, shortened
+from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.loop import Loop, act_alone, tell, what_limits_did
 
 
-class Rows(NamedTuple):
+class BlockRows(NamedTuple):
     """Where the numbers of an agent lie in its block; each a range of rows.
 
     Attributes:
@@ -55,7 +55,7 @@ class Rows(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop, own: int = 0) -> "Rows":
+    def of(cls, loop: Loop, own: int = 0) -> "BlockRows":
         """Return the rows of a loop of which so many numbers differ between formations.
 
         Raises:
@@ -122,7 +122,7 @@ def _said(loop: Loop, law: Law, x: Any, offset: Any, memory: Memory) -> Any:
     return jnp.zeros(0, x.dtype) if signal is None else signal
 
 
-class Known(NamedTuple):
+class StepInputs(NamedTuple):
     """What an agent's step rests on, entry by entry."""
 
     t: Any
@@ -140,7 +140,7 @@ class Known(NamedTuple):
     before: Any
 
 
-class Done(NamedTuple):
+class StepOutputs(NamedTuple):
     """What it comes to."""
 
     state: Any
@@ -160,12 +160,12 @@ class Done(NamedTuple):
     saying: Any
 
 
-def agent_step(loop: Loop, leads: bool) -> Callable[[Known], Done]:
+def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
     """Return what a leader or another agent does in a step, as a function for JAX."""
     law = loop.leader if leads else loop.follower
     model, motion, meter = loop.model, loop.motion, loop.meter
 
-    def act(known: Known) -> Done:
+    def act(known: StepInputs) -> StepOutputs:
         x, offset = known.x, known.offset
         view = LocalView(known.t, x, offset, known.z, known.told, motion.dt)
         asked, u, memory, told = act_alone(loop, law, view, known.memory, leads)
@@ -175,7 +175,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[Known], Done]:
         if known.wanted is not None:
             tracking, outputs = meter.of_leader(known.steady, x, offset, known.wanted)
         state = motion.move(x, u, known.push, known.noise)
-        return Done(
+        return StepOutputs(
             state=state,
             memory=memory,
             cut=cut,
@@ -197,7 +197,12 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[Known], Done]:
 
 
 def body_of(
-    own: Own, bits: int, rows: Rows, leads: bool, follows: bool, tabled: bool = False
+    own: VaryingNumbers,
+    bits: int,
+    rows: BlockRows,
+    leads: bool,
+    follows: bool,
+    tabled: bool = False,
 ) -> Body:
     """Return what the leaders or all others do in a step.
 
@@ -212,16 +217,16 @@ def body_of(
     Raises:
         Unsupported: the law or the model uses what has no scalar operations.
     """
-    graph, loop = Graph(bits), own.loop
+    graph, loop = ScalarGraph(bits), own.loop
     law = loop.leader if leads else loop.follower
     known = known_of(loop, graph, rows, law, leads, follows)
 
-    def act(leaves: list[Any], known: Known) -> Done:
+    def act(leaves: list[Any], known: StepInputs) -> StepOutputs:
         return agent_step(own.filled(leaves), leads)(known)
 
     found = lower(act, graph, [own_leaves(own, graph, rows, follows, tabled), known])
-    shapes = jax.tree.structure(Done(*[0] * 15)._replace(memory=law.init()))
-    done: Done = shapes.unflatten([nodes(graph, part) for part in found])
+    shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
+    done: StepOutputs = shapes.unflatten([nodes(graph, part) for part in found])
     remembered = jax.tree.leaves(done.memory, is_leaf=lambda part: isinstance(part, list))
     stores = {"state": done.state, "cut": done.cut, "memory": sum(remembered, start=[])}
     if leads or loop.levels is not None:
@@ -244,7 +249,7 @@ def body_of(
     return body.become(shortened(body.all()))
 
 
-def _parted(known: Known, twice: list[Node]) -> list[Node]:
+def _parted(known: StepInputs, twice: list[Node]) -> list[Node]:
     """Return a number of all steps and of the steady window as one before and one in it.
 
     Only one of the two is then added to at a step.
@@ -253,14 +258,16 @@ def _parted(known: Known, twice: list[Node]) -> list[Node]:
     return [all_.graph.make("select", known.steady[()], 0.0, all_), steady]
 
 
-def own_leaves(own: Own, graph: Graph, rows: Rows, follows: bool, tabled: bool) -> list[np.ndarray]:
+def own_leaves(
+    own: VaryingNumbers, graph: ScalarGraph, rows: BlockRows, follows: bool, tabled: bool
+) -> list[np.ndarray]:
     """Return the leaves of a loop in which numbers are its own: in rows, or in the table."""
     begin = len(rows.state) if follows else 0
     places = range(begin, begin + own.count) if tabled else rows.own
     return own.leaves(leaves_of(graph, "table" if tabled else "row", places, tabled))
 
 
-def _difference(loop: Loop, graph: Graph, states: int, signals: int) -> list[Node]:
+def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> list[Node]:
     """Return the differences of what neighbours read: of states by the model, of signals plain."""
     # Of the model as it is: how far two states are apart is the same for all formations.
     own, their = (leaves_of(graph, kind, range(states + signals)) for kind in ("own", "their"))
@@ -269,7 +276,9 @@ def _difference(loop: Loop, graph: Graph, states: int, signals: int) -> list[Nod
     return [*nodes(graph, found), *(graph.make("sub", a, b) for a, b in plain)]
 
 
-def known_of(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follows: bool) -> Known:
+def known_of(
+    loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
+) -> StepInputs:
     """Return what a step rests on as leaves of a graph."""
     n, signals = len(rows.state), signals_of(loop)
 
@@ -278,7 +287,7 @@ def known_of(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follow
 
     x, offset, size = row(rows.state), row(rows.offset), memory_size(law)
     late = graph.make("ne", graph.leaf("steady", uniform=True), 0.0)
-    return Known(
+    return StepInputs(
         t=single(graph.leaf("time", uniform=True)),
         step=single(graph.leaf("step", uniform=True)),
         steady=single(late),
@@ -298,7 +307,9 @@ def known_of(loop: Loop, graph: Graph, rows: Rows, law: Law, leads: bool, follow
     )
 
 
-def leaves_of(graph: Graph, kind: str, places: Sequence[int], uniform: bool = False) -> np.ndarray:
+def leaves_of(
+    graph: ScalarGraph, kind: str, places: Sequence[int], uniform: bool = False
+) -> np.ndarray:
     """Return leaves of one kind, a number each."""
     entries = np.empty(len(places), object)
     entries[:] = [graph.leaf(kind, place, uniform=uniform) for place in places]
@@ -320,7 +331,7 @@ def shaped(entries: np.ndarray, like: Memory) -> Memory:
     return tree.unflatten([entries[a:b].reshape(np.shape(leaf)) for leaf, a, b in parts])
 
 
-def _placed(rows: Rows, named: dict[str, list[Node]]) -> dict[int, Node]:
+def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:
     """Return row -> node for the entries of each name."""
     return {
         row: node

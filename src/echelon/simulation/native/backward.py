@@ -15,8 +15,8 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.simulation.codegen import SLOTS, Body, Unsupported, aligned, fed_widths
-from echelon.simulation.native.agent_step import Rows, signals_of
-from echelon.simulation.native.blocks import Swarm
+from echelon.simulation.native.agent_step import BlockRows, signals_of
+from echelon.simulation.native.blocks import SwarmBlocks
 from echelon.simulation.native.kernel_cache import (
     KERNELS,
     LANES,
@@ -28,14 +28,20 @@ from echelon.simulation.native.kernel_cache import (
 )
 from echelon.simulation.native.schedule import step_by_step
 from echelon.simulation.native.stepper import STEPS, NativeStepper, any_beyond
-from echelon.simulation.native.transpose import Felt, Pulled, Transpose, heard_by, lean
+from echelon.simulation.native.transpose import (
+    CotangentRows,
+    Transpose,
+    TransposedStep,
+    heard_by,
+    lean,
+)
 from echelon.simulation.native.transposed_graph import (
     check_pairs,
     heard_back,
     reach_of,
     turned_about,
 )
-from echelon.simulation.native.varying import Own
+from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.loop import Loop, Moment, begin, signals
 from echelon.simulation.step.meter import Sums
 
@@ -58,13 +64,13 @@ class _Pair(NamedTuple):
 
     forward: Kernel
     backward: Kernel
-    felt: Felt
+    felt: CotangentRows
 
 
 _pairs: dict[Hashable, _Pair] = {}
 
 
-def _pair(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
+def _pair(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:
     """Return the kernels for loops alike but for their own numbers, made once."""
     wind, signature = own.loop.motion.wind, own.signature
     # The signature is of all but the wind's numbers, which have rows where there is one.
@@ -77,9 +83,9 @@ def _pair(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
     return found
 
 
-def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
-    loop, rows = own.loop, Rows.of(own.loop)
-    felt, wanted = Felt.of(loop, rows, *wants), follows(loop)
+def _made(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:
+    loop, rows = own.loop, BlockRows.of(own.loop)
+    felt, wanted = CotangentRows.of(loop, rows, *wants), follows(loop)
     plan = plan_of(own, rows, BITS, False, lines[0], False, True)
     ways = [Transpose(own, BITS, rows, felt, leads, wanted).made() for leads in (True, False)]
     taped = max(1, *(len(way.kept) for way in ways))
@@ -103,13 +109,13 @@ def _made(own: Own, lines: tuple[bool, bool], wants: Wants) -> _Pair:
     return _Pair(onward, back, felt)
 
 
-def _onto_tape(body: Body, way: Pulled) -> Body:
+def _onto_tape(body: Body, way: TransposedStep) -> Body:
     """Return the body of a step that leaves on the tape what its transpose wants."""
     graph = body.mirror[0].graph
     return body._replace(tape={k: graph.leaf(*name) for k, name in enumerate(way.kept)})
 
 
-class Slopes(NamedTuple):
+class CostSlopes(NamedTuple):
     """Slopes of a cost.
 
     Attributes:
@@ -139,11 +145,11 @@ class Backward:
     """
 
     def __init__(
-        self, own: Own, states: Array, reference: Array | None, steps: int, wants: Wants
+        self, own: VaryingNumbers, states: Array, reference: Array | None, steps: int, wants: Wants
     ) -> None:
         """Write and compile the step and its transpose."""
         self.own, self.loop, self.steps, self.states = own, own.loop, steps, states
-        self.places = Swarm(own.loop, LANES[BITS])
+        self.places = SwarmBlocks(own.loop, LANES[BITS])
         if wants.spaced:
             check_pairs(own.loop)
         if all(wants):
@@ -225,7 +231,7 @@ class Backward:
 
     # ---- backwards ----
 
-    def pull(self, slopes: Sums) -> Slopes:
+    def pull(self, slopes: Sums) -> CostSlopes:
         """Return the slopes of what has these along the sums of the run.
 
         Raises:
@@ -318,7 +324,7 @@ class Backward:
 
     # ---- at the beginning of the run ----
 
-    def _ended(self) -> Slopes:
+    def _ended(self) -> CostSlopes:
         """Return the slopes, with what the beginning of the run adds to them."""
         felt, loop = self.pair.felt, self.loop
         found = self.felt.transpose(0, 2, 1).reshape(len(self.places.agents), -1)[self.places.of]
@@ -329,10 +335,10 @@ class Backward:
         states = found[:, felt.state]
         offsets = found[:, felt.offset] if self.wants.moved else np.zeros_like(states)
         if not (len(felt.memory) or self.signals):
-            return Slopes(leaves, states + heard, offsets - heard)
+            return CostSlopes(leaves, states + heard, offsets - heard)
         more = self._begun(found[:, felt.memory], heard)
         leaves = [a + np.asarray(b) for a, b in zip(leaves, more[0], strict=True)]
-        return Slopes(leaves, states + np.asarray(more[1]), offsets + np.asarray(more[2]))
+        return CostSlopes(leaves, states + np.asarray(more[1]), offsets + np.asarray(more[2]))
 
     def _shown(self) -> Array:
         """Return the slopes along what agents heard at the first step, (N, s)."""

@@ -17,11 +17,11 @@ from echelon.simulation.native.agent_order import (
     ordered,
     windows,
 )
-from echelon.simulation.native.schedule import Near
+from echelon.simulation.native.schedule import BlockReach
 from echelon.simulation.step.loop import Loop
 
 
-class Found(NamedTuple):
+class Neighbourhood(NamedTuple):
     """What a kernel reads of others, as it is called with it.
 
     Attributes:
@@ -76,7 +76,7 @@ class Places(abc.ABC):
     groups: int
     together: bool
     lines: bool
-    near: Near | None = None
+    near: BlockReach | None = None
 
     @property
     def edge_blocks(self) -> int:
@@ -97,7 +97,7 @@ class Places(abc.ABC):
         return len(self.agents) // self.lanes
 
     @abc.abstractmethod
-    def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
+    def find(self, width: int, rows: int, dtype: np.dtype) -> Neighbourhood:
         """Return where agents find each other: numbers are shown by `width`, blocks have `rows`."""
 
     @abc.abstractmethod
@@ -121,7 +121,7 @@ def senders_of(loop: Loop) -> Array:
 
 
 @final
-class Swarm(Places):
+class SwarmBlocks(Places):
     """The agents of one formation, neighbours in the lanes of a vector wherever they stand."""
 
     def __init__(self, loop: Loop, lanes: int) -> None:
@@ -158,7 +158,7 @@ class Swarm(Places):
         self.agents, self.segments = ordered(self.loop, self.lanes, near, degrees)
         self.of = first_places(self.agents)
 
-    def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
+    def find(self, width: int, rows: int, dtype: np.dtype) -> Neighbourhood:
         """Return where agents find each other: what they show stands one after the other."""
         loop, lanes = self.loop, self.lanes
         far = 1 if self.lines else stride(width, lanes)
@@ -167,7 +167,7 @@ class Swarm(Places):
         heavy[:] = weights
         held = self.of[senders_of(loop)[self.agents]]
         nearest = np.asarray(loop.meter.nearest)[self.agents]
-        return Found(
+        return Neighbourhood(
             starts,
             np.ascontiguousarray(positions * far, np.int32),
             heavy,
@@ -182,7 +182,7 @@ class Swarm(Places):
         leads = (ends < self.segments[1] * self.lanes).any(axis=(1, 2))
         return np.asarray(_follow(ends).all(axis=1) & ~leads, np.int8)
 
-    def measure(self, found: Found, far: int, bytes_: int) -> None:
+    def measure(self, found: Neighbourhood, far: int, bytes_: int) -> None:
         """Find how far blocks of so many bytes reach, whose agents show numbers `far` apart."""
         size, led = self.lanes * far, int(self.segments[1])
         slots = slice(found.neighbour_starts[led], None)
@@ -196,7 +196,7 @@ class Swarm(Places):
         first = np.minimum.accumulate(ends.min(axis=(1, 2))[::-1])[::-1]
         last = np.where(ends == self.blocks, 0, ends).max(axis=(1, 2))
         reach = max(1, apart.max(initial=0), (last - first).max(initial=0))
-        self.near = Near(int(reach), first, bytes_)
+        self.near = BlockReach(int(reach), first, bytes_)
 
     def spacing(self, edges: Array) -> Array:
         """Return the sums that rows of edges hold, (E,)."""
@@ -206,7 +206,7 @@ class Swarm(Places):
 
 
 @final
-class Formations(Places):
+class FormationBlocks(Places):
     """One agent of as many formations in a vector: all find each other block by block.
 
     Agents are numbered formation by formation.
@@ -216,7 +216,7 @@ class Formations(Places):
         """Place the agents of loops that are alike."""
         self.loops, self.loop, self.lanes = loops, loops[0], lanes
         self.groups = -(-len(loops) // lanes)
-        self.alone, self.together, self.lines = Swarm(self.loop, 1), True, False
+        self.alone, self.together, self.lines = SwarmBlocks(self.loop, 1), True, False
         # The last group is filled with copies.
         formation = np.minimum(np.arange(self.groups * lanes), len(loops) - 1)
         formation = formation.reshape(self.groups, 1, lanes)
@@ -224,14 +224,14 @@ class Formations(Places):
         self.agents, self.segments = each.reshape(-1), self.alone.segments
         self.of = first_places(self.agents)
 
-    def find(self, width: int, rows: int, dtype: np.dtype) -> Found:
+    def find(self, width: int, rows: int, dtype: np.dtype) -> Neighbourhood:
         """Return where agents find each other in a group: what they show stands row by row."""
         loop, lanes, of, far = self.loop, self.lanes, self.alone.of, width * self.lanes
         starts, positions, weights = self.alone.heard
         heavy = aligned((*weights.shape[:2], lanes), dtype)
         heavy[:] = weights
         ends = of[np.asarray(loop.meter.edges)] * far
-        return Found(
+        return Neighbourhood(
             starts,
             (positions * far).astype(np.int32),
             heavy,
@@ -321,7 +321,9 @@ def heard(
     return starts, positions, np.where(there, weights[:, order][:, edge], 0.0)
 
 
-def edge_blocks(loop: Loop, places: "Swarm", dtype: np.dtype, far: int) -> tuple[Array, Array]:
+def edge_blocks(
+    loop: Loop, places: "SwarmBlocks", dtype: np.dtype, far: int
+) -> tuple[Array, Array]:
     """Return the edges in blocks for the sums of how far distances are off.
 
     What two agents show that follow each other lies `far` apart.

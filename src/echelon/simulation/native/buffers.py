@@ -21,7 +21,7 @@ _NOBODY = _holders([np.empty(0, np.uint8)], 0)
 
 
 @final
-class Room:
+class BufferPool:
     """Makes arrays, in memory of earlier ones that nobody holds any more where there is some.
 
     A large array costs more than all that is written to it where its pages are new: a virtual

@@ -9,8 +9,8 @@ import numpy as np
 
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, program, shared, winds
-from echelon.simulation.native.agent_step import Rows, body_of, signals_of
-from echelon.simulation.native.varying import Own
+from echelon.simulation.native.agent_step import BlockRows, body_of, signals_of
+from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.loop import Loop
 
 LANES = {64: 8, 32: 16}
@@ -30,13 +30,19 @@ class Kernel(NamedTuple):
     """The code that steps some loops, the rows that it works on, its plan, and `common.shared`."""
 
     code: Code
-    rows: Rows
+    rows: BlockRows
     plan: Plan
     common: int
 
 
 def plan_of(
-    own: Own, rows: Rows, bits: int, together: bool, lines: bool, weighted: bool, tabled: bool
+    own: VaryingNumbers,
+    rows: BlockRows,
+    bits: int,
+    together: bool,
+    lines: bool,
+    weighted: bool,
+    tabled: bool,
 ) -> Plan:
     """Return what is written of some loops, whose own numbers may stand in the table (`tabled`).
 
@@ -76,7 +82,7 @@ def add_to(kept: dict[Any, Any], key: Hashable, made: Any) -> None:
     kept[key] = made
 
 
-def compiled(rows: Rows, plan: Plan, codes: dict[str, Code]) -> Kernel:
+def compiled(rows: BlockRows, plan: Plan, codes: dict[str, Code]) -> Kernel:
     """Return the code of a plan, and with it what is known of it.
 
     `codes` are those that were made, by their texts: other graphs are other numbers in the same.
@@ -89,7 +95,7 @@ def compiled(rows: Rows, plan: Plan, codes: dict[str, Code]) -> Kernel:
     return Kernel(code, rows, plan, len(shared(plan)))
 
 
-Make: TypeAlias = Callable[[Own, int, bool, bool, bool], Kernel]
+Make: TypeAlias = Callable[[VaryingNumbers, int, bool, bool, bool], Kernel]
 """What makes kernels, or has made them, as `Kernels.of` does."""
 
 
@@ -110,7 +116,12 @@ class Kernels:
         self._made: dict[Hashable, Kernel] = {}
 
     def of(
-        self, own: Own, bits: int, together: bool, lines: bool = False, weighted: bool = False
+        self,
+        own: VaryingNumbers,
+        bits: int,
+        together: bool,
+        lines: bool = False,
+        weighted: bool = False,
     ) -> Kernel:
         """Return what steps some loops, `weighted` where their edges' weights may become others.
 
@@ -123,7 +134,7 @@ class Kernels:
         key = (signature, wind, bits, LANES[bits], together, lines, weighted)
         found = None if signature is None else self._made.get(key)
         if found is None:
-            rows = Rows.of(own.loop, own.count)
+            rows = BlockRows.of(own.loop, own.count)
             plan = plan_of(own, rows, bits, together, lines, weighted, False)
             found = compiled(rows, plan, self.codes)
             if signature is not None:

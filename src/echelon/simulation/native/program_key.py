@@ -13,7 +13,7 @@ from echelon.simulation.step.settings import Settings
 
 
 @final
-class Families:
+class ProgramKeys:
     """Tells families apart; what a kind of loop reads of its numbers is traced once."""
 
     def __init__(self) -> None:

@@ -20,7 +20,7 @@ _DEEP = 4
 """Steps of a tile that are worth to stay in the nearer of them."""
 
 
-class Near(NamedTuple):
+class BlockReach(NamedTuple):
     """How far blocks reach.
 
     Attributes:
@@ -55,7 +55,7 @@ def step_by_step(segments: Array, edges: int, steps: int, thread: int, threads: 
     return turns
 
 
-def tile_by_tile(segments: Array, near: Near, steps: int, thread: int, threads: int) -> Array:
+def tile_by_tile(segments: Array, near: BlockReach, steps: int, thread: int, threads: int) -> Array:
     """Return the turns (T, 8) of a thread that takes each so many-th tile.
 
     The leaders are ahead of all others. The arguments are those of `step_by_step`.
@@ -84,7 +84,7 @@ def tile_by_tile(segments: Array, near: Near, steps: int, thread: int, threads: 
     return np.concatenate(found)
 
 
-def tiles(near: Near, steps: int) -> tuple[int, int]:
+def tiles(near: BlockReach, steps: int) -> tuple[int, int]:
     """Return how many steps a tile takes, and how many blocks it has."""
     depth, window = 1, 1
     for cache in _CACHES:
@@ -95,7 +95,7 @@ def tiles(near: Near, steps: int) -> tuple[int, int]:
     return depth, max(1, window - depth * near.reach)
 
 
-def pays(segments: Array, near: Near, steps: int) -> bool:
+def pays(segments: Array, near: BlockReach, steps: int) -> bool:
     """Tell whether tiles pay: they take several steps, and all blocks are several tiles."""
     depth, tile = tiles(near, steps)
     return depth > 1 and segments[2] > 3 * tile

@@ -11,12 +11,12 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, needed, stride
 from echelon.simulation.native.agent_step import memories_of, signals_of
-from echelon.simulation.native.blocks import Formations, Places, Swarm, heard
-from echelon.simulation.native.buffers import Room
+from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, heard
+from echelon.simulation.native.buffers import BufferPool
 from echelon.simulation.native.kernel_cache import KERNELS, LANES, Make
 from echelon.simulation.native.signals import offsets_of, shown_by
-from echelon.simulation.native.threads import Crew
-from echelon.simulation.native.varying import Own
+from echelon.simulation.native.threads import ThreadPool
+from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.native.wind_draws import draw_holds, holds_at_once
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop, Moment, begin, begin_forgetful, stretch_at
@@ -83,13 +83,15 @@ class NativeStepper(Stepper):
         places: Places | None = None,
     ) -> None:
         """Write and compile the step."""
-        self.own = Own(loops, unlike)
+        self.own = VaryingNumbers(loops, unlike)
         self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
         together, lanes = len(loops) > 1, LANES[bits]
-        known = places or (Formations(loops, lanes) if together else Swarm(self.loop, lanes))
+        known = places or (
+            FormationBlocks(loops, lanes) if together else SwarmBlocks(self.loop, lanes)
+        )
         self.places: Places = known
-        self.crew, self.room = Crew(self.places, pool, threads), Room()
+        self.crew, self.room = ThreadPool(self.places, pool, threads), BufferPool()
         # Numbers of formations follow each other.
         each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
         self.leaders = (each + self.loop.leaders).reshape(-1)
@@ -119,7 +121,7 @@ class NativeStepper(Stepper):
         self.found = places.find(plan.width, plan.told if plan.ahead else plan.rows, self.dtype)
         self.led = int(places.segments[1])
         if plan.ahead:
-            assert isinstance(places, Swarm)
+            assert isinstance(places, SwarmBlocks)
             parts = (self.blocks, *self.mirrors, *self.found[1:3], *self.found[5:7])
             bytes_ = sum(part.nbytes for part in parts) // places.blocks
             far = 1 if plan.lines else stride(plan.width, plan.lanes)

@@ -38,7 +38,7 @@ def processors() -> int:
 
 
 @final
-class Crew:
+class ThreadPool:
     """Runs a kernel on threads; no number depends on how many there are.
 
     Args:

@@ -15,8 +15,8 @@ import numpy as np
 from echelon.core.types import Array
 from echelon.simulation.codegen import (
     Body,
-    Graph,
     Node,
+    ScalarGraph,
     Unsupported,
     from_tape,
     lower,
@@ -24,8 +24,8 @@ from echelon.simulation.codegen import (
     stride,
 )
 from echelon.simulation.native.agent_step import (
-    Known,
-    Rows,
+    BlockRows,
+    StepInputs,
     agent_step,
     known_of,
     leaves_of,
@@ -36,12 +36,12 @@ from echelon.simulation.native.agent_step import (
     single,
 )
 from echelon.simulation.native.kernel_cache import LANES
-from echelon.simulation.native.varying import Own
+from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import spacing_error
 
 
-class Felt(NamedTuple):
+class CotangentRows(NamedTuple):
     """Where the slopes of an agent lie in its block on the way back; each a range of rows.
 
     Attributes:
@@ -68,7 +68,7 @@ class Felt(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop, rows: Rows, spaced: bool, moved: bool) -> "Felt":
+    def of(cls, loop: Loop, rows: BlockRows, spaced: bool, moved: bool) -> "CotangentRows":
         """Return the rows of a loop of such rows, `spaced` with `place`, `moved` with `offset`."""
         leaning, n, q = leans(loop), len(rows.state), len(loop.meter.measured)
         heard = heard_by(loop) * (leaning or spaced)
@@ -115,7 +115,7 @@ _SMOOTH = ("state", "memory", "tell", "errors", "tracking", "outputs", "effort",
 """What of a step there are slopes of; the rest is counted."""
 
 
-class Pulled(NamedTuple):
+class TransposedStep(NamedTuple):
     """The transpose of a step: its body, and the leaves that the step leaves on its tape."""
 
     body: Body
@@ -136,15 +136,21 @@ class Transpose:
     """
 
     def __init__(
-        self, own: Own, bits: int, rows: Rows, felt: Felt, leads: bool, follows: bool
+        self,
+        own: VaryingNumbers,
+        bits: int,
+        rows: BlockRows,
+        felt: CotangentRows,
+        leads: bool,
+        follows: bool,
     ) -> None:
         """Begin a graph."""
         self.own, self.loop, self.rows, self.felt = own, own.loop, rows, felt
-        self.leads, self.follows, self.graph = leads, follows, Graph(bits)
+        self.leads, self.follows, self.graph = leads, follows, ScalarGraph(bits)
         self.law = own.loop.leader if leads else own.loop.follower
         self.signals, self.measured = signals_of(own.loop), own.loop.meter.measured
 
-    def made(self) -> Pulled:
+    def made(self) -> TransposedStep:
         """Return the transpose.
 
         What is added to totals are the slopes along the numbers of the loop's own, leaf by leaf.
@@ -162,9 +168,9 @@ class Transpose:
         tree = jax.tree.structure(moving, is_leaf=lambda part: isinstance(part, np.ndarray))
         along = [node for part in found[: len(leaves)] for node in part]
         body = self._body(known, tree.unflatten(found[len(leaves) :]), after, along)
-        return Pulled(*from_tape(body, {"felt": "row", "heard": "z"}))
+        return TransposedStep(*from_tape(body, {"felt": "row", "heard": "z"}))
 
-    def _pull(self, leaves: list[Any], known: Known, moving: _Moving, given: Any) -> Any:
+    def _pull(self, leaves: list[Any], known: StepInputs, moving: _Moving, given: Any) -> Any:
         def act(leaves: list[Any], moving: _Moving) -> tuple[Any, ...]:
             step = agent_step(self.own.filled(leaves), self.leads)
             done = step(known._replace(**moving._asdict()))
@@ -249,7 +255,7 @@ class Transpose:
             after if self.signals else np.zeros(0),
         )
 
-    def _body(self, known: Known, back: _Moving, after: np.ndarray, along: list[Node]) -> Body:
+    def _body(self, known: StepInputs, back: _Moving, after: np.ndarray, along: list[Node]) -> Body:
         """Return the body, of the slopes that a step's have become."""
         felt, measured, place = self.felt, list(self.measured), list[Node]()
         x, offset = np.array(back.x, object), np.array(back.offset, object)

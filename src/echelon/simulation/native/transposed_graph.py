@@ -7,12 +7,12 @@ import numpy as np
 from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array
 from echelon.simulation.codegen import Unsupported, aligned, fed_widths, stride
-from echelon.simulation.native.blocks import Swarm, heard, senders_of, smooth_blocks
+from echelon.simulation.native.blocks import SwarmBlocks, heard, senders_of, smooth_blocks
 from echelon.simulation.native.kernel_cache import Kernel
 from echelon.simulation.step.loop import Loop, stretch_at
 
 
-class Turned(NamedTuple):
+class TransposedGraph(NamedTuple):
     """Who heard each agent, as `places.heard` has whom it hears; whose positions are in lines."""
 
     starts: Array
@@ -22,7 +22,7 @@ class Turned(NamedTuple):
     lines: bool
 
 
-class Reach(NamedTuple):
+class TransposedArrays(NamedTuple):
     """The same as a kernel reads it, and whom each agent feeds: `places.Found` turned about."""
 
     neighbour_starts: Array
@@ -45,7 +45,7 @@ def check_pairs(loop: Loop) -> None:
         raise Unsupported("slopes along distances of edges that are not all heard both ways alike")
 
 
-def turned_about(loop: Loop, places: Swarm) -> Turned:
+def turned_about(loop: Loop, places: SwarmBlocks) -> TransposedGraph:
     """Return the graph of a loop turned about."""
     exchange = loop.exchange
     turned = Exchange(exchange.senders, exchange.receivers, exchange.weights)
@@ -56,16 +56,18 @@ def turned_about(loop: Loop, places: Swarm) -> Turned:
     # A copy feels nothing, so that what is added up over all lanes counts each agent once.
     once = (places.of[agents] == own)[block]
     positions, weights = np.where(once, positions, own[block]), np.where(once, weights, 0.0)
-    return Turned(starts, positions, weights, *smooth_blocks(starts, positions))
+    return TransposedGraph(starts, positions, weights, *smooth_blocks(starts, positions))
 
 
-def reach_of(loop: Loop, places: Swarm, turned: Turned, kernel: Kernel) -> Reach:
+def reach_of(
+    loop: Loop, places: SwarmBlocks, turned: TransposedGraph, kernel: Kernel
+) -> TransposedArrays:
     """Return what a kernel that takes back reads of a graph turned about."""
     plan, nearest = kernel.plan, np.asarray(loop.meter.nearest)
     heavy = aligned(turned.weights.shape, np.float64)
     heavy[:] = turned.weights
     far, (_, fed) = 1 if plan.lines else stride(plan.width, plan.lanes), fed_widths(plan)
-    return Reach(
+    return TransposedArrays(
         turned.starts,
         np.ascontiguousarray(turned.positions * far, np.int32),
         heavy,

@@ -39,7 +39,7 @@ def is_number(leaf: Any) -> bool:
 
 
 @final
-class Own:
+class VaryingNumbers:
     """Numbers of loops that are alike but for them.
 
     Args:

@@ -19,7 +19,13 @@ from echelon.agents.references.flatness import (
 from echelon.agents.references.guide import Guide
 from echelon.core.errors import PlanError
 from echelon.core.types import Array
-from echelon.simulation.optimal.objectives import Grid, TrackingOptions, coarse, spacing, tracking
+from echelon.simulation.optimal.objectives import (
+    PlanTimes,
+    TrackingOptions,
+    coarse,
+    spacing,
+    tracking,
+)
 from echelon.simulation.optimal.problem import OptimalControl
 from echelon.simulation.optimal.solver import Solver, Trajectory
 
@@ -53,7 +59,7 @@ class FormationPlan(NamedTuple):
         setup_seconds: of making the solvers ready.
     """
 
-    grid: Grid
+    grid: PlanTimes
     plans: tuple[Trajectory, ...]
     seconds: tuple[float, ...]
     iterations: tuple[int, ...]
@@ -66,7 +72,7 @@ def plan_formation(
     graph: Graph,
     formation: Formation,
     states: Array,
-    grid: Grid,
+    grid: PlanTimes,
     *,
     reference: Guide | None,
     planning: TrackingOptions,
@@ -111,7 +117,7 @@ def plan_tracking(
     model: ControlAffine,
     start: Array,
     targets: Targets,
-    grid: Grid,
+    grid: PlanTimes,
     planning: TrackingOptions,
     limits: bool,
 ) -> Trajectory:
@@ -144,7 +150,7 @@ class _Desk:
     """Solvers made ready once and used by all agents whose problems have the same form."""
 
     def __init__(
-        self, model: ControlAffine, planning: TrackingOptions, grid: Grid, limits: bool
+        self, model: ControlAffine, planning: TrackingOptions, grid: PlanTimes, limits: bool
     ) -> None:
         self.model, self.planning, self.grid, self.limits = model, planning, grid, limits
         self.seconds: dict[int, float] = {}

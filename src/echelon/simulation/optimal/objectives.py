@@ -71,7 +71,7 @@ class TrackingOptions:
         return read_weights("output_weight", np.ones(len(names)) if given is None else given, names)
 
 
-class Grid(NamedTuple):
+class PlanTimes(NamedTuple):
     """Times of a plan: `steps` intervals of `hold` steps of dt (s) each."""
 
     steps: int
@@ -89,7 +89,7 @@ class Grid(NamedTuple):
         return self.interval * np.arange(self.steps + 1)
 
 
-def grid(horizon: float, dt: float, interval: float) -> Grid:
+def grid(horizon: float, dt: float, interval: float) -> PlanTimes:
     """Return the grid of a horizon: intervals of whole steps, the last of which covers its end.
 
     Raises:
@@ -102,14 +102,14 @@ def grid(horizon: float, dt: float, interval: float) -> Grid:
     count = max(1, round(horizon / dt))
     hold = min(count, max(1, round(interval / dt)))
     # Rounded up: a run that ended within an interval must have an input there.
-    return Grid(-(-count // hold), hold, dt)
+    return PlanTimes(-(-count // hold), hold, dt)
 
 
 # ---- problems ------------------------------------------------------------------------------------
 
 
 def tracking(
-    model: ControlAffine, planning: TrackingOptions, times: Grid, limits: bool, fine: bool
+    model: ControlAffine, planning: TrackingOptions, times: PlanTimes, limits: bool, fine: bool
 ) -> OptimalControl:
     """Return the problem of an agent with targets.
 
@@ -128,7 +128,7 @@ def tracking(
 
 def spacing(
     model: ControlAffine,
-    times: Grid,
+    times: PlanTimes,
     limits: bool,
     fine: bool,
     distances: Array,
@@ -171,7 +171,7 @@ def _input_cost(model: ControlAffine) -> Callable[[jax.Array, jax.Array], jax.Ar
 
 
 def _problem(
-    model: ControlAffine, times: Grid, limits: bool, fine: bool, stage: Stage, parameters: int
+    model: ControlAffine, times: PlanTimes, limits: bool, fine: bool, stage: Stage, parameters: int
 ) -> OptimalControl:
     return OptimalControl(
         model,
@@ -186,7 +186,7 @@ def _problem(
     )
 
 
-def coarse(times: Grid) -> int:
+def coarse(times: PlanTimes) -> int:
     """Return the Runge-Kutta steps within an interval of a first solution."""
     # Less 1e-9, so that a quotient one rounding above a whole number is not one more.
     return min(times.hold, max(1, math.ceil(times.interval / _SUBSTEP - 1e-9)))

@@ -13,7 +13,7 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.optimal.casadi import casadi
 from echelon.simulation.optimal.problem import OptimalControl
-from echelon.simulation.optimal.transcription import Program, transcribe
+from echelon.simulation.optimal.transcription import NonlinearProgram, transcribe
 
 FELT = 1e-6
 """A constraint that is missed by less than this counts as met."""
@@ -27,7 +27,7 @@ class Violation(NamedTuple):
     time: float
 
 
-def violations(program: Program, g: Array) -> tuple[Violation, ...]:
+def violations(program: NonlinearProgram, g: Array) -> tuple[Violation, ...]:
     """Return by how much each kind of constraint is missed at most, the largest first."""
     sizes = np.array([row.size for row in program.rows])
     amounts = sizes * np.maximum(program.low - g, g - program.high)
@@ -41,7 +41,7 @@ def violations(program: Program, g: Array) -> tuple[Violation, ...]:
     return tuple(sorted(worst.values(), key=lambda v: -v.amount))
 
 
-def least_violations(program: Program, w: Array, p: Array) -> tuple[Violation, ...]:
+def least_violations(program: NonlinearProgram, w: Array, p: Array) -> tuple[Violation, ...]:
     """Return what is missed where the sum of all misses of the problem's own constraints is least.
 
     The motion, the start and the actuators' limits are kept. Where these alone contradict each
@@ -149,7 +149,7 @@ class Solver:
             raise PlanError(f"`solver` is `{solver}`, which CasADi lacks; try {listing(known)}.")
         with precision("float64"):
             check_model(problem.model)
-            self.program: Program = transcribe(problem)
+            self.program: NonlinearProgram = transcribe(problem)
         chosen = {"print_time": False, "error_on_fail": False, **_DEFAULTS.get(solver, {})}
         # It splits the rows of a step into equations and inequalities, and must be given which.
         if solver == "fatrop":

@@ -16,7 +16,7 @@ from echelon.simulation.optimal.casadi import casadi, casadi_function
 from echelon.simulation.optimal.problem import Constraint, OptimalControl
 
 
-class Row(NamedTuple):
+class ConstraintRow(NamedTuple):
     """What one row of the program's constraints says.
 
     Attributes:
@@ -33,7 +33,7 @@ class Row(NamedTuple):
     own: bool = False
 
 
-class Program(NamedTuple):
+class NonlinearProgram(NamedTuple):
     """A nonlinear program min f(w, p) subject to low <= g(w, p) <= high.
 
     w holds (x_k, v_k) step by step with u = u* + S v, so that its entries are of like size; g holds
@@ -44,7 +44,7 @@ class Program(NamedTuple):
     problem: dict[str, Any]
     low: Array
     high: Array
-    rows: tuple[Row, ...]
+    rows: tuple[ConstraintRow, ...]
 
 
 class _Parts(NamedTuple):
@@ -58,7 +58,7 @@ class _Parts(NamedTuple):
     end: Any
 
 
-def transcribe(problem: OptimalControl) -> Program:
+def transcribe(problem: OptimalControl) -> NonlinearProgram:
     """Return the program of a problem.
 
     Raises:
@@ -91,7 +91,7 @@ def transcribe(problem: OptimalControl) -> Program:
     closing = [limits[:, -1]] if problem.nodes > N else []
     last = ca.vertcat(*closing, kept[:, -1], parts.end(x[:, -1], p[:, -1]))
     low, high, rows = _rows(problem)
-    return Program(
+    return NonlinearProgram(
         {
             "x": ca.vertcat(ca.vec(body), tail),
             "f": cost,
@@ -166,17 +166,17 @@ def _scalar(name: str, function: Any) -> Any:
     return function
 
 
-def _rows(problem: OptimalControl) -> tuple[Array, Array, tuple[Row, ...]]:
+def _rows(problem: OptimalControl) -> tuple[Array, Array, tuple[ConstraintRow, ...]]:
     """Return the bounds of g and what each row says, in the order of `transcribe`."""
-    motion = [(0.0, 0.0, Row(f"motion of {name}")) for name in problem.model.state_names]
-    begin = [(0.0, 0.0, Row(f"start of {name}")) for name in problem.model.state_names]
+    motion = [(0.0, 0.0, ConstraintRow(f"motion of {name}")) for name in problem.model.state_names]
+    begin = [(0.0, 0.0, ConstraintRow(f"start of {name}")) for name in problem.model.state_names]
     limits = [
-        (low / size, high / size, Row(f"actuator limit {j + 1}", size=size))
+        (low / size, high / size, ConstraintRow(f"actuator limit {j + 1}", size=size))
         for j, (low, high, size) in enumerate(_limits(problem))
     ]
     kept, ending = (
         [
-            (low, high, Row(one.name, own=True))
+            (low, high, ConstraintRow(one.name, own=True))
             for one, f in _constraints(problem)
             if one.end is end
             for low, high in _bounds(one, f.numel_out())

@@ -26,7 +26,7 @@ from echelon.synthesis.certificates.lmi import rate_of
 _SAFE = 1.0 - 1e-6
 
 
-class Pairs(NamedTuple):
+class DomainPairs(NamedTuple):
     """What a gain must contract on a domain.
 
     Attributes:
@@ -56,7 +56,9 @@ def the_domain(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None
     return bounds if isinstance(bounds, Domain) else Domain.about(model, bounds)
 
 
-def pairs_on(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None, R: Array) -> Pairs:
+def pairs_on(
+    model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None, R: Array
+) -> DomainPairs:
     """Return what a gain must contract on a method's domain, with R (m, m).
 
     Raises:
@@ -66,14 +68,14 @@ def pairs_on(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None, 
     domain = the_domain(model, bounds)
     if has_constant_input_map(model, domain):
         found = jacobians(model, domain)
-        return Pairs(domain, found, found.matrices, None)
+        return DomainPairs(domain, found, found.matrices, None)
     found = weighted_jacobians(model, domain, R)
     A, W = np.split(found.matrices, 2, axis=2)
-    return Pairs(domain, found, A, W)
+    return DomainPairs(domain, found, A, W)
 
 
 def contracting_region(
-    pairs: Pairs,
+    pairs: DomainPairs,
     P: Array,
     B: Array,
     R: Array,
