@@ -4,7 +4,6 @@ Names are looked up in the registry alone.
 """
 
 import contextlib
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -28,11 +27,12 @@ from echelon.core.errors import (
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.checks import section
+from echelon.experiments.scenario.checks import ROLES, section
+from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
 from echelon.experiments.scenario.part import Part, accepted, known, law_part, offered, part_of
 from echelon.experiments.scenario.scenario import Fault, Scenario, refuse
-from echelon.experiments.scenario.sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.user_code import own_code
+from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import joined
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
@@ -312,9 +312,7 @@ def _follower(
     spec = scenario.follower
     part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
     _check_keys(scenario, faults, "follower", part)
-    plain = ("feedforward", "trim", "frame")
-    offers: dict[str, Any] = {key: getattr(spec, key) for key in plain}
-    offers |= _stopping(spec)
+    offers = law_arguments(spec)
     if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)
@@ -323,25 +321,15 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
-def _stopping(spec: LeaderSpec | FollowerSpec) -> dict[str, Any]:
-    """Return the keys of the law `stopping-point` that a role gives."""
-    given = {name: getattr(spec, name, None) for name in _STOPPING_KEYS}
-    given = {name: value for name, value in given.items() if value is not None}
-    return given | ({"speed": math.inf} if given.get("speed") == "inf" else {})
-
-
-_STOPPING_KEYS = ("roots", "rate", "coupling", "speed", "observer", "hears")
-_LAW_KEYS = ("gain", "feedforward", "trim", "frame", *_STOPPING_KEYS)
-
-
 def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:
-    """Note the keys of a role that its law does not take, which of one's own its class knows."""
-    for key in section(scenario.data, role):
-        if key in _LAW_KEYS and key not in accepted(part.cls):
-            with faults.at(role, str(key)):
+    """Note the keys of a role that its law, a class of the user, does not take."""
+    taken = accepted(part.cls)
+    for key in marked_keys(ROLES[role][0]):
+        if key in section(scenario.data, role) and key not in taken:
+            with faults.at(role, key):
                 raise ScenarioError(
-                    f"got a key that the law `{part.what}` does not take, allowed are those that "
-                    "its class names."
+                    f"got a key that the law `{part.what}` does not take, allowed are the "
+                    "arguments of its class."
                 )
 
 
@@ -365,25 +353,23 @@ def _leader(
     _check_keys(scenario, faults, "leader", part)
     if spec.reacts and "reaction" not in accepted(part.cls):
         raise ScenarioError(
-            f"`reacts` is true, and the law `{part.what}` cannot be told to react; use `tracking`."
+            f"`reacts` is true, but the law `{part.what}` cannot react to neighbours; use "
+            "`tracking`."
         )
     if spec.reacts and reaction is None:
-        raise ScenarioError("`reacts` needs a follower law with a gain, and this one has none.")
+        raise ScenarioError("`reacts` needs a follower law with a gain, but this law has none.")
     if reference is not None and "reference" not in accepted(part.cls):
-        raise ScenarioError(f"there is a `reference`, and the law `{part.what}` takes none.")
-    offers: dict[str, Any] = {
+        raise ScenarioError(f"got a `reference`, but the law `{part.what}` takes none.")
+    offers = {
         "reference": reference,
         "reaction": reaction,
         "start_error": spec.start_error,
         "horizon": scenario.simulation.horizon,
         "limits": scenario.simulation.limits,
-        # One inner loop for all, unless the file says otherwise.
-        **{k: v for k, v in _stopping(scenario.follower).items() if k in ("roots", "rate")},
+        **law_arguments(spec),
+        # All agents have the same inner loop, unless the file says otherwise.
+        **spec.inner_loop(scenario.follower),
     }
-    own = _stopping(spec)
-    if {"roots", "rate"} & own.keys():
-        offers = {key: value for key, value in offers.items() if key not in ("roots", "rate")}
-    offers |= own
     if spec.gain is not None:
         with faults.at("leader", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
 from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.law_sections import UserClass
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.sections import OwnClass
 from echelon.experiments.scenario.user_code import own_class, own_code
 from echelon.laws.law import Law
 
@@ -86,8 +86,8 @@ def part_of(
     return Part(resolve(table[str(name)]), str(name), given, own=False)
 
 
-def law_part(scenario: Scenario, table: Mapping[str, registry.Entry], law: str | OwnClass) -> Part:
+def law_part(scenario: Scenario, table: Mapping[str, registry.Entry], law: str | UserClass) -> Part:
     """Return the law that a scenario names, a member of a table or a class of the user's."""
-    if isinstance(law, OwnClass):
+    if isinstance(law, UserClass):
         return part_of(scenario, Law, table, None, law.python, law.parameters)
     return part_of(scenario, Law, table, law, None)
