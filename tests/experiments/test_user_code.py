@@ -128,8 +128,8 @@ SENTENCES = {
     "a key that a law of one's own does not take": (
         {"follower": {"law": {"python": "mine.py:Pull"}, "gain": {"method": "riccati"}}},
         "follower.gain",
-        "got a key that the law `mine.py:Pull` does not take, allowed are those that its class "
-        "names.",
+        "got a key that the law `mine.py:Pull` does not take, allowed are the arguments "
+        "of its class.",
     ),
     "a file that is not there": (
         {"follower": {"gain": {"python": "yours.py:Heavy"}}},

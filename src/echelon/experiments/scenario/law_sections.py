@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, Hears
+from echelon.core.words import DEFAULT_FEEDFORWARD, Feedforward, Frame, NeighbourChoice
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.values import (
     STRICT,
@@ -200,7 +200,7 @@ class FollowerSpec(BaseModel, **STRICT):
     twice the slowest root over lambda_min, or the largest that the step allows."""
     speed: _Speed = None
     observer: _Observer = None
-    hears: Annotated[Annotated[str, OneOf(map(str, Hears))] | None, _STOPPING] = None
+    hears: Annotated[Annotated[str, OneOf(map(str, NeighbourChoice))] | None, _STOPPING] = None
     """Of the law `stopping-point`: whether agents use the information of `all` neighbours, or only
     of those nearer to a leader (`leaderward`)."""
     feedforward: Annotated[
