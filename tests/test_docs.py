@@ -181,7 +181,11 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     (package / "synthesis/gains/decay.py").write_text(head + code, "utf-8")
     added = re.findall(r"^ (.+)\n\+(.+)$", section.partition("## A reference")[0], re.MULTILINE)
     scenario = "experiments/scenario"
-    files = ("synthesis/gains/__init__.py", f"{scenario}/registry.py", f"{scenario}/law_sections.py")
+    files = (
+        "synthesis/gains/__init__.py",
+        f"{scenario}/registry.py",
+        f"{scenario}/law_sections.py",
+    )
     for file, (above, line) in zip(files, added, strict=True):
         text = (package / file).read_text("utf-8")
         assert text.count(f"{above}\n") == 1

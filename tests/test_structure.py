@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "echelon"

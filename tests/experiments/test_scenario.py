@@ -16,7 +16,7 @@ from echelon.core.errors import ScenarioError, listing
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.checks import ROLES
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
-from echelon.experiments.scenario.part import accepted, resolve
+from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
     Fault,
@@ -595,5 +595,7 @@ def test_a_named_set_of_parameters_may_be_changed(load):
         with pytest.raises(echelon.EchelonError) as caught:
             echelon.build(load(f"model={{name: quadrotor, parameters: {parameters}}}"))
         assert said in str(caught.value)
-    with pytest.raises(echelon.EchelonError, match="`pendulum` has no named parameter sets"):
+    with pytest.raises(
+        echelon.EchelonError, match="got the parameter set `small`, but `pendulum` has none"
+    ):
         echelon.build(load("model={name: pendulum, parameters: {set: small}}"))

@@ -117,13 +117,13 @@ SENTENCES = {
     "a class that is not there": (
         {"follower": {"law": {"python": "mine.py:Pul"}}},
         "follower",
-        "`Pul` in `{folder}/mine.py` is no `Law` class; it has `Pull`, `Steer`, `Restless` (did "
+        "`Pul` in `{folder}/mine.py` is not a `Law` class; it has `Pull`, `Steer`, `Restless` (did "
         "you mean `Pull`?).",
     ),
     "a class of another kind": (
         {"reference": {"python": "mine.py:Pull"}},
         "reference",
-        "`Pull` in `{folder}/mine.py` is no `Reference` class; it has `Ray`.",
+        "`Pull` in `{folder}/mine.py` is not a `Reference` class; it has `Ray`.",
     ),
     "a key that a law of one's own does not take": (
         {"follower": {"law": {"python": "mine.py:Pull"}, "gain": {"method": "riccati"}}},
@@ -146,13 +146,12 @@ SENTENCES = {
     "a value that the reference refuses": (
         {"reference": {"python": "mine.py:Ray", "velocity": [1, 2, 3]}},
         "reference",
-        "`mine.py:Ray` cannot be made with these parameters: ValueError: `velocity` must be two "
-        "numbers.",
+        "`mine.py:Ray` refuses these parameters: ValueError: `velocity` must be two numbers.",
     ),
     "a reference that nobody takes": (
         {"leader": {"law": {"python": "mine.py:Pull"}}},
         "leader",
-        "there is a `reference`, and the law `mine.py:Pull` takes none.",
+        "got a `reference`, but the law `mine.py:Pull` takes none.",
     ),
     "a method that fails": (
         {"follower": {"gain": {"python": "mine.py:Fails"}}},

@@ -11,7 +11,7 @@ import pytest
 import echelon as ech
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.registry import METHODS
 
 # ---- all tellers say the same ----

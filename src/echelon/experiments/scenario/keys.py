@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import json_schema
 
 _HEAD = """# Scenario keys

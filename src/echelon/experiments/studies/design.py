@@ -20,7 +20,7 @@ from echelon.core.words import Theorem
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.law_sections import GainSpec
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import Fault
 from echelon.experiments.studies.speedup import speedup
