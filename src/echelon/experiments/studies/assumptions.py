@@ -11,7 +11,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.agents.references.demand import ReferenceDemand, asked, infeasible, too_fast
-from echelon.core.linear import in_words
+from echelon.core.linear import eigenvalue_text
 from echelon.core.statement import (
     Hypothesis,
     Statement,
@@ -54,7 +54,7 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
         yield holds(Topic.GRAPH, _PROOF, text, len(graph.edges), size)
     followers, leaders = len(graph.followers), len(graph.leaders)
     roles = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
-    yield holds(Topic.FOLLOWS, _PROOF, who_hears_whom(graph), leaders, roles)
+    yield holds(Topic.PARENTS, _PROOF, who_hears_whom(graph), leaders, roles)
     extremes = f"lambda_min {low:.6g}, lambda_max {high:.6g}"
     yield holds(Topic.GROUNDED, _PROOF, "for the grounded Laplacian", low, extremes)
     if other:
@@ -96,9 +96,9 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     both = both and monotone.verdict is Verdict.HOLDS
     text, remedy = "needs Assumption 5 and symmetric offsets", "see Assumption 5 and the offsets"
     yield (
-        holds(Topic.ALONG, _LINEAR, text)
+        holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
         if both
-        else fails(Topic.ALONG, _LINEAR, text, remedy=remedy)
+        else fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
     )
     yield _printed_line(parts, promise)
     yield _finite_line(parts, promise)
@@ -106,7 +106,7 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
 
 def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
-    name, slow = Topic.TRACKS, promise.own
+    name, slow = Topic.LEADER_TRACKING, promise.own
     if slow is None:
         return unneeded(name, _PROOF, "it follows nothing")
     if not promise.linear:
@@ -129,13 +129,13 @@ def _reference_line(model: ControlAffine, found: ReferenceDemand, settings: Sett
     number = found.share, ", ".join(numbers)
     if not found.feasible:
         text, remedy = infeasible(model, found), "give knots that the model can move along"
-        return fails(Topic.ASKED, Kind.SAMPLES, text, *number, remedy=remedy)
+        return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
     if limited and found.share > 1.0:
         text, remedy = too_fast(model, found), "make it slower or smaller"
-        return fails(Topic.ASKED, Kind.SAMPLES, text, *number, remedy=remedy)
+        return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
     bound = "the limits alone bound what it may ask" if limited else "nothing here bounds it"
     text = f"at most, over {settings.horizon:g} s; {bound}"
-    return holds(Topic.ASKED, Kind.SAMPLES, text, *number)
+    return holds(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number)
 
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
@@ -156,7 +156,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
         remedy = "`monotone` or `inner-loop` find one, `riccati` does without"
         return fails(name, _LINEAR, "this P does not", *number, remedy=remedy)
     names = ", ".join(f"`{parts.model.state_names[k]}`" for k in found.states)
-    text = f"no P > 0 can: mode at {in_words(found.eigenvalue)} 1/s along {names}"
+    text = f"no P > 0 can: mode at {eigenvalue_text(found.eigenvalue)} 1/s along {names}"
     remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
     return fails(name, _LINEAR, text, *number, remedy=remedy)
 
@@ -166,8 +166,8 @@ def _flat_lines() -> Iterator[Statement]:
     text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
     yield holds(Topic.MONOTONE, _PROOF, text, 0.0, "0")
     text = "for offsets of every flat output: they are symmetries of the chains"
-    yield holds(Topic.ALONG, _PROOF, text)
-    for name in (Topic.PRINTED, Topic.FINITE):
+    yield holds(Topic.DRIFT_ALONG_Z, _PROOF, text)
+    for name in (Topic.LMI_AS_PRINTED, Topic.FINITE):
         yield unneeded(name, _PROOF, "T5 asks nothing of a P")
 
 
@@ -191,7 +191,7 @@ def _printed_line(parts: Parts, promise: Promise) -> Statement:
     largest = float(np.linalg.eigvalsh(np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]]))[-1])
     text = "infeasible for every P > 0: its upper left block is zero"
     number, remedy = (largest, f"eigenvalue {largest:.3g} > 0"), "use the finite condition"
-    return fails(Topic.PRINTED, _PROOF, text, *number, remedy=remedy)
+    return fails(Topic.LMI_AS_PRINTED, _PROOF, text, *number, remedy=remedy)
 
 
 def _finite_line(parts: Parts, promise: Promise) -> Statement:

@@ -49,7 +49,7 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
         text = "the model bends at the trim, and has no modes there"
         yield vacuous(Topic.MARGINS, _KIND, text)
         return
-    if promise.hypotheses[Hypothesis.DECAYS].fails:
+    if promise.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails:
         yield unneeded(Topic.MARGINS, _KIND, "there is nothing to lose")
         return
     stiffness = margins.stiffness(loop.closed)
@@ -76,7 +76,7 @@ def _turns_lines(promise: Promise) -> Iterator[Statement]:
     """Yield what is known of graphs that take turns: how weak the coupling may get (T8)."""
     edge, lines = promise.edge, promise.hypotheses
     anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
-    if not anywhere and edge is not None and not lines[Hypothesis.DECAYS].fails:
+    if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling with which one P serves all graphs, whenever they switch"
         yield holds(Topic.GAIN, _KIND, what, low, f"{low:.3g} to inf")
@@ -94,11 +94,11 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     ratio = high / low
     if not ratio > _WIDE:
         text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
-        return holds(Topic.SPREAD, _KIND, text, ratio, f"{ratio:.3g}")
+        return holds(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}")
     text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
     text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
     remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
-    return fails(Topic.SPREAD, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
+    return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
 
 
 def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
@@ -162,9 +162,9 @@ def _push_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[Statement]:
         return holds(name, _KIND, text, worst, each)
 
     text = "no push of that norm on all followers together takes any farther"
-    yield line(Topic.PUSHED, invariant_ellipsoid(loop.closed, E), text)
+    yield line(Topic.DISTURBANCE_NETWORK, invariant_ellipsoid(loop.closed, E), text)
     text = "the exact peak, for a push shaped like the worst eigenvector"
-    yield line(Topic.PUSHED_MODE, peak_gain(loop.closed, E), text)
+    yield line(Topic.DISTURBANCE_MODE, peak_gain(loop.closed, E), text)
 
 
 def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:

@@ -12,7 +12,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import at_limits, is_limited, trim_shortfall
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
@@ -68,7 +68,7 @@ def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = 
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 
-@program
+@cached_jit
 def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)
@@ -77,7 +77,7 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 
 def _trim_held(case: Case) -> Statement:
     """Within limits an agent holds its trim only if its actuators deliver that input."""
-    model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_HELD
+    model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
     moved = case.parts.world.plant_for(model)
     if not (case.settings.limits and is_limited(moved)):
         return unneeded(name, Kind.PROOF, "no limit acts on the inputs")
@@ -107,14 +107,16 @@ def _exact(case: Case) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
     if not case.disturbed:
         text = "states are known exactly, and nothing disturbs the agents"
-        return holds(Hypothesis.EXACT, Kind.PROOF, text)
+        return holds(Hypothesis.EXACT_STATES, Kind.PROOF, text)
     text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
-    return fails(Hypothesis.EXACT, Kind.PROOF, text, remedy="leave it out to see what it costs")
+    return fails(
+        Hypothesis.EXACT_STATES, Kind.PROOF, text, remedy="leave it out to see what it costs"
+    )
 
 
 def _agreement(case: Case) -> Statement:
     """Several leaders are one if they start alike and do the same; else nobody can follow all."""
-    name, leaders = Hypothesis.AGREEMENT, case.leaders
+    name, leaders = Hypothesis.LEADERS_AGREE, case.leaders
     if len(leaders.starts) == 1:
         return unneeded(name, Kind.PROOF, "there is one")
     if leaders.agree:
@@ -148,7 +150,9 @@ def _drifting(case: Case) -> Statement:
         "agents then end in the leaders' convex hull"
     )
     number = away.most, f"{away.most:.3g} {unit}apart"
-    return fails(Hypothesis.AGREEMENT, Kind.SAMPLES, text, *number, remedy=remedy, reason=reason)
+    return fails(
+        Hypothesis.LEADERS_AGREE, Kind.SAMPLES, text, *number, remedy=remedy, reason=reason
+    )
 
 
 def _symmetric(case: Case) -> Statement:
@@ -191,7 +195,7 @@ def _smooth(case: Case) -> Statement:
 
 
 def _matched(case: Case) -> Statement:
-    name, leaders = Hypothesis.MATCHED, case.leaders
+    name, leaders = Hypothesis.MATCHED_MOTION, case.leaders
     remedy = (
         "`feedforward: relay` removes the lag, and asks for the leader's input at every follower"
     )

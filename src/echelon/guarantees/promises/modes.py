@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echelon.core.linear import held_radius
+from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.case import Case
@@ -38,26 +38,26 @@ def _linear(case: Case) -> Iterator[Statement]:
 
 def _bent(case: Case) -> Iterator[Statement]:
     """Yield what is left of these lines where there is no linearization: what a region says."""
-    for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLED, Hypothesis.ALONG):
+    for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
         yield vacuous(name, _LINEAR, _BENT)
     region = case.region
     if region is None or region.theorem is Theorem.A5:
-        yield vacuous(Hypothesis.DECAYS, _LINEAR, _BENT)
+        yield vacuous(Hypothesis.DISAGREEMENT_DECAY, _LINEAR, _BENT)
     else:
         text = "by the slopes of all sides of the trim, where the model bends"
         rate = -region.rate
-        yield holds(Hypothesis.DECAYS, region.kind, text, rate, f"{rate:.3g} 1/s")
+        yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{rate:.3g} 1/s")
     yield _held_beside(case)
 
 
 def _held_beside(case: Case) -> Statement:
     """Whether each side of a bend decays in steps of the integrator, as if it were all around."""
-    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
+    name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     shown = f"dt {settings.dt:g} s"
     if case.region is None or case.beside is None:
         return vacuous(name, Kind.SAMPLES, _BENT, None, shown)
     A, dt = case.beside[:, None], settings.dt
-    radius = held_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
+    radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
     text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
         return holds(name, Kind.SAMPLES, text, radius, shown)
@@ -90,19 +90,19 @@ def _detectable(case: Case) -> Statement:
 def _coupled(case: Case) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
-        return holds(Hypothesis.COUPLED, Kind.PROOF, "no edge known", c, f"c {c:.4g}")
+        return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge known", c, f"c {c:.4g}")
     number = c, f"c {c:.4g}, edge {edge:.4g}"
     if c >= edge:
         text = "from the edge on every mode decays: near the trim, of linear agents anywhere"
-        return holds(Hypothesis.COUPLED, Kind.PROOF, text, *number)
+        return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
     text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
     remedy = f"raise `coupling` to {edge:.4g} or more"
-    return fails(Hypothesis.COUPLED, Kind.PROOF, text, *number, remedy=remedy)
+    return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
 
 def _decaying(case: Case) -> Statement:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    name, loop = Hypothesis.DECAYS, case.loop
+    name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
     if not case.governed:
         law = isinstance(case.parts.drive, Laws)
         text = "the followers' law does not act on the disagreement"
@@ -146,7 +146,7 @@ def _taking_turns(case: Case) -> Statement:
 
 def _along(case: Case) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
-    name, frozen = Hypothesis.ALONG, case.frozen
+    name, frozen = Hypothesis.ALONG_PATH, case.frozen
     if not (case.loop.every and case.governed):
         return unneeded(name, Kind.SAMPLES, "there is nothing to lose")
     if frozen is None or not frozen.travelled:
@@ -167,7 +167,7 @@ def _along(case: Case) -> Statement:
 
 def held(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
-    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
+    name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
         return unneeded(name, _LINEAR, "there is nothing to lose", None, f"dt {settings.dt:g} s")
     radius, printed = loop.radius(settings), settings.integrator == "printed"
@@ -189,11 +189,11 @@ def _step(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
     dt = case.settings.dt
     number = radius, f"dt {dt:g} s"
     if radius < 1.0:
-        return holds(Hypothesis.STEP, _LINEAR, text, *number)
+        return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
     if not remedy:
         longest = longest_step(case.loop, case.frozen, case.settings)
         remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
     # Where agents start it lasts a moment, and a promise is of starts near the goals.
     reason = "" if "agents start" in text else "with the input held over the step `dt` it grows"
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
-    return fails(Hypothesis.STEP, _LINEAR, text, *number, remedy=remedy, reason=reason)
+    return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

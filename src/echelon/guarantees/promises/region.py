@@ -58,7 +58,7 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
         return _beside_bends(parts, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
-        return Region(None, None, unneeded(_NAME, Kind.PROOF, text, shown="none"))
+        return Region(None, None, unneeded(_NAME, Kind.PROOF, text, number_text="none"))
     try:
         found = _computed(parts, gain, gain.certificate.region)
     except GainError as error:
@@ -82,7 +82,7 @@ def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     It has no linearization there, but a hull holds the slopes of all its sides nearby.
     """
     text = "the slopes beside the trim, where the model bends, do not all contract in P"
-    none = unneeded(_NAME, Kind.VERTICES, text, shown="none")
+    none = unneeded(_NAME, Kind.VERTICES, text, number_text="none")
     try:
         pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
         found = pairs and _contraction(parts, gain, pairs, exact=False)

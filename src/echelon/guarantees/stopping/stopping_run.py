@@ -11,8 +11,8 @@ import scipy.linalg
 from echelon.agents.models.chains import flat_output, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import program
-from echelon.core.linear import held_radius
+from echelon.core.compiled import cached_jit
+from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind
@@ -131,7 +131,7 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun 
     return StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
 
 
-@program
+@cached_jit
 def _flat(
     model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
 ) -> jax.Array:
@@ -156,14 +156,14 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
     text = f"feedback makes chains of all {n} states and the integrators before inputs"
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
-    yield holds(Hypothesis.MATCHED, _PROOF, run.law.information[1])
-    yield holds(Hypothesis.COUPLED, _PROOF, "any coupling will do", c, f"c {c:.4g}, edge 0")
+    yield holds(Hypothesis.MATCHED_MOTION, _PROOF, run.law.information[1])
+    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling will do", c, f"c {c:.4g}, edge 0")
     text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
     if run.parts.graph.schedule is not None:
         text = "the slower of the slowest root and of what is left after a period, or in the end"
-    yield holds(Hypothesis.DECAYS, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
+    yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
     text = "the law is linear in flat coordinates wherever it goes"
-    yield unneeded(Hypothesis.ALONG, _PROOF, text)
+    yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
         yield _switching_line(run)
@@ -198,7 +198,7 @@ def _offsets_line(run: StoppingRun) -> Statement:
 def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
     assert run.law.reach is not None
-    name, dt, c = Hypothesis.STEP, run.settings.dt, run.coupling
+    name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
     share = c * run.law.reach.heaviest * dt
     radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
     led = float(run.leader.strength(dt)) * dt
@@ -236,7 +236,7 @@ def _held(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
         inner = np.append(0.0, stop[:-1])
         gains = inner + strengths[:, None] * stop
         dt, how = run.settings.dt, run.settings.integrator
-        found = max(found, held_radius(A, B, gains[:, None], dt, how))
+        found = max(found, sampled_radius(A, B, gains[:, None], dt, how))
     return found
 
 
@@ -291,10 +291,10 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     helps = "" if inner and current >= s else "set `observer: true`, or "
     remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
     number = asked, f"{asked:.3g}"
-    return fails(Hypothesis.EXACT, _PROOF, text, *number, remedy=remedy, reason=text)
+    return fails(Hypothesis.EXACT_STATES, _PROOF, text, *number, remedy=remedy, reason=text)
 
 
-@program
+@cached_jit
 def _pushed(
     model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
