@@ -15,7 +15,8 @@ from echelon.core.types import Array
 from echelon.laws.law import Law
 from echelon.simulation.codegen import Unsupported, is_installed
 from echelon.simulation.native.stepper import NativeStepper, beyond
-from echelon.simulation.step.loop import Loop, Moment, begin, control, step
+from echelon.simulation.step.loop import Loop, Moment
+from echelon.simulation.step.sequence import begin, control, step
 from echelon.simulation.step.settings import Settings
 
 _MANY = 200
@@ -130,9 +131,5 @@ class _ByJax(Mover):
 @program
 def _advance(loop: Loop, now: Moment, count: Array) -> tuple[Moment, Any]:
     """Take steps, and return the moment with the inputs (N, m) there."""
-
-    def one(_: jax.Array, now: Moment) -> Moment:
-        return step(loop, now, control(loop, now))
-
-    now = jax.lax.fori_loop(0, count, one, now)
+    now = jax.lax.fori_loop(0, count, lambda _, now: step(loop, now), now)
     return now, control(loop, now).inputs

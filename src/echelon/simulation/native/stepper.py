@@ -19,8 +19,9 @@ from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.native.wind_draws import draw_holds, holds_at_once
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, begin, begin_forgetful, stretch_at
+from echelon.simulation.step.loop import Loop, Moment, begin_forgetful, stretch_at
 from echelon.simulation.step.meter import ALWAYS, Sums
+from echelon.simulation.step.sequence import begin
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some hundredths of a second."""
@@ -350,7 +351,7 @@ class NativeStepper(Stepper):
             memories_of(self.memories[1], memory[self.followers]),
             cut.astype(np.int8),
         ]
-        return Moment._make(now), self._sums(first, step, kept)
+        return Moment(*now), self._sums(first, step, kept)
 
     def _clear_sums(self) -> None:
         rows = self.rows
