@@ -36,7 +36,9 @@ def parts(channel=None):
 
 
 def settings(**more):
-    return ech.Settings(**{"horizon": STEPS * DT, "dt": DT, "integrator": "euler", "engine": "jax", **more})
+    return ech.Settings(
+        **{"horizon": STEPS * DT, "dt": DT, "integrator": "euler", "engine": "jax", **more}
+    )
 
 
 def by_hand(late):

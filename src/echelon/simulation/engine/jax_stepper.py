@@ -68,6 +68,15 @@ class JaxStepper(Stepper):
         """Steps that take some tenths of a second, or a few of very many agents."""
         return _longest(len(self.states))
 
+    @property
+    def largest(self) -> float:
+        """The magnitude of states beyond which nothing is computed: none."""
+        return np.inf
+
+    def turn(self, loop: Loop) -> None:
+        """Continue in a loop that is like the one before but for its numbers."""
+        self.loop = loop
+
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
         return begin(self.loop, self.states)

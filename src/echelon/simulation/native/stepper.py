@@ -162,6 +162,11 @@ class NativeStepper(Stepper):
         more = int(_OPERATIONS[self.bits] / (self._work * agents))
         return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
 
+    @property
+    def largest(self) -> float:
+        """The magnitude of states beyond which kernels lose digits."""
+        return _LARGEST[self.bits]
+
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
         states = np.asarray(self.states, self.dtype)
@@ -214,7 +219,7 @@ class NativeStepper(Stepper):
                 self._run(step, count, first, table)
                 self._read(self.rows.input, u[k])
                 step += count
-            elif step == first or counts[k - 1]:
+            elif k == 0 or counts[k - 1]:
                 self._look(step, first, table, u[k])
             else:
                 u[k] = u[k - 1]
