@@ -168,7 +168,9 @@ def test_a_check_says_what_the_reference_asks(tmp_path, echelon):
     drift = {"name": "line", "velocity": [250, 0, 0]}
     checked = ech.check(*ech.build(ech.load_scenario("paper", [f"reference={json.dumps(drift)}"])))
     (line,) = [line for line in checked.lines if line.name == "reference, what it asks"]
-    assert line.verdict is Verdict.HOLDS and line.shown.startswith("250 m/s, 0 m/s^2, 0 % of the")
+    assert line.verdict is Verdict.HOLDS and line.number_text.startswith(
+        "250 m/s, 0 m/s^2, 0 % of the"
+    )
 
 
 SCENARIO = """
@@ -201,10 +203,10 @@ def test_a_scenario_names_a_path_of_states_by_its_file(tmp_path):
     ("change", "said"),
     [
         ("reference.file=none.csv", "is no line of names with lines of numbers below it"),
-        ("reference={name: circle, file: swing.csv}", "`circle` is made of its keys, and is read"),
+        ("reference={name: circle, file: swing.csv}", "`circle` does not read files"),
         ("model={name: van-der-pol}", "has the columns `rate`, `t`, `angle`, `torque`, and `Van"),
         ("reference={name: states, times: [0, 0], states: [[0]], inputs: [[0]]}", "increasing"),
-        ("leader={law: lqr, reacts: true}", "the law `lqr` cannot be told to react"),
+        ("leader={law: lqr, reacts: true}", "the law `lqr` cannot react to neighbours"),
         ("reference={name: states, file: swing.csv, times: [0, 1]}", "got `file` and `times`"),
     ],
 )

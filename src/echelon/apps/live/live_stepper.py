@@ -7,9 +7,10 @@ import jax
 from echelon.core.errors import MissingExtraError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array
-from echelon.simulation.codegen import Unsupported, is_installed
 from echelon.simulation.engine.jax_stepper import JaxStepper
+from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
 

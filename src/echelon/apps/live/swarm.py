@@ -14,7 +14,7 @@ from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
 from echelon.apps.live.knobs import Knobs, Panel
 from echelon.apps.live.live_stepper import choose_stepper
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import GraphError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array
@@ -221,7 +221,7 @@ class LiveLoop:
         return None if reference is None else np.asarray(reference, np.float64)
 
 
-@program
+@cached_jit
 def _reference_states(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
     return leader.reference_states(model, times)
 

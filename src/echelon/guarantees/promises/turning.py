@@ -13,7 +13,8 @@ import numpy as np
 
 from echelon.agents.models.heading import heading_gap, heading_index, heading_of, state_turn
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
+from echelon.core.rational import bisect
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
@@ -23,7 +24,7 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.certificates.lmi import rate_of
 from echelon.synthesis.gains.gain import Gain
 
-_NAME = Hypothesis.TURNING
+_NAME = Hypothesis.HEADING_FRAME
 _ROUNDS, _RESIDUAL = 20, 1e-10
 """Newton's, and what may be left of the rates, in units of the states."""
 _HALVINGS = 20
@@ -118,7 +119,7 @@ def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None
     return None
 
 
-@program
+@cached_jit
 def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return how a state and a normalized input z (n + m,) move in turning axes, with the slope."""
     n, spin = len(model.state_names), jnp.asarray(state_turn(model).slope)
@@ -131,7 +132,7 @@ def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Arra
     return left(z), jax.jacfwd(left)(z)
 
 
-@program
+@cached_jit
 def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the slopes of the motion at a state and a normalized input, A (n, n) and B (n, m)."""
 
@@ -143,10 +144,9 @@ def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array
 
 def _fastest(case: Case, rate: float) -> float:
     """Return up to which rate of a turn this way modes decay, rad/s, by halving."""
-    low, high = 0.0, abs(rate)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        slowest = slowest_in_turn(case, float(np.copysign(middle, rate)))
-        decays = slowest is not None and slowest < 0.0
-        low, high = (middle, high) if decays else (low, middle)
-    return low
+
+    def decays(size: float) -> bool:
+        slowest = slowest_in_turn(case, float(np.copysign(size, rate)))
+        return slowest is not None and slowest < 0.0
+
+    return bisect(decays, 0.0, abs(rate), _HALVINGS)

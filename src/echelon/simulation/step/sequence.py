@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from echelon.agents.network.exchange import Difference, Exchange
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Inputs, States
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.step.action import Action, act, limit_sides
@@ -17,7 +17,7 @@ from echelon.simulation.step.loop import Loop, Moment, WorldState
 from echelon.simulation.step.meter import Sums, reference_at
 
 
-@program
+@cached_jit
 def begin(loop: Loop, states: States) -> Moment:
     """Return the moment at which a run begins from states (N, n)."""
 
@@ -103,7 +103,7 @@ def _by_depth(loop: Loop, now: Moment, led: Action, act_all: Callable[..., Actio
 # ---- what is sent and received -------------------------------------------------------------------
 
 
-@program
+@cached_jit
 def signals(
     loop: Loop, now: Moment, offsets: Float[jax.Array, "N n"]
 ) -> Float[jax.Array, "N s"] | None:
@@ -180,7 +180,7 @@ def measured_step(
     return _move(loop, now, acted), loop.meter.read(*moment, acted.limited, chatter, followed)
 
 
-@program
+@cached_jit
 def advance(
     loop: Loop, now: Moment, counts: jax.Array, reference: Array | None, first: jax.Array | int
 ) -> tuple[Moment, tuple[Any, Any], Sums]:
@@ -203,7 +203,7 @@ def advance(
     return now, stored, sums
 
 
-@program
+@cached_jit
 def final_states(loop: Loop, starts: jax.Array, steps: int) -> jax.Array:
     """Return the states (S, N, n) after `steps` steps from each of the starts (S, N, n)."""
 
