@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.agents.models.heading import Heading, heading_gap, input_turn, state_turn, turned
+from echelon.agents.models.heading import Heading
+from echelon.agents.models.heading_symmetry import heading_gap, input_turn, state_turn
 from echelon.core.errors import LawError, ModelError
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.guarantees.promises.turning import steady_turn

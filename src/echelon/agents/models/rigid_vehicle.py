@@ -16,7 +16,6 @@ from echelon.agents.models.model import (
 )
 from echelon.core.types import Output, State
 
-
 # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three factors passes 0 unless z'' passes -g.
 # Each vehicle states the bound itself: stated by a base class it would also hold for subclasses
 # that change the motion, and nobody relies on it there.
