@@ -48,7 +48,7 @@ def leader_rmse(result: ech.Result) -> float:
 
 Row = tuple[str, str, str]
 
-ORACLES = """Asserted by `tests/test_simulate.py`, against code that shares nothing with echelon:
+ORACLES = """Asserted by `tests/simulation/test_simulate.py`, against independent code:
 
 | what | found | asserted |
 |---|---|---|

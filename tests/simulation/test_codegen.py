@@ -343,7 +343,7 @@ def test_what_is_no_number_is_picked_and_ordered_as_by_jax():
     ],
 )
 def test_what_is_too_much_to_pick_from_is_told(function, told):
-    with pytest.raises(Unsupported, match=f"{told} in .*test_kernels.py, line"):
+    with pytest.raises(Unsupported, match=f"{told} in .*test_codegen.py, line"):
         text_of(function, 3)
 
 
@@ -569,7 +569,7 @@ def ends_by_itself(v):
 def test_what_has_no_code_is_told_with_file_and_line(function, told):
     with pytest.raises(Unsupported, match=told) as caught:
         text_of(function, 3)
-    assert "test_kernels.py, line" in str(caught.value)
+    assert "test_codegen.py, line" in str(caught.value)
 
 
 @pytest.mark.parametrize(

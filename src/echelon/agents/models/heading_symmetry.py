@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from echelon.agents.models.heading import Heading, Turn
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Input, Scalar, State
 
@@ -84,7 +84,7 @@ def check_heading(model: ControlAffine) -> None:
         )
 
 
-@kept
+@memoize
 def heading_gap(model: ControlAffine) -> float:
     """Return how far f and g are from turning with the heading, at samples, relative to their size.
 
@@ -99,7 +99,7 @@ def heading_gap(model: ControlAffine) -> float:
     return float((gaps / np.maximum(1.0, sizes)).max())
 
 
-@program
+@cached_jit
 def _gaps(
     model: ControlAffine, x: Float[jax.Array, "S n"], angles: Float[jax.Array, " S"]
 ) -> tuple[jax.Array, jax.Array]:

@@ -17,13 +17,13 @@ def report(
     """Write a run as one HTML page: table, promise, figures, scenario, versions, how to cite."""
     file = Path("report.html") if out is None else out
     check_target(file, force)
-    from echelon.core.files import write_whole
+    from echelon.core.files import write_atomic
     from echelon.output.archive.open_folder import open_run
     from echelon.output.archive.report_page import report_page
 
     page = report_page(open_run(run), run if run.is_dir() else None)
     try:
-        write_whole(file, page)
+        write_atomic(file, page)
     except OSError as error:
         raise OutputError(f"`{file}` cannot be written: {error.strerror or error}.") from error
     print(f"- Written to {file}: {len(page) / 1e6:.2f} MB, one file that needs no network.")

@@ -44,10 +44,10 @@ def view(
     if html is None:
         show_page(page, port, browser)
         return
-    from echelon.core.files import write_whole
+    from echelon.core.files import write_atomic
 
     try:
-        write_whole(html, page)
+        write_atomic(html, page)
     except OSError as error:
         raise OutputError(f"`{html}` cannot be written: {error.strerror or error}.") from error
     print(f"- Written to {html}: {len(page) / 1e6:.2f} MB, one file that needs no network.")

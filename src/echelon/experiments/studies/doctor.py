@@ -63,7 +63,7 @@ def checks() -> Iterator[Check]:
     )
     for test in tests:
         # What an earlier command found says nothing of this machine as it is now.
-        with numerics.precision("float64"), disk_cache.opened(None):
+        with numerics.precision("float64"), disk_cache.use_folder(None):
             check = test()
         yield check
 

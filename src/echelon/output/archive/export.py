@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError, did_you_mean, listing
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.experiments.results.recording import Recording
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def export(run: Recording, file: Path, kind: str) -> None:
         )
     content = _WRITERS[kind](run)
     try:
-        write_whole(file, content)
+        write_atomic(file, content)
     except OSError as error:
         raise OutputError(f"`{file}` cannot be written: {error.strerror or error}.") from error
 

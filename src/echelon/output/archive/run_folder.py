@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from echelon.core.errors import OutputError
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import labelled, save_dataset, summary
 from echelon.experiments.results.recording import recording
@@ -73,8 +73,8 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
         save_dataset(data, folder / DATA)
         # NaN is no JSON: whoever reads the file with another parser would stop there.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
-        write_whole(folder / SUMMARY, content + "\n")
-        write_whole(folder / "report.txt", report(result) + "\n")
+        write_atomic(folder / SUMMARY, content + "\n")
+        write_atomic(folder / "report.txt", report(result) + "\n")
         if result.drive.gain is not None:
             save_gain(result.drive.gain, result.model, result.graph, folder / GAIN)
         if figures and len(result.times):
@@ -88,6 +88,6 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
 
 def _write(folder: Path, name: str, text: str) -> None:
     try:
-        write_whole(folder / name, text)
+        write_atomic(folder / name, text)
     except OSError as error:
         raise unwritable(folder, error) from error
