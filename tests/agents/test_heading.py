@@ -10,7 +10,12 @@ import pytest
 
 import echelon as ech
 from echelon.agents.models.heading import Heading
-from echelon.agents.models.heading_symmetry import heading_gap, input_turn, state_turn
+from echelon.agents.models.heading_symmetry import (
+    heading_gap,
+    input_turn,
+    rotate_state,
+    state_turn,
+)
 from echelon.core.errors import LawError, ModelError
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.guarantees.promises.turning import steady_turn
