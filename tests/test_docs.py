@@ -178,9 +178,9 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     section = page("extending.md").read_text("utf-8").partition("## A gain method")[2]
     code = re.search(r"class Decay.*?\n\n\n", section, re.DOTALL)[0]
     head = "import numpy as np\nimport scipy.linalg\n\nimport echelon as ech\n\n\n"
-    (package / "gains" / "decay.py").write_text(head + code, "utf-8")
+    (package / "synthesis/gains/decay.py").write_text(head + code, "utf-8")
     added = re.findall(r"^ (.+)\n\+(.+)$", section.partition("## A reference")[0], re.MULTILINE)
-    files = ("gains/__init__.py", "scenario/registry.py")
+    files = ("synthesis/gains/__init__.py", "experiments/scenario/registry.py")
     for file, (above, line) in zip(files, added, strict=True):
         text = (package / file).read_text("utf-8")
         assert text.count(f"{above}\n") == 1
@@ -305,11 +305,8 @@ def test_what_pages_quote_of_the_readme_has_no_relative_link():
 def test_the_theory_page_names_tests_that_exist():
     named = re.findall(r"`(test_\w+)\.py::(test_\w+)`", page("theory.md").read_text("utf-8"))
     assert len(named) >= 20
-    missing = [
-        f"{file}.py::{test}"
-        for file, test in named
-        if f"def {test}(" not in (ROOT / "tests" / f"{file}.py").read_text("utf-8")
-    ]
+    files = {path.stem: path.read_text("utf-8") for path in (ROOT / "tests").rglob("test_*.py")}
+    missing = [f"{f}.py::{test}" for f, test in named if f"def {test}(" not in files.get(f, "")]
     assert missing == []
 
 

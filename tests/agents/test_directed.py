@@ -302,7 +302,7 @@ def test_the_delay_that_is_left_is_that_of_the_delayed_network(graph):
     L = graph.grounded_laplacian().toarray()
     network = np.kron(np.eye(3), A), np.kron(L, gain.coupling * B @ gain.R_inverse @ B.T @ gain.P)
     assert abscissa(*network, 0.98 * delay) < 0.0 < abscissa(*network, 1.02 * delay)
-    spread = lines[Topic.SPREAD]
+    spread = lines[Topic.EIGENVALUE_RATIO]
     ratio = np.abs(np.linalg.eigvals(L)).max() / np.linalg.eigvals(L).real.min()
     assert spread.number == pytest.approx(ratio) and spread.fails and ratio > 4.0
     assert f"{1e3 * delay:.3g} ms old" in spread.text
@@ -339,7 +339,7 @@ def test_what_is_promised_of_a_linear_law_on_arrows_is_its_modes():
     lines = {
         line.statement: line for line in check(flown(RING, gain), ech.Settings(4.0, 0.01)).lines
     }
-    assert lines[Topic.GRAPH].fails and Topic.PUSHED not in lines
+    assert lines[Topic.GRAPH].fails and Topic.DISTURBANCE_NETWORK not in lines
 
 
 def test_a_region_on_arrows_is_smaller_by_their_skew_and_verified(tmp_path):

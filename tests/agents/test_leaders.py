@@ -80,7 +80,7 @@ def test_it_is_said_who_follows_whom(flown):
     )
     checked = ech.check(flown.parts, flown.settings)
     (line,) = [line for line in checked.lines if line.name == "who follows whom"]
-    assert line.text == said and line.shown == "3 leaders, 4 followers"
+    assert line.text == said and line.number_text == "3 leaders, 4 followers"
 
 
 def test_of_flocks_it_is_said_in_numbers():

@@ -9,7 +9,7 @@ from test_models import FAMILY
 
 from echelon.agents.models import ControlAffine, Linear, Pendulum, PlanarQuadrotor, Quadrotor
 from echelon.agents.models.linearization import Linearization, linearize, trim_slopes
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 
 
@@ -33,7 +33,7 @@ def counted():
     """A function kept per model, and the models that it was computed for."""
     models = []
 
-    @kept
+    @memoize
     def count(model):
         models.append(model)
         return len(models)

@@ -460,7 +460,7 @@ def test_a_cut_link_disappears_the_error_reacts_and_the_page_says_why(browser, p
 def click_link(shown, i, j):
     """Click the middle of a link, wherever it is now."""
     shown.evaluate("echelon.ask('pause', true)")
-    until(lambda: shown.evaluate("echelon.apps.live.paused"))
+    until(lambda: shown.evaluate("echelon.live.paused"))
     ends = np.array([shown.evaluate(f"echelon.whereOnScreen({k})") for k in (i, j)])
     box = shown.locator("#scene").bounding_box()
     shown.mouse.click(box["x"] + ends[:, 0].mean(), box["y"] + ends[:, 1].mean())
@@ -475,7 +475,7 @@ def test_a_slider_turns_its_knob_and_the_page_shows_places_that_are_the_loops(br
         shown.get_by_role("slider", name="formation size").fill("900")
         until(lambda: session.knobs.size > 2.0)
         shown.evaluate("echelon.ask('pause', true)")
-        until(lambda: shown.evaluate("echelon.apps.live.paused"))
+        until(lambda: shown.evaluate("echelon.live.paused"))
         time = shown.evaluate("echelon.time")
         until(lambda: shown.evaluate("echelon.time") == time and session.paused)
         states = session.swarm.advance(still=True).states

@@ -18,7 +18,7 @@ from runs import OWN_PENDULUM
 
 import echelon as ech
 from echelon.core import files
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.laws.law import Law
 from echelon.output.archive.chunks import Chunks
 from echelon.simulation.engine import simulate as engine
@@ -292,20 +292,20 @@ def test_a_disk_that_fills_while_a_run_lasts_ends_it_and_it_goes_on_later(
 def test_a_file_that_cannot_be_written_is_what_it_was(here):
     (here / "gain.json").write_text("precious")
     with pytest.raises(OSError):
-        under(1000, write_whole, here / "gain.json", "x" * 2000)
+        under(1000, write_atomic, here / "gain.json", "x" * 2000)
     assert (here / "gain.json").read_text() == "precious"
     assert not list(here.glob("*.part")) and not list(here.glob(".*"))
-    write_whole(here / "gain.json", "x" * 2000)
+    write_atomic(here / "gain.json", "x" * 2000)
     assert len((here / "gain.json").read_text()) == 2000
 
 
 def test_a_link_and_a_device_are_written_through(here):
     (here / "target").write_text("old")
     (here / "link").symlink_to("target")
-    write_whole(here / "link", "new")
+    write_atomic(here / "link", "new")
     assert (here / "link").is_symlink() and (here / "target").read_text() == "new"
     with pytest.raises(OSError):
-        write_whole(Path("/dev/full"), "anything")
+        write_atomic(Path("/dev/full"), "anything")
 
 
 # ---- folders and files of the user's ----

@@ -21,7 +21,7 @@ from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.core import compiled, disk_cache, memoize
 from echelon.core.compiled import CompiledFunction
-from echelon.core.memoize import stored
+from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
 from echelon.experiments.scenario.user_code import own_class
 
@@ -32,7 +32,7 @@ def folder(tmp_path, monkeypatch):
     forget()
     # Other tests of this process may have loaded a user's file.
     monkeypatch.setattr(disk_cache, "_closed", threading.Event())
-    with disk_cache.opened(tmp_path):
+    with disk_cache.use_folder(tmp_path):
         yield tmp_path
     forget()
 
@@ -48,7 +48,7 @@ class Own(VanDerPol):
 
 
 def place(*values):
-    return disk_cache.place_of("what", *values)
+    return disk_cache.file_for("what", *values)
 
 
 def sensitivity(model, x, scale):
@@ -147,7 +147,7 @@ def test_what_is_found_depends_on_every_bit_and_class():
     places = [place(value) for value in values]
     assert None not in places and len(set(places)) == len(values)
     assert place(VanDerPol(), array.copy()) == place(VanDerPol(), array)
-    assert disk_cache.place_of("another", 1) != place(1)
+    assert disk_cache.file_for("another", 1) != place(1)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_what_is_found_depends_on_every_bit_and_class():
 )
 def test_nothing_is_kept_for_a_strangers_class(value, folder):
     assert place(value) is None
-    assert stored(lambda: 3, "what", value) == 3 and list(folder.iterdir()) == []
+    assert load_or_compute(lambda: 3, "what", value) == 3 and list(folder.iterdir()) == []
 
 
 def test_other_sources_settings_and_versions_find_nothing(monkeypatch):
@@ -202,7 +202,7 @@ def test_nothing_is_kept_where_a_source_changed_since_the_process_began(folder, 
     before = place(1)
     monkeypatch.setattr(disk_cache, "_BEGAN", 0.0)
     # What was loaded after the change is no part of what was told before it.
-    assert stored(lambda: 3, "what", 1) == 3 and place(1) == before
+    assert load_or_compute(lambda: 3, "what", 1) == 3 and place(1) == before
     assert list(folder.iterdir()) == []
     forget()
     assert place(1) is None
@@ -239,9 +239,9 @@ def replaced(home):
 def test_a_source_that_changes_before_it_is_loaded_keeps_nothing(home, change):
     file = place(1)
     assert file is not None
-    disk_cache.keep(file, b"true")
+    disk_cache.write_if_unchanged(file, b"true")
     change(home)
-    disk_cache.keep(file, b"false")
+    disk_cache.write_if_unchanged(file, b"false")
     assert disk_cache.read(file) == b"true"
 
 
@@ -260,7 +260,7 @@ def test_what_a_killed_process_leaves_goes_with_the_oldest(folder, monkeypatch):
         at.setattr(os, "replace", killed)
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
-                disk_cache.keep(file, b"made")
+                disk_cache.write_if_unchanged(file, b"made")
     # Each by a name of its own, since two threads may write one file.
     assert len(set(begun)) == 2 and all(name.endswith("-cache") for name in begun)
     assert list(folder.iterdir()) == []
@@ -304,7 +304,7 @@ def test_nothing_is_kept_once_a_users_file_is_loaded(tmp_path, monkeypatch):
 
 
 def test_the_library_keeps_nothing(folder):
-    with disk_cache.opened(None):
+    with disk_cache.use_folder(None):
         assert place(1) is None and not disk_cache.is_open()
     assert place(1) is not None
 
@@ -312,10 +312,10 @@ def test_the_library_keeps_nothing(folder):
 def test_what_comes_back_is_equal_and_read_only(monkeypatch):
     model = Pendulum()
     inspect.unwrap(at_trim)(model)  # what it rests on is compiled
-    first = stored(lambda: inspect.unwrap(at_trim)(model), "at_trim", model)
-    again = stored(refused, "at_trim", model)
+    first = load_or_compute(lambda: inspect.unwrap(at_trim)(model), "at_trim", model)
+    again = load_or_compute(refused, "at_trim", model)
     assert isinstance(again, AtTrim) and again.gap == first.gap
     for a, b in zip(first[:-1], again[:-1], strict=True):
         np.testing.assert_array_equal(a, b)
         assert not b.flags.writeable or not b.size
-    assert memoize.kept(lambda value: value)(model) is model
+    assert memoize.memoize(lambda value: value)(model) is model

@@ -168,7 +168,7 @@ def test_the_region_is_told_and_the_promise_says_it(robust):
     assert lines["region of the gain"].verdict is Verdict.HOLDS
     assert lines["region of the gain"].kind is region.kind is Kind.VERTICES
     assert lines["region of the gain"].number == region.rate
-    assert lines["region of the gain"].shown == f"{region.rate:.3g} 1/s"
+    assert lines["region of the gain"].number_text == f"{region.rate:.3g} 1/s"
     assert found.promised and "corners of a hull" in found.sentence()
     assert f"{region.rate:.3g} 1/s or faster" in found.sentence() and "(T1)" in found.sentence()
     assert f"<= {region.radius:.3g}^2" in found.sentence()
@@ -207,7 +207,7 @@ def test_the_leader_s_excursion_is_taken_off_the_margin(robust):
 def test_a_leader_that_leaves_the_domain_leaves_no_set():
     lines, found = checked(ROBUST, leader={"law": "passive", "start_error": {"angle": 0.6}})
     line = lines["certified set"]
-    assert (line.verdict, line.shown, line.number) == (Verdict.FAILS, "empty", 0.0)
+    assert (line.verdict, line.number_text, line.number) == (Verdict.FAILS, "empty", 0.0)
     assert "the leader alone reaches 0.6 in `angle`, and the domain 0.5" in line.text
     assert "no start is certified" in found.sentence()
 
@@ -287,7 +287,9 @@ def test_a_linear_agent_is_certified_everywhere():
     model = {"name": "linear", "parameters": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}
     gain = {"method": "contraction", "domain": {}, "rate": 0.2}
     lines, found = checked({"gain": gain}, model=model)
-    assert lines["certified set"].shown == "radius inf" and "from everywhere" in found.sentence()
+    assert (
+        lines["certified set"].number_text == "radius inf" and "from everywhere" in found.sentence()
+    )
 
 
 # ---- what g does ----
@@ -415,7 +417,7 @@ def test_a_pushed_integrator_lags_by_its_slowest_mode():
     gain = {"method": "given", "P": "identity", "coupling": 3.0}
     lines, _ = checked({"gain": gain}, model={"name": "single-integrator"})
     for statement in ("disturbance, network", "disturbance, one mode"):
-        values = [float(part.split()[1]) for part in lines[statement].shown.split(", ")]
+        values = [float(part.split()[1]) for part in lines[statement].number_text.split(", ")]
         assert values == pytest.approx([1.0 / (3.0 * LOW)] * len(values), rel=5e-3)
         assert lines[statement].number == pytest.approx(1.0 / (3.0 * LOW), rel=1e-6)
 
@@ -424,7 +426,7 @@ def test_a_chain_of_integrators_passes_on_what_it_gets():
     gain = {"method": "given", "P": "identity", "coupling": 2.0}
     model = {"name": "single-integrator"}
     lines, _ = checked({"gain": gain}, model=model)
-    assert lines["string gain"].shown == "1, 1 over 3 links"
+    assert lines["string gain"].number_text == "1, 1 over 3 links"
     assert lines["string gain"].verdict is Verdict.NOT_NEEDED
     lines, _ = checked({"gain": gain}, model=model, graph={"name": "ring", "agents": 4})
     assert "string gain" not in lines
@@ -436,7 +438,7 @@ def test_a_parents_input_fed_forward_leaves_one_mode_on_any_tree():
     graph = {"name": "path", "agents": 11}
     lines, found = checked(follower, model={"name": "double-integrator"}, graph=graph)
     assert found.promised
-    assert lines["coupling"].shown == "c 1, edge 0.5"
+    assert lines["coupling"].number_text == "c 1, edge 0.5"
     # Q = R = I on (x, v): s^2 + sqrt(3) s + 1, whose roots have real part -sqrt(3)/2.
     assert lines["disagreement decays"].number == pytest.approx(-(3.0**0.5) / 2.0)
     assert found.rate == pytest.approx(3.0**0.5 / 2.0) and found.theorem is None

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 
 import echelon as ech
-from echelon.core.linear import exponential
+from echelon.core.linear import matrix_exponential
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Kind
 
@@ -16,7 +16,7 @@ def built(scenario, *changes):
     return ech.build(ech.load_scenario(scenario, list(changes)))
 
 
-def line_of(found, name=Hypothesis.ALONG):
+def line_of(found, name=Hypothesis.ALONG_PATH):
     return found.hypotheses[name]
 
 
@@ -69,7 +69,7 @@ def test_the_longest_step_is_that_of_the_steepest_tilt():
     assert found.longest_step(settings) == pytest.approx(steep, rel=0.1)
     assert found.longest_step(settings) < 0.6 * found.loop.longest_step(settings)
     too_long = settings._replace(dt=0.02)
-    line = line_of(ech.promise(parts, too_long), Hypothesis.STEP)
+    line = line_of(ech.promise(parts, too_long), Hypothesis.SAMPLING)
     assert line.fails and "along the leader's path" in line.text and "dt" in line.remedy
 
 
@@ -77,7 +77,7 @@ def test_a_step_too_long_for_the_starts_alone_takes_no_promise_away():
     changes = ["follower.gain={method: inner-loop}", "simulation.dt=0.01"]
     changes += ["initial={states: {2: [1, 0.8, 1, 0, 0, 0, 0.9, 0, 0, 0, 0, 0]}}"]
     found = ech.promise(*built("paper", *changes))
-    line = line_of(found, Hypothesis.STEP)
+    line = line_of(found, Hypothesis.SAMPLING)
     assert found.promised and line.fails and "where agents start" in line.text
 
 
@@ -94,6 +94,6 @@ def test_the_inner_loop_does_not_chatter_at_the_papers_own_step(seed):
 def test_flows_are_exponentials(scale):
     draws = np.random.default_rng(1)
     rates = scale * (draws.normal(size=(5, 3, 6, 6)) - 2.0 * np.eye(6))
-    for found, wanted in zip(exponential(rates), scipy.linalg.expm(rates), strict=True):
+    for found, wanted in zip(matrix_exponential(rates), scipy.linalg.expm(rates), strict=True):
         size = np.abs(wanted).max(axis=(1, 2), keepdims=True)
         np.testing.assert_allclose(found / size, wanted / size, rtol=0, atol=1e-11)

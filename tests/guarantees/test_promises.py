@@ -212,7 +212,7 @@ def test_one_step_of_the_integrator_that_runs_decides():
         with np.errstate(over="ignore"):
             sizes = np.linalg.norm(result.errors, axis=(1, 2))
         assert bool(sizes[-40:].max() < sizes[:40].max()) is holds
-    assert found.hypotheses[Hypothesis.STEP].number > 1.0
+    assert found.hypotheses[Hypothesis.SAMPLING].number > 1.0
 
 
 def test_the_printed_step_keeps_no_offset():
@@ -221,7 +221,7 @@ def test_the_printed_step_keeps_no_offset():
     parts = parts_of(model, ech.Graph.path(2), gain)
     assert ech.promise(parts, settings(integrator="printed", dt=1.0)).promised
     away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
-    step = ech.promise(away, settings(integrator="printed", dt=1.0)).hypotheses[Hypothesis.STEP]
+    step = ech.promise(away, settings(integrator="printed", dt=1.0)).hypotheses[Hypothesis.SAMPLING]
     assert step.fails and "forgets the goals" in step.text
 
 
@@ -236,7 +236,7 @@ def test_vehicles_that_cannot_hold_their_trim_are_promised_nothing(change):
     assert not found.promised
     told = "the actuators deliver `thrust` 0.2 of 0.2747 N, and cannot hold the trim"
     assert told in found.sentence()
-    assert found.hypotheses[Hypothesis.TRIM_HELD].number == pytest.approx(0.728, abs=1e-3)
+    assert found.hypotheses[Hypothesis.TRIM_WITHIN_LIMITS].number == pytest.approx(0.728, abs=1e-3)
     designs = ech.design(scenario, "riccati")
     assert not designs.recommended.promise.promised and told in designs.because
     assert told in " ".join(ech.report(ech.simulate(*built)).split())
@@ -257,10 +257,10 @@ def test_leaders_that_disagree_leave_no_proof_and_containment_is_said():
     together, apart = (leaders_apart(method, gap) for gap in (0.0, 1.0))
     found = ech.promise(together, settings())
     assert (found.theorem, found.kind) == (Theorem.T1, Kind.PROOF)
-    assert found.hypotheses[Hypothesis.AGREEMENT].verdict is Verdict.HOLDS
+    assert found.hypotheses[Hypothesis.LEADERS_AGREE].verdict is Verdict.HOLDS
     found = ech.promise(apart, settings(horizon=20.0))
     assert not found.promised and found.theorem is None and found.region is None
-    line = found.hypotheses[Hypothesis.AGREEMENT]
+    line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     assert line.fails and line.number == pytest.approx(1.0)
     assert "end in the leaders' convex hull" in found.sentence()
     # They do: the followers stand between the leaders, and off their goals for good.
@@ -273,7 +273,7 @@ def test_free_leaders_of_a_limit_cycle_are_said_to_drift_apart():
                "initial={states: {0: [2.0, 0.0], 6: [-1.0, 0.5]}}"]  # fmt: skip
     built = ech.build(ech.load_scenario("van-der-pol", changes))
     found, result = ech.promise(*built), ech.simulate(*built)
-    line = found.hypotheses[Hypothesis.AGREEMENT]
+    line = found.hypotheses[Hypothesis.LEADERS_AGREE]
     away = np.linalg.norm(result.states[:, 6] - result.states[:, 0], axis=1)
     assert not found.promised and line.number == pytest.approx(away.max(), rel=1e-2)
     assert "leader 6 starts 3.04 off the place that leader 0 gives it" in line.text
@@ -286,7 +286,7 @@ def test_leaders_that_come_together_leave_the_linearization():
     built = built._replace(parts=built.parts.replace(initial=states, start_error={}))
     found = ech.promise(*built)
     assert found.promised and found.theorem is None
-    assert "brings them together" in found.hypotheses[Hypothesis.AGREEMENT].text
+    assert "brings them together" in found.hypotheses[Hypothesis.LEADERS_AGREE].text
 
 
 def test_what_decays_unseen_is_no_cause():
@@ -463,7 +463,7 @@ def test_the_data_of_a_run_hold_the_whole_promise():
     told, data = ech.summary(result)["promise"], ech.dataset(result)
     assert told == ech.promise(parts, settings(horizon=0.1)).as_mapping()
     # Lines of laws that turn, of graphs that switch and of motors are there only where these are.
-    apart = {Hypothesis.TURNING, Hypothesis.SWITCHING, Hypothesis.LIMITS}
+    apart = {Hypothesis.HEADING_FRAME, Hypothesis.SWITCHING, Hypothesis.LIMITS}
     always = {h.value for h in Hypothesis if h not in apart}
     assert {each["statement"] for each in told["hypotheses"]} == always
     for each in told["hypotheses"]:
@@ -656,7 +656,9 @@ def test_a_step_too_long_for_one_side_of_a_bend_is_not_promised():
     parts = parts_of(model, PATH, gain)
     for dt, holds in ((0.005, True), (0.05, False)):
         promise = ech.promise(parts, settings(dt=dt))
-        assert promise.promised is holds and promise.hypotheses[Hypothesis.STEP].fails is not holds
+        assert (
+            promise.promised is holds and promise.hypotheses[Hypothesis.SAMPLING].fails is not holds
+        )
 
 
 def test_design_ranks_no_mode_of_a_model_that_bends():

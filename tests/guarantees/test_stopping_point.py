@@ -529,9 +529,13 @@ def override(*changes):
 @pytest.mark.parametrize(
     ("change", "line", "text"),
     [
-        ("follower.coupling=100", Hypothesis.STEP, "c d_max dt = 1.5 is above 1"),
-        ("leader.coupling=3000", Hypothesis.STEP, "too long for the leader: c dt = 15 is above 1"),
-        ("follower.coupling=66.6", Hypothesis.STEP, "lower `coupling` or `roots`"),
+        ("follower.coupling=100", Hypothesis.SAMPLING, "c d_max dt = 1.5 is above 1"),
+        (
+            "leader.coupling=3000",
+            Hypothesis.SAMPLING,
+            "too long for the leader: c dt = 15 is above 1",
+        ),
+        ("follower.coupling=66.6", Hypothesis.SAMPLING, "lower `coupling` or `roots`"),
         ("follower.speed=[1,1,5,1]", Hypothesis.SET, "lower the `speed` of `z` below 4.06"),
         ("follower.speed=inf", Hypothesis.SET, "lower the `speed` of `z` below 4.06"),
         ("initial.spread={vz: 40}", Hypothesis.STARTS, "is not proved to stay above -9.81"),

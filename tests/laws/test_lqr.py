@@ -168,7 +168,9 @@ def test_a_check_says_what_the_reference_asks(tmp_path, echelon):
     drift = {"name": "line", "velocity": [250, 0, 0]}
     checked = ech.check(*ech.build(ech.load_scenario("paper", [f"reference={json.dumps(drift)}"])))
     (line,) = [line for line in checked.lines if line.name == "reference, what it asks"]
-    assert line.verdict is Verdict.HOLDS and line.shown.startswith("250 m/s, 0 m/s^2, 0 % of the")
+    assert line.verdict is Verdict.HOLDS and line.number_text.startswith(
+        "250 m/s, 0 m/s^2, 0 % of the"
+    )
 
 
 SCENARIO = """

@@ -156,7 +156,7 @@ def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
 
 def test_no_failing_line_and_no_cause_is_without_a_remedy():
     with pytest.raises(AssertionError, match="fails without a remedy"):
-        Statement(Hypothesis.STEP, Verdict.FAILS, Kind.PROOF)
+        Statement(Hypothesis.SAMPLING, Verdict.FAILS, Kind.PROOF)
     with pytest.raises(TypeError):
         Cause("it fails")
 

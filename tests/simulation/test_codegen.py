@@ -14,8 +14,9 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
-from echelon.simulation.codegen import ScalarGraph, Unsupported, machine_code, needed, shortened
-from echelon.simulation.codegen.scalar import OPERATIONS
+from echelon.simulation.codegen import machine_code, shortened
+from echelon.simulation.scalars import ScalarGraph, Unsupported, needed
+from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
 rng = np.random.default_rng(7)
 WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)
@@ -343,7 +344,7 @@ def test_what_is_no_number_is_picked_and_ordered_as_by_jax():
     ],
 )
 def test_what_is_too_much_to_pick_from_is_told(function, told):
-    with pytest.raises(Unsupported, match=f"{told} in .*test_kernels.py, line"):
+    with pytest.raises(Unsupported, match=f"{told} in .*test_codegen.py, line"):
         text_of(function, 3)
 
 
@@ -569,7 +570,7 @@ def ends_by_itself(v):
 def test_what_has_no_code_is_told_with_file_and_line(function, told):
     with pytest.raises(Unsupported, match=told) as caught:
         text_of(function, 3)
-    assert "test_kernels.py, line" in str(caught.value)
+    assert "test_codegen.py, line" in str(caught.value)
 
 
 @pytest.mark.parametrize(

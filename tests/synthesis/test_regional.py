@@ -359,14 +359,14 @@ def test_the_papers_own_experiment_is_checked_line_by_line():
     assert not found.promised
     assert lines["detectability of (A, g'P)"].verdict is Verdict.FAILS
     assert lines["detectability of (A, g'P)"].number == 4
-    assert lines["detectability of (A, g'P)"].shown == "rank 4 of 12"
+    assert lines["detectability of (A, g'P)"].number_text == "rank 4 of 12"
     assert lines["finite condition on P"].verdict is Verdict.VACUOUS
     assert lines["LMI as printed"].verdict is Verdict.FAILS
     assert lines["Assumption 5, P-monotone drift"].verdict is Verdict.FAILS
     assert "no P > 0 can" in lines["Assumption 5, P-monotone drift"].text
     lines, found = verdicts("paper")
     assert found.promised and lines["disagreement decays"].verdict is Verdict.HOLDS
-    low, high = (float(part) for part in lines["gain margin"].shown.split(" to "))
+    low, high = (float(part) for part in lines["gain margin"].number_text.split(" to "))
     assert low <= 0.5 and high > 1e3
     assert all(isinstance(line.verdict, Verdict) for line in found.lines)
 

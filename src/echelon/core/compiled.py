@@ -45,7 +45,7 @@ class _CallArguments(NamedTuple):
     def key(self) -> Hashable:
         """Return what is equal for calls of one program."""
         kinds = tuple(map(type, self.leaves))
-        return self.tree, self.leaves, kinds, self.forms(), disk_cache.settings()
+        return self.tree, self.leaves, kinds, self.forms(), disk_cache.jax_settings()
 
     def forms(self) -> tuple[Hashable, ...]:
         """Return the shapes and types of the arrays."""
@@ -87,7 +87,7 @@ class CompiledFunction(Generic[_R]):
         """Return what is kept for a call, or compile and keep it; None where JAX is to do it."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         # Places stand for what is traced; other arrays are known by their numbers.
-        file = disk_cache.place_of(name, call.forms(), jax.tree.unflatten(call.tree, call.leaves))
+        file = disk_cache.file_for(name, call.forms(), jax.tree.unflatten(call.tree, call.leaves))
         if file is None:
             return None
         stored = disk_cache.read(file)
@@ -99,11 +99,11 @@ class CompiledFunction(Generic[_R]):
         # What cannot be written down is for JAX to keep from the next process on.
         with contextlib.suppress(Exception):
             packed = _OTHER if made is None else _packed(made)
-        disk_cache.keep(file, packed)
+        disk_cache.write_if_unchanged(file, packed)
         return made
 
 
-def program(function: Callable[..., _R]) -> Callable[..., _R]:
+def cached_jit(function: Callable[..., _R]) -> Callable[..., _R]:
     """Return a function that JAX compiles, of arrays of JAX's or of NumPy's."""
     return CompiledFunction(function)
 

@@ -36,7 +36,7 @@ class _Foreign(Exception):
 
 
 @contextlib.contextmanager
-def opened(folder: Path | None) -> Iterator[None]:
+def use_folder(folder: Path | None) -> Iterator[None]:
     """Keep all in a folder, or nothing, while the context lasts and in this process alone.
 
     The command line opens one: who imports the library may change what its classes do.
@@ -59,7 +59,7 @@ def close() -> None:
     _closed.set()
 
 
-def place_of(what: str, *values: Any) -> Path | None:
+def file_for(what: str, *values: Any) -> Path | None:
     """Return the file for what is made of some values; None where nothing may be kept.
 
     Args:
@@ -71,14 +71,14 @@ def place_of(what: str, *values: Any) -> Path | None:
         return None
     made = hashlib.sha256(ground)
     try:
-        for part in _told((what, settings(), values)):
+        for part in _told((what, jax_settings(), values)):
             made.update(b"%d:" % len(part) + part)
     except _Foreign:
         return None
     return folder / f"{made.hexdigest()}-made-cache"
 
 
-def settings() -> tuple[str, ...]:
+def jax_settings() -> tuple[str, ...]:
     """Return what is set, in this thread, that may change what JAX makes."""
     # Here, since the command line opens the store before it needs JAX.
     import jax
@@ -114,8 +114,8 @@ def read(file: Path) -> bytes | None:
     return None
 
 
-def keep(file: Path, made: bytes) -> None:
-    """Write what was made by echelon's sources to a file of `place_of`."""
+def write_if_unchanged(file: Path, made: bytes) -> None:
+    """Write what was made by echelon's sources to a file of `file_for`."""
     # A source that is loaded late may have changed since all were told.
     if _sources() == _loaded():
         write(file, made)

@@ -8,17 +8,17 @@ PART = ".part"
 """What the names of unfinished files end in."""
 
 
-def write_whole(path: Path, content: bytes | str) -> None:
+def write_atomic(path: Path, content: bytes | str) -> None:
     """Write a file that has all of the content or, where that fails, what it had before.
 
     Raises:
         OSError: it cannot be written.
     """
     data = content.encode() if isinstance(content, str) else content
-    make_whole(path, lambda part: _write(part, data))
+    make_atomic(path, lambda part: _write(part, data))
 
 
-def make_whole(path: Path, make: Callable[[Path], object]) -> None:
+def make_atomic(path: Path, make: Callable[[Path], object]) -> None:
     """Let `make` write a file under another name, and give it its own when it is complete.
 
     Raises:

@@ -101,7 +101,7 @@ def _used(jaxpr: Any) -> list[Any]:
     return found[::-1]
 
 
-def read_by(function: Callable[..., Any], *arguments: Any) -> list[bool]:
+def used_leaves(function: Callable[..., Any], *arguments: Any) -> list[bool]:
     """Return which leaves of the arguments the results of a function for JAX may rest on."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     read = {v for equation in _used(jaxpr) for v in equation.invars if not hasattr(v, "val")}
@@ -192,7 +192,7 @@ def _is_open(equation: Any, operands: list[np.ndarray]) -> bool:
     return first is not None and any(a.dtype == object for a in operands[first[0] : first[1]])
 
 
-def each(function: Callable[..., object], *arrays: np.ndarray) -> np.ndarray:
+def map_entries(function: Callable[..., object], *arrays: np.ndarray) -> np.ndarray:
     """Return a function of one entry of each array, entry by entry."""
     # Of arrays without axes `frompyfunc` makes a bare entry, and the walk needs arrays throughout.
     return np.asarray(np.frompyfunc(function, len(arrays), 1)(*arrays), dtype=object)
@@ -217,7 +217,7 @@ def _place(
         # `gather` fills what it reads from outside with NaN, which no comparison holds for.
         return pool[int(place)] if 0.0 <= place < len(pool) else outside()
 
-    return [each(entry, r) for r in compute(equation, places)]
+    return [map_entries(entry, r) for r in compute(equation, places)]
 
 
 def _add(
@@ -234,7 +234,9 @@ def _add(
     weights = np.asarray(jax.vmap(result)(jnp.eye(len(pool))))
     total = np.full(weights.shape[1:], constant(0.0), object)
     for entry, weight in zip(pool, weights, strict=True):
-        total = total + each(lambda w, p=entry: constant(w) * p if w else constant(0.0), weight)
+        total = total + map_entries(
+            lambda w, p=entry: constant(w) * p if w else constant(0.0), weight
+        )
     return total
 
 
@@ -255,7 +257,7 @@ def _label_entries(operands: Sequence[np.ndarray]) -> tuple[list[Any], list[np.n
 
 def entrywise(function: Callable[..., object]) -> Rule:
     """Return the rule of a function of entries, which the primitive's parameters do not change."""
-    return lambda params, *arrays: each(function, *arrays)
+    return lambda params, *arrays: map_entries(function, *arrays)
 
 
 def reduction(join: Callable[[Any, Any], Any], of_none: Any) -> Rule:

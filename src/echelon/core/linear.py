@@ -15,7 +15,7 @@ _DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
 _AXIS = 64 * float(np.finfo(float).eps)  # of the fastest mode's rate, that of rounding
 
 
-def held_step(
+def discretize(
     A: np.ndarray, B: np.ndarray, dt: float, integrator: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (F, G) of a step x+ = F x + G u of xdot = A x + B u, u held over dt (s).
@@ -37,7 +37,7 @@ def held_step(
     return moved[..., :n], moved[..., n:]
 
 
-def exponential(X: np.ndarray) -> np.ndarray:
+def matrix_exponential(X: np.ndarray) -> np.ndarray:
     """Return exp(X) of matrices (..., n, n), all scaled and squared alike.
 
     SciPy's waits on other threads for each of a stack of small matrices; products of a stack do
@@ -55,7 +55,7 @@ def exponential(X: np.ndarray) -> np.ndarray:
     return found
 
 
-def held_radius(
+def sampled_radius(
     A: np.ndarray, B: np.ndarray, gains: np.ndarray, dt: float, integrator: str | None = None
 ) -> float:
     """Return the largest spectral radius of a step of xdot = A x - B K x(t_k), u held over dt.
@@ -67,7 +67,7 @@ def held_radius(
         dt: s.
         integrator: its name; the exact flow without.
     """
-    F, G = held_step(A, B, dt, integrator)
+    F, G = discretize(A, B, dt, integrator)
     return float(np.abs(np.linalg.eigvals(F - G @ gains)).max())
 
 
@@ -78,14 +78,14 @@ def longest_step(
 
     The step is lengthened by tenths from a thousandth of the fastest mode's time until a loop
     grows, and that last tenth is bisected; infinite where none grows up to a thousand times the
-    slowest mode's. Shapes are those of `held_radius`.
+    slowest mode's. Shapes are those of `sampled_radius`.
     """
     poles = np.linalg.eigvals(A - B @ gains)
     # A mode on the imaginary axis has no slowest time; 1e-9 1/s keeps the search finite.
     dt, end = 1e-3 / np.abs(poles).max(), 1e3 / max(1e-9, float(np.abs(poles.real).min()))
 
     def decays(dt: float) -> bool:
-        return held_radius(A, B, gains, dt, integrator) < 1.0
+        return sampled_radius(A, B, gains, dt, integrator) < 1.0
 
     while decays(1.1 * dt):
         dt *= 1.1
@@ -99,7 +99,7 @@ def longest_step(
     return float(low)
 
 
-def in_words(eigenvalue: complex) -> str:
+def eigenvalue_text(eigenvalue: complex) -> str:
     """Return an eigenvalue as text, without an imaginary part that is zero."""
     # Adding zero makes 0.0 of -0.0, whose sign would read as decay.
     real = f"{eigenvalue.real + 0.0:.3g}"

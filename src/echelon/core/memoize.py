@@ -22,7 +22,7 @@ _LARGE = 4096
 """Bytes of an array of which a digest is remembered."""
 
 
-def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
+def memoize(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return a function that computes once for all arguments of the same classes and values.
 
     They are compared bit by bit, since arrays may be changed in place and their identity says
@@ -33,7 +33,9 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
     @functools.lru_cache(_MOST)
     def answer(call: "_MemoKey") -> _R:
         name = f"{function.__module__}.{function.__qualname__}"
-        return stored(lambda: function(*call.args, **call.named), name, call.args, call.named)
+        return load_or_compute(
+            lambda: function(*call.args, **call.named), name, call.args, call.named
+        )
 
     @functools.wraps(function)
     def once(*args: _P.args, **named: _P.kwargs) -> _R:
@@ -47,9 +49,9 @@ def kept(function: Callable[_P, _R]) -> Callable[_P, _R]:
     return once
 
 
-def stored(make: Callable[[], _R], what: str, *values: Any) -> _R:
+def load_or_compute(make: Callable[[], _R], what: str, *values: Any) -> _R:
     """Return what is made of values, or what another process has made and kept of the same."""
-    file = disk_cache.place_of(what, *values)
+    file = disk_cache.file_for(what, *values)
     if file is None:
         return make()
     packed = disk_cache.read(file)
@@ -62,7 +64,7 @@ def stored(make: Callable[[], _R], what: str, *values: Any) -> _R:
     with contextlib.suppress(Exception):
         # Arrays apart, so that they are read-only when they come back.
         body = pickle.dumps(made, 5, buffer_callback=parts.append)
-        disk_cache.keep(file, pickle.dumps([body, *(bytes(part) for part in parts)]))
+        disk_cache.write_if_unchanged(file, pickle.dumps([body, *(bytes(part) for part in parts)]))
     return made
 
 

@@ -36,7 +36,7 @@ def euler(field: Field, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
     return x + dt * field(x, u)
 
 
-def printed(field: Field, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
+def printed_update(field: Field, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
     """Apply Algorithm 1 as the paper prints it, x <- f + g u (literal: there is no dt)."""
     return field(x, u)
 
@@ -44,7 +44,7 @@ def printed(field: Field, x: jax.Array, u: jax.Array, dt: float) -> jax.Array:
 INTEGRATORS: dict[str, Callable[[Field, jax.Array, jax.Array, float], jax.Array]] = {
     "rk4": rk4,
     "euler": euler,
-    "printed": printed,
+    "printed": printed_update,
 }
 
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 _PAGES: Final = {"result": "echelon.output.archive.notebook:result_page"}
 
 
-def page_of(kind: str, value: Any) -> str:
+def notebook_page(kind: str, value: Any) -> str:
     """Return a value as HTML."""
     module, _, name = _PAGES[kind].partition(":")
     return getattr(importlib.import_module(module), name)(value)

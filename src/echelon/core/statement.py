@@ -10,18 +10,18 @@ class Hypothesis(Word):
     """What a promise rests on; the value is what tables call it."""
 
     TRIM_APPLIED = "Definition 1, f(0) = 0"
-    TRIM_HELD = "trim within the limits"
-    EXACT = "Assumption 3, exact states"
-    AGREEMENT = "leaders agree"
+    TRIM_WITHIN_LIMITS = "trim within the limits"
+    EXACT_STATES = "Assumption 3, exact states"
+    LEADERS_AGREE = "leaders agree"
     SYMMETRY = "offsets are symmetries"
     SMOOTH = "smooth at the trim"
     DETECTABLE = "detectability of (A, g'P)"
-    MATCHED = "leader's motion is matched"
-    COUPLED = "coupling"
-    DECAYS = "disagreement decays"
-    ALONG = "law along the leader's path"
-    TURNING = "law turns with the heading"
-    STEP = "step, input held"
+    MATCHED_MOTION = "leader's motion is matched"
+    COUPLING = "coupling"
+    DISAGREEMENT_DECAY = "disagreement decays"
+    ALONG_PATH = "law along the leader's path"
+    HEADING_FRAME = "law turns with the heading"
+    SAMPLING = "step, input held"
     SWITCHING = "graphs that take turns"
     REGION = "region of the gain"
     SET = "certified set"
@@ -35,25 +35,25 @@ class Topic(Word):
 
     AUTONOMOUS = "Assumption 1, autonomous"
     GRAPH = "Assumption 2, graph"
-    FOLLOWS = "who follows whom"
+    PARENTS = "who follows whom"
     GROUNDED = "Assumption 6, M L = I"
     POSITIVE = "Lemma 1, L > 0"
     SCHUR = "Lemma 2, Schur complement"
     EDGES = "Lemma 3, sum over edges"
-    TRACKS = "Assumption 4, leader tracks"
-    ASKED = "reference, what it asks"
+    LEADER_TRACKING = "Assumption 4, leader tracks"
+    REFERENCE_DEMAND = "reference, what it asks"
     MONOTONE = "Assumption 5, P-monotone drift"
-    ALONG = "Lemma 4, drift along z"
-    PRINTED = "LMI as printed"
+    DRIFT_ALONG_Z = "Lemma 4, drift along z"
+    LMI_AS_PRINTED = "LMI as printed"
     FINITE = "finite condition on P"
     KILLING = "Killing residual of g"
     MARGINS = "margins"
     GAIN = "gain margin"
     DELAY = "delay margin"
-    SPREAD = "lambda_max by lambda_min"
+    EIGENVALUE_RATIO = "lambda_max by lambda_min"
     SCALING = "input scaling"
-    PUSHED = "disturbance, network"
-    PUSHED_MODE = "disturbance, one mode"
+    DISTURBANCE_NETWORK = "disturbance, network"
+    DISTURBANCE_MODE = "disturbance, one mode"
     STRING = "string gain"
 
 
@@ -78,7 +78,7 @@ class Statement:
         verdict: whether it holds.
         kind: of the argument.
         number: behind the verdict; None where there is none.
-        shown: the number as a table has it, with its unit.
+        number_text: the number as a table has it, with its unit.
         text: what was found, in words.
         remedy: what would be needed; empty where nothing fails.
         reason: what the failure says against any promise; empty where it leaves one.
@@ -88,7 +88,7 @@ class Statement:
     verdict: Verdict
     kind: Kind
     number: float | None = None
-    shown: str = ""
+    number_text: str = ""
     text: str = ""
     remedy: str = ""
     reason: str = ""
@@ -125,7 +125,7 @@ class Statement:
             "verdict": str(self.verdict),
             "kind": str(self.kind),
             "number": self.number if finite else None,
-            "shown": self.shown,
+            "shown": self.number_text,
             "text": self.text,
             "remedy": self.remedy,
         }

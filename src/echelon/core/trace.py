@@ -103,7 +103,7 @@ def check_function(
     Raises:
         Exception: the one that `fault` makes, for the first fault found.
     """
-    found = traced(fault, what, function, *arguments, advice=advice)
+    found = checked_trace(fault, what, function, *arguments, advice=advice)
     check_array(fault, what, found.result, shape)
 
 
@@ -130,7 +130,7 @@ def check_array(
         )
 
 
-def traced(
+def checked_trace(
     fault: Callable[[str], Exception],
     what: str,
     function: Callable[..., Any],
@@ -149,7 +149,7 @@ def traced(
         raise
     # It is anyone's code: whatever it raises is its own fault, and stays attached as the cause.
     except Exception as error:
-        raise fault(f"{what} fails with {in_short(error)}; {advice}.") from error
+        raise fault(f"{what} fails with {error_summary(error)}; {advice}.") from error
     if found.rounds:
         raise fault(
             f"{what} casts float64 numbers to fewer digits, and must keep the type of its "
@@ -163,7 +163,7 @@ def traced(
     return found
 
 
-def in_short(error: BaseException) -> str:
+def error_summary(error: BaseException) -> str:
     """Return the class and the first line of somebody else's error, without a full stop."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[0].rstrip('.:') if lines else 'no message'}"

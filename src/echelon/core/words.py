@@ -42,7 +42,7 @@ class Frame(Word):
     HEADING = "axes that turn with the heading that the leader follows, which is forwarded"
 
 
-class Hears(Word):
+class NeighbourChoice(Word):
     """Which of its neighbours an agent under the law `stopping-point` hears."""
 
     ALL = "all of its neighbours"

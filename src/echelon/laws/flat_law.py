@@ -11,7 +11,7 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains, chains_of, check_bounds, flatten, switch_on
 from echelon.agents.models.model import ControlAffine, FlatBound
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, ModelError, listing
 from echelon.core.types import Array, Input, State
 from echelon.laws.flat_loop import FlatLoop, FlatMemory
@@ -305,7 +305,7 @@ def _charted(model: ControlAffine, name: str, value: float) -> bool:
     return low < value < high
 
 
-@program
+@cached_jit
 def _pushes(chains: Chains, model: ControlAffine, states: jax.Array, output: int) -> jax.Array:
     """Return how the first integrator before an input moves what it reaches of an output, (K,)."""
     order = chains.degrees[output] - max(chains.integrators)

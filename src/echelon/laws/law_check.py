@@ -10,9 +10,9 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.demand import reference_warnings
 from echelon.agents.references.reference import Reference
 from echelon.core.errors import LawError
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
-from echelon.core.trace import check_array, traced
+from echelon.core.trace import check_array, checked_trace
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, LocalView, reference_of
 
@@ -48,7 +48,7 @@ def leader_warnings(
     return reference_warnings(model, reference, horizon, limits)
 
 
-@kept
+@memoize
 def _check_law(law: Law, model: ControlAffine) -> None:
     """Trace one agent of a law, and check what it returns; once for a law and a model."""
     name, m = type(law).__name__, len(model.input_names)
@@ -58,7 +58,7 @@ def _check_law(law: Law, model: ControlAffine) -> None:
             "`Feedforward`, such as `Feedforward.RELAY`."
         )
     memory = _memory(law)
-    found = traced(
+    found = checked_trace(
         LawError,
         f"`update` of `{name}`",
         lambda view, memory: law.update(model, view, memory),
@@ -97,7 +97,7 @@ def _view(law: Law, model: ControlAffine) -> LocalView:
     signal = jax.eval_shape(lambda: law.signal(model, x, x, _memory(law)))
     z = x if signal is None else jnp.zeros(signal.shape)
     if law.feedforward is not Feedforward.NONE:
-        said = traced(
+        said = checked_trace(
             LawError,
             f"`broadcast` of `{type(law).__name__}`",
             lambda x, v: law.message(model, x, v, _memory(law)),

@@ -17,7 +17,7 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import check_kind_of, check_reference
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError
 from echelon.core.linear import symmetric_part
 from echelon.core.types import Array, Input, State
@@ -171,7 +171,7 @@ def _decay(P: Array, W: Array) -> Array:
     return np.asarray(-0.5 * np.linalg.eigvalsh(root @ W @ root.swapaxes(1, 2)).min())
 
 
-@program
+@cached_jit
 def _slopes(
     model: ControlAffine, reference: Guide, times: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -19,10 +19,10 @@ from echelon.agents.references.flatness import first_state, followed_states
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import Reference, check_reference
 from echelon.core.errors import LawError, listing
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, Scalar, State
-from echelon.core.words import Feedforward, Hears
+from echelon.core.words import Feedforward, NeighbourChoice
 from echelon.laws.flat_law import (
     CHAIN_SHARE,
     LEAD_SHARE,
@@ -110,7 +110,9 @@ class StoppingPoint(FlatLaw):
     feedforward: Feedforward = eqx.field(
         default=Feedforward.RELAY, static=True, converter=Feedforward.named
     )
-    hears: Hears = eqx.field(default=Hears.ALL, static=True, converter=Hears.named)
+    hears: NeighbourChoice = eqx.field(
+        default=NeighbourChoice.ALL, static=True, converter=NeighbourChoice.named
+    )
     reach: GraphDemand | None = None
     ahead: Array | None = None
 
@@ -126,7 +128,7 @@ class StoppingPoint(FlatLaw):
     @property
     def leaderward(self) -> bool:
         """Whether only neighbours nearer to the leader are heard."""
-        return self.hears is Hears.LEADERWARD or self.feedforward is Feedforward.PARENT
+        return self.hears is NeighbourChoice.LEADERWARD or self.feedforward is Feedforward.PARENT
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -302,7 +304,7 @@ class StoppingLeader(FlatLaw):
         return loop.obey(model, view.x, rate, memory, view.period)
 
 
-@kept
+@memoize
 def beginning_of(leader: StoppingLeader, model: ControlAffine) -> Array:
     """Return where a leader's path begins, as `begins` does, read-only; once for both."""
     with precision("float64"):

@@ -17,7 +17,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine, FlatBound, Flattened
 from echelon.core.errors import ModelError, listing
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State
 
@@ -188,7 +188,7 @@ def _fault_of(bound: FlatBound, chains: Chains) -> str:
 # ---- which models have them ----------------------------------------------------------------------
 
 
-@kept
+@memoize
 def chains_of(model: ControlAffine) -> Chains:
     """Return what makes a model linear by feedback, as it states or as it is found at samples.
 
@@ -269,7 +269,7 @@ def look_for_chains(
     return Chains(outputs, tuple(degrees), integrators, sampled=True)
 
 
-@kept
+@memoize
 def _reach(
     model: ControlAffine, outputs: tuple[str, ...], integrators: tuple[int, ...], order: int
 ) -> Array:

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Scalar, State
 
@@ -64,8 +64,8 @@ class Turn(NamedTuple):
         if not self.signs.any():
             return values
         signs = jnp.asarray(self.signs, values.dtype)
-        kept = jnp.where(self.signs != 0.0, jnp.cos(angle), jnp.ones_like(values))
-        return kept * values + jnp.sin(angle) * (signs * values[self.partners])
+        scale = jnp.where(self.signs != 0.0, jnp.cos(angle), jnp.ones_like(values))
+        return scale * values + jnp.sin(angle) * (signs * values[self.partners])
 
     @property
     def slope(self) -> Array:
@@ -135,7 +135,7 @@ def check_heading(model: "ControlAffine") -> None:
         )
 
 
-@kept
+@memoize
 def heading_gap(model: "ControlAffine") -> float:
     """Return how far f and g are from turning with the heading, at samples, relative to their size.
 
@@ -151,7 +151,7 @@ def heading_gap(model: "ControlAffine") -> float:
     return float((gaps / np.maximum(1.0, sizes)).max())
 
 
-@program
+@cached_jit
 def _gaps(model: "ControlAffine", x: jax.Array, angles: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the gap (S, n, 1 + m) at each sample, and the size of what it is of (n, 1 + m)."""
     D, E = state_turn(model), input_turn(model)

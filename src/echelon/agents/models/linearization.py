@@ -8,8 +8,8 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.secants import Gap, Sides, sides, stencil
-from echelon.core.compiled import program
-from echelon.core.memoize import kept
+from echelon.core.compiled import cached_jit
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array, Input, State, States
 
@@ -53,7 +53,7 @@ class AtTrim(NamedTuple):
     gap: Gap | None
 
 
-@kept
+@memoize
 def at_trim(model: ControlAffine) -> AtTrim:
     """Return all that is asked of a model at its trim, compiled together.
 
@@ -69,7 +69,7 @@ def at_trim(model: ControlAffine) -> AtTrim:
     return AtTrim(*there, bends=_bends(seen, u), gap=seen.gap(said))  # pyright: ignore
 
 
-@program
+@cached_jit
 def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[jax.Array]:
     functions = (model.drift, model.input_map, model.output)
     slopes = [jax.jacfwd(function)(x) for function in functions]
@@ -95,7 +95,7 @@ def _bends(seen: Sides, u: Array) -> Array:
     return bent | jumps
 
 
-@kept
+@memoize
 def linearize(model: ControlAffine) -> Linearization:
     """Return A = d(f + g u*)/dx and B = g S at the trim, read-only; computed once for a model."""
     there = at_trim(model)
@@ -103,7 +103,7 @@ def linearize(model: ControlAffine) -> Linearization:
     return Linearization(_freeze(there.drift_slope + trim_slopes(model).sum(0)), _freeze(B))
 
 
-@kept
+@memoize
 def trim_slopes(model: ControlAffine) -> Array:
     """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: what each trim input puts into A."""
     # d(g u*)/dx = sum_k u*_k dg_k/dx: an input scaled by s scales its own term alone.

@@ -8,11 +8,11 @@ import numpy as np
 from echelon.agents.models.heading import check_heading
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine, Limits
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
-from echelon.core.trace import check_function, in_short
+from echelon.core.trace import check_function, error_summary
 
 # Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
 _TRIM_TOLERANCE = 1e-9
@@ -41,7 +41,7 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
     return _warnings_of(model, _check_kind(model))
 
 
-@kept
+@memoize
 def _warnings_of(model: ControlAffine, name: str) -> tuple[str, ...]:
     """Return the warnings of a model after all checks; once for a model."""
     with precision("float64"):
@@ -237,7 +237,7 @@ def _differentiate(model: ControlAffine, name: str) -> AtTrim:
     # The model is anyone's code, and JAX says in many ways that it cannot derive it.
     except Exception as error:
         raise ModelError(
-            f"`{name}` has no derivative at its trim, by {in_short(error)}; write it "
+            f"`{name}` has no derivative at its trim, by {error_summary(error)}; write it "
             "with `jax.numpy` alone."
         ) from error
     gap = there.gap
@@ -289,7 +289,7 @@ def limited(model: ControlAffine, asked: np.ndarray) -> np.ndarray:
     return np.asarray(_limited(model, asked))
 
 
-@program
+@cached_jit
 def _limited(model: ControlAffine, asked: jax.Array) -> jax.Array:
     return jax.vmap(model.limit)(asked)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import FormationError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, States
@@ -287,7 +287,7 @@ def _describe_change(
     return None
 
 
-@program
+@cached_jit
 def _local(model: ControlAffine, states: States) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Return f and g at states (S, n), each with its Jacobian."""
     parts = {"drift": model.drift, "input map": model.input_map}

@@ -11,8 +11,8 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.flatness import follow_at
 from echelon.agents.references.guide import Guide
-from echelon.core.compiled import program
-from echelon.core.memoize import kept
+from echelon.core.compiled import cached_jit
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 
@@ -50,7 +50,7 @@ _NEAR = 1e-3
 """Between times of which differences are taken, s: rounding and curvature each leave 1e-6."""
 
 
-@kept
+@memoize
 def asked(
     model: ControlAffine, reference: Guide, horizon: float, samples: int = 1000
 ) -> ReferenceDemand:
@@ -156,7 +156,7 @@ def demand(model: ControlAffine, inputs: Array) -> Array:
         return np.where(moved == 0.0, 0.0, np.abs(moved) / np.maximum(room, 0.0)).max(axis=1)
 
 
-@program
+@cached_jit
 def _rate(
     model: ControlAffine, before: jax.Array, now: jax.Array, after: jax.Array, near: float
 ) -> jax.Array:
@@ -166,7 +166,7 @@ def _rate(
     )
 
 
-@program
+@cached_jit
 def _velocities(model: ControlAffine, states: jax.Array, inputs: jax.Array) -> jax.Array:
     return jax.vmap(model.velocity)(states, inputs)
 

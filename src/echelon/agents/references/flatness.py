@@ -10,7 +10,7 @@ from jax.core import Tracer
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import check_reference
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import LawError, PlanError
 from echelon.core.numerics import precision
 from echelon.core.types import Array, State
@@ -41,7 +41,7 @@ def first_state(model: ControlAffine, reference: Guide) -> State:
     return jax.device_put(follow_at(model, reference, np.zeros(1))[0][0])
 
 
-@program
+@cached_jit
 def _follow_all(
     model: ControlAffine, reference: Guide, times: Array | jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -104,6 +104,6 @@ def _targets(model: ControlAffine, x: Array, v: Array) -> Targets:
     return Targets(x, outputs, v)
 
 
-@program
+@cached_jit
 def _outputs(model: ControlAffine, states: jax.Array) -> jax.Array:
     return jax.vmap(model.output)(states)

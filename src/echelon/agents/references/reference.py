@@ -13,9 +13,9 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.core.enclosure.hull import Box, value_hull
 from echelon.core.errors import GainError, LawError, ReferenceError, check_kind, listing
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import derivatives, precision
-from echelon.core.trace import check_array, check_function, traced
+from echelon.core.trace import check_array, check_function, checked_trace
 from echelon.core.types import Array, Input, Scalar, State
 
 COORDINATES = ("x", "y", "z", "yaw")
@@ -88,7 +88,7 @@ def _heading_place(model: ControlAffine) -> int | None:
     return COORDINATES.index(name) if name in COORDINATES and name in model.flat_outputs else None
 
 
-@kept
+@memoize
 def _turns(reference: Reference, place: int, rest: float) -> bool:
     """Tell whether a coordinate may be another than `rest` at some time."""
 
@@ -103,12 +103,12 @@ def _turns(reference: Reference, place: int, rest: float) -> bool:
     return bool((hull.vertices != rest).any() or hull.error.any())
 
 
-@kept
+@memoize
 def _check_map(model: ControlAffine) -> None:
     """Trace the flatness map, and check the state and the input that it returns."""
     name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
     with precision("float64"):
-        found = traced(
+        found = checked_trace(
             LawError,
             f"`flat` of `{name}`",
             model.flat,

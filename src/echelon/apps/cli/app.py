@@ -62,7 +62,7 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
     folder = keep_compiled_code(os.environ)
-    with disk_cache.opened(folder), outlive_readers(), STOP.listen():
+    with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:
             _call()
         except EchelonError as error:

@@ -7,7 +7,7 @@ import typer
 
 from echelon.apps.cli.console import print_file
 from echelon.apps.cli.options import OverwriteOption, RunArgument
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.output.archive.folder import claim_file, write_errors
 
 
@@ -23,5 +23,5 @@ def report(
 
     page = report_page(open_run(run), run if run.is_dir() else None)
     with write_errors(out):
-        write_whole(out, page)
+        write_atomic(out, page)
     print_file(out, "{}, one self-contained file")

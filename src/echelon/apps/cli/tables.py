@@ -123,7 +123,7 @@ def _cell(value: object) -> str:
 
 def statements_table(lines: "Iterable[Statement]") -> "Table":
     """Return the lines of a check as a table."""
-    rows = ((x.name, str(x.verdict), str(x.kind), x.shown, x.explanation) for x in lines)
+    rows = ((x.name, str(x.verdict), str(x.kind), x.number_text, x.explanation) for x in lines)
     return plain_table(("statement", "verdict", "kind", "number", "why, or what to change"), rows)
 
 

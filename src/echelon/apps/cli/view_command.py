@@ -10,7 +10,7 @@ import typer
 from echelon.apps.cli.console import print_file
 from echelon.apps.cli.options import BrowserOption, OverwriteOption, PortOption, RunArgument
 from echelon.apps.cli.stop import STOP
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.output.archive.folder import claim_file, write_errors
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def view(
         show_page(page, port, browser)
         return
     with write_errors(html):
-        write_whole(html, page)
+        write_atomic(html, page)
     print_file(html, "{}, one self-contained file")
 
 

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import MissingExtraError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array
 from echelon.laws.law import Law
-from echelon.simulation.codegen import Unsupported, is_installed
+from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper, beyond
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, Moment, begin, control, step
 from echelon.simulation.step.settings import Settings
 
@@ -104,7 +105,7 @@ class _Native(Mover):
         return beyond(states, 64)
 
 
-@program
+@cached_jit
 def _followed(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
     return leader.reference_states(model, times)
 
@@ -127,7 +128,7 @@ class _ByJax(Mover):
         return ~np.isfinite(states)
 
 
-@program
+@cached_jit
 def _advance(loop: Loop, now: Moment, count: Array) -> tuple[Moment, Any]:
     """Take steps, and return the moment with the inputs (N, m) there."""
 

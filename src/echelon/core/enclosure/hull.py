@@ -20,7 +20,7 @@ from echelon.core.enclosure.polynomial import Polynomial, constant
 from echelon.core.enclosure.rules import polynomials
 from echelon.core.enclosure.slopes import number, slopes_in, variable
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import each, evaluate
+from echelon.core.jaxpr import evaluate, map_entries
 from echelon.core.types import Array
 
 Bounds: TypeAlias = Sequence[float | Fraction] | Array
@@ -116,7 +116,7 @@ def slope_hull(
     if weight is not None:
         # A weight is asked for its slopes too, which one that jumps has not.
         beside = _evaluate_sloped(weight, x, v, atoms)
-        found = np.concatenate([found, each(lambda entry: entry.value, beside)], axis=1)
+        found = np.concatenate([found, map_entries(lambda entry: entry.value, beside)], axis=1)
     return _hull_of(found, atoms)
 
 
@@ -147,8 +147,8 @@ def _evaluate_sloped(function: _Function, x: np.ndarray, v: np.ndarray, atoms: A
     """Return the values of a function with their slopes in x."""
     states = np.empty(len(x), object)
     states[:] = [variable(k, p) for k, p in enumerate(x)]
-    [found] = evaluate(function, [states, each(number, v)], slopes_in(atoms))
-    return found if found.dtype == object else each(number, found)
+    [found] = evaluate(function, [states, map_entries(number, v)], slopes_in(atoms))
+    return found if found.dtype == object else map_entries(number, found)
 
 
 def _slopes(values: np.ndarray, n: int, atoms: Atoms) -> np.ndarray:

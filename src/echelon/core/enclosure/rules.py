@@ -17,7 +17,7 @@ from echelon.core.enclosure.atoms import Atoms
 from echelon.core.enclosure.interval import ELEMENTARY, Interval
 from echelon.core.enclosure.polynomial import Polynomial, constant
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import Algebra, compute, dot, each, reduction
+from echelon.core.jaxpr import Algebra, compute, dot, map_entries, reduction
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(atoms, parameters of the primitive, operands) -> result."""
@@ -42,7 +42,7 @@ def lift(array: np.ndarray) -> np.ndarray:
     numbers = array.astype(np.float64)
     if not np.isfinite(numbers).all():
         raise GainError("the model holds a constant that is not finite.")
-    return each(constant, numbers)
+    return map_entries(constant, numbers)
 
 
 def outside() -> object:
@@ -52,7 +52,7 @@ def outside() -> object:
 
 def fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return what an unknown primitive makes of parameters alone, in float64: parameters again."""
-    values = [each(number, a) if a.dtype == object else a for a in operands]
+    values = [map_entries(number, a) if a.dtype == object else a for a in operands]
     if any(v is None for a in values for v in a.flat):
         raise GainError(
             f"the model uses `{equation.primitive.name}`, which the hull of "
@@ -73,7 +73,7 @@ def number(p: object) -> Fraction | None:
 
 
 def _function(function: Callable[..., object]) -> Rule:
-    return lambda atoms, params, *arrays: each(functools.partial(function, atoms), *arrays)
+    return lambda atoms, params, *arrays: map_entries(functools.partial(function, atoms), *arrays)
 
 
 def _elementary(name: str) -> Rule:
@@ -166,7 +166,9 @@ def _comparison(certain: Callable[[Interval], bool], never: Callable[[Interval],
         # Neither holds where the box does not decide.
         return True if certain(difference) else False if never(difference) else None
 
-    return lambda atoms, params, a, b: _as_booleans(each(functools.partial(compare, atoms), a, b))
+    return lambda atoms, params, a, b: _as_booleans(
+        map_entries(functools.partial(compare, atoms), a, b)
+    )
 
 
 def _as_booleans(answers: np.ndarray) -> np.ndarray:
@@ -191,7 +193,7 @@ def _or(a: bool | None, b: bool | None) -> bool | None:
 
 
 def _logic(function: Callable[..., bool | None]) -> Rule:
-    return lambda atoms, params, *arrays: _as_booleans(each(function, *arrays))
+    return lambda atoms, params, *arrays: _as_booleans(map_entries(function, *arrays))
 
 
 def _choose_case(atoms: Atoms, which: Any, *cases: Any) -> Any:
@@ -221,14 +223,14 @@ def convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarra
     if polynomials and kind not in "biu" or not polynomials and kind == "b":
         return x
     if not polynomials and kind not in "iu":
-        return each(functools.partial(_as_number, atoms), x)
-    numbers = each(number, x)
+        return map_entries(functools.partial(_as_number, atoms), x)
+    numbers = map_entries(number, x)
     if any(v is None for v in numbers.flat):
         raise GainError(
             "the model turns a state into a whole number, "
             "which the hull of Jacobians does not know."
         )
-    return each(bool if kind == "b" else math.trunc, numbers).astype(params["new_dtype"])
+    return map_entries(bool if kind == "b" else math.trunc, numbers).astype(params["new_dtype"])
 
 
 def _as_number(atoms: Atoms, answer: bool | None) -> Polynomial:
@@ -243,7 +245,9 @@ RULES: dict[str, Rule] = {
     # JAX has no `reciprocal`, and `abs` looks at the sign first.
     **{name: _elementary(name) for name in ELEMENTARY if name not in ("reciprocal", "abs")},
     "div": _function(_quotient),
-    "integer_pow": lambda atoms, params, x: each(lambda p: whole_power(atoms, p, params["y"]), x),
+    "integer_pow": lambda atoms, params, x: map_entries(
+        lambda p: whole_power(atoms, p, params["y"]), x
+    ),
     "pow": _function(power),
     "sin": _function(lambda atoms, p: atoms.circle(p)[1]),
     "cos": _function(lambda atoms, p: atoms.circle(p)[0]),

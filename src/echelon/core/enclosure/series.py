@@ -20,7 +20,7 @@ import numpy as np
 from echelon.core.enclosure import rules
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, wave
 from echelon.core.errors import GainError
-from echelon.core.jaxpr import Algebra, Rule, dot, each, entrywise, reduction, walk
+from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
 
 _BITS = 90
@@ -322,7 +322,7 @@ def _algebra(order: int) -> Algebra:
         if lifted.dtype != object:
             return lifted
         # Constants are polynomials of no variable.
-        return each(lambda p: number(p.value() or 0.0, order), lifted)
+        return map_entries(lambda p: number(p.value() or 0.0, order), lifted)
 
     def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
         raise GainError(
@@ -333,7 +333,7 @@ def _algebra(order: int) -> Algebra:
     known: dict[str, Rule] = {
         **{name: entrywise(function) for name, function in _FUNCTIONS.items()},
         "div": entrywise(lambda a, b: a * _reciprocal(b)),
-        "integer_pow": lambda params, x: each(lambda s: _whole_power(s, params["y"]), x),
+        "integer_pow": lambda params, x: map_entries(lambda s: _whole_power(s, params["y"]), x),
         "pow": entrywise(_power),
         "convert_element_type": _convert,
         "dot_general": dot(zero),

@@ -20,7 +20,7 @@ from echelon.core.enclosure import rules
 from echelon.core.enclosure.atoms import Atoms
 from echelon.core.enclosure.polynomial import Polynomial, constant, divides
 from echelon.core.errors import GainError, listing
-from echelon.core.jaxpr import Algebra, dot, each, reduction
+from echelon.core.jaxpr import Algebra, dot, map_entries, reduction
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(parameters of the primitive, operands) -> result."""
@@ -93,14 +93,14 @@ def slopes_in(atoms: Atoms) -> Algebra:
 
 def _lift(array: np.ndarray) -> np.ndarray:
     lifted = rules.lift(array)
-    return each(number, lifted) if lifted.dtype == object else lifted
+    return map_entries(number, lifted) if lifted.dtype == object else lifted
 
 
 def _fold(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Return what an unknown primitive makes of parameters alone: parameters again."""
-    plain = [each(_parameter, a) if a.dtype == object else a for a in operands]
+    plain = [map_entries(_parameter, a) if a.dtype == object else a for a in operands]
     found = rules.fold(equation, plain)
-    return [each(number, a) if a.dtype == object else a for a in found]
+    return [map_entries(number, a) if a.dtype == object else a for a in found]
 
 
 def _parameter(entry: object) -> Polynomial | None:
@@ -138,7 +138,7 @@ _DERIVATIVES: dict[str, Callable[[_Made, Polynomial], Polynomial]] = {
 
 
 def _function(function: Callable[..., object]) -> Rule:
-    return lambda atoms, params, *arrays: each(functools.partial(function, atoms), *arrays)
+    return lambda atoms, params, *arrays: map_entries(functools.partial(function, atoms), *arrays)
 
 
 def _elementary(atoms: Atoms, name: str, p: Sloped) -> Sloped:
@@ -328,8 +328,8 @@ def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarr
         if isinstance(entry, Sloped) and entry.slopes and kind in "biu":
             raise _jump(atoms, "a state becomes a whole number", entry.value)
     if kind not in "biu":
-        return each(lambda e: e if isinstance(e, Sloped) else number(int(e)), x)
-    plain = each(lambda e: e.value if isinstance(e, Sloped) else e, x)
+        return map_entries(lambda e: e if isinstance(e, Sloped) else number(int(e)), x)
+    plain = map_entries(lambda e: e.value if isinstance(e, Sloped) else e, x)
     return rules.convert(atoms, params, plain)
 
 
@@ -344,7 +344,9 @@ _RULES: dict[str, Rule] = {
         if name != "reciprocal"  # JAX has none
     },
     "div": _function(_quotient),
-    "integer_pow": lambda atoms, params, x: each(lambda p: _whole_power(atoms, p, params["y"]), x),
+    "integer_pow": lambda atoms, params, x: map_entries(
+        lambda p: _whole_power(atoms, p, params["y"]), x
+    ),
     "pow": _function(_power),
     "sin": _function(_sine),
     "cos": _function(_cosine),

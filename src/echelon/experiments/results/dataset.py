@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.experiments.results.foreseen import heard_in
 from echelon.experiments.results.labelled import Labelled
 from echelon.experiments.results.lyapunov import lyapunov
@@ -196,9 +196,9 @@ def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
     # In memory first: on a disk that is full the library under it ends the whole process.
     data = labelled(run) if isinstance(run, Result) else run
     if isinstance(data, Labelled):
-        write_whole(path, data.netcdf())
+        write_atomic(path, data.netcdf())
     else:
-        write_whole(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
+        write_atomic(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:

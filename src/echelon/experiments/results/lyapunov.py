@@ -13,7 +13,7 @@ from echelon.agents.models.heading import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.disturbance import disturbed, draw
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.simulation.engine.result import Result
@@ -111,7 +111,7 @@ def _difference(model: ControlAffine) -> _Difference:
     return lambda x, y: np.asarray(_differences(model, x, y))
 
 
-@program
+@cached_jit
 def _differences(model: ControlAffine, x: jax.Array, y: jax.Array) -> jax.Array:
     return jax.vmap(jax.vmap(model.difference))(x, y)
 
@@ -149,7 +149,7 @@ class _Fields(NamedTuple):
     rates: jax.Array | None
 
 
-@program
+@cached_jit
 def _fields(
     drive: Drive,
     model: ControlAffine,
@@ -202,7 +202,7 @@ def _seen(model: ControlAffine, fields: _Fields, y: Array) -> tuple[Array, Array
     return y, f - turning, xdot - turning
 
 
-@program
+@cached_jit
 def _turned_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> jax.Array:
     """Return values (T, N, n) in axes that are turned by angles (T,)."""
     return jax.vmap(jax.vmap(state_turn(model), (0, None)))(values, -angles)

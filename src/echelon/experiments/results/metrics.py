@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import Outcome
 from echelon.core.numerics import precision
 from echelon.core.types import Array
@@ -129,7 +129,7 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
         return np.asarray(_output_errors(result.model, result.states[:, leader], wanted))
 
 
-@program
+@cached_jit
 def _output_errors(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
     return jax.vmap(lambda x, wanted: output_error(model, x, wanted))(x, wanted)
 

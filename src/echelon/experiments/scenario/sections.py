@@ -9,7 +9,7 @@ from typing import Annotated, Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Frame, Hears
+from echelon.core.words import DEFAULT_FEEDFORWARD, ENGINES, Feedforward, Frame, NeighbourChoice
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.values import (
     Agents,
@@ -287,7 +287,7 @@ class FollowerSpec(BaseModel, **STRICT):
     all, such as m/s; `inf` for none."""
     observer: bool | None = None
     """Of the law `stopping-point`: whether what the model lacks is estimated and opposed."""
-    hears: Annotated[str, OneOf(map(str, Hears))] | None = None
+    hears: Annotated[str, OneOf(map(str, NeighbourChoice))] | None = None
     """Of the law `stopping-point`: `all` neighbours are heard, or `leaderward` those alone that are
     nearer to a leader."""
     feedforward: Annotated[str, OneOf(map(str, Feedforward))] = str(DEFAULT_FEEDFORWARD)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from echelon.core import disk_cache
 from echelon.core.errors import EchelonError, ScenarioError, did_you_mean, listing
-from echelon.core.trace import in_short
+from echelon.core.trace import error_summary
 
 _T = TypeVar("_T")
 
@@ -78,4 +78,4 @@ def own_code(what: str) -> Iterator[None]:
     # A program that leaves is a fault of the file too, and must not end echelon as if all were
     # well.
     except (Exception, SystemExit) as error:
-        raise ScenarioError(f"{what}: {in_short(error)}.") from error
+        raise ScenarioError(f"{what}: {error_summary(error)}.") from error

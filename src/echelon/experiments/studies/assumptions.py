@@ -11,7 +11,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.agents.references.demand import ReferenceDemand, asked, infeasible, too_fast
-from echelon.core.linear import in_words
+from echelon.core.linear import eigenvalue_text
 from echelon.core.statement import Hypothesis, Statement, Topic
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.finite_condition import finite_condition
@@ -47,7 +47,7 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     followers, leaders = len(graph.followers), len(graph.leaders)
     shown = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
     text = who_hears_whom(graph)
-    yield Statement(Topic.FOLLOWS, _HOLDS, _PROOF, leaders, shown, text)
+    yield Statement(Topic.PARENTS, _HOLDS, _PROOF, leaders, shown, text)
     shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
     yield Statement(Topic.GROUNDED, _HOLDS, _PROOF, low, shown, text)
     text = "no eigenvalue of any L has a smaller real part" if other else "grounded Laplacian"
@@ -88,17 +88,17 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     both = both and monotone.verdict is Verdict.HOLDS
     text, linear = "needs Assumption 5 and symmetric offsets", Kind.LINEARIZATION
     verdict, remedy = Verdict.of(both), "" if both else "see Assumption 5 and the offsets"
-    yield Statement(Topic.ALONG, verdict, linear, text=text, remedy=remedy)
+    yield Statement(Topic.DRIFT_ALONG_Z, verdict, linear, text=text, remedy=remedy)
     largest = _printed_lmi(parts, promise)
     shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
     text, remedy = f"{text}block is zero", "use the finite condition"
-    yield Statement(Topic.PRINTED, Verdict.FAILS, _PROOF, largest, shown, text, remedy)
+    yield Statement(Topic.LMI_AS_PRINTED, Verdict.FAILS, _PROOF, largest, shown, text, remedy)
     yield _finite_line(parts, promise)
 
 
 def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
-    name, slow = Topic.TRACKS, promise.own
+    name, slow = Topic.LEADER_TRACKING, promise.own
     if slow is None:
         return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
     if not promise.linear:
@@ -114,7 +114,7 @@ def _leader_line(promise: Promise) -> Statement:
 
 def _reference_line(model: ControlAffine, found: ReferenceDemand, settings: Settings) -> Statement:
     """Say what a leader must do to follow; no model here limits a speed but by its inputs."""
-    name, remedy = Topic.ASKED, ""
+    name, remedy = Topic.REFERENCE_DEMAND, ""
     limited = settings.limits and model.input_limits is not None
     sizes = ((found.speed, "m/s"), (found.acceleration, "m/s^2"))
     # Below a micrometre and the like are the differences' rounding.
@@ -146,7 +146,7 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     text, remedy = "the drift does not expand P", ""
     if found is not None:
         names = ", ".join(f"`{parts.model.state_names[k]}`" for k in found.states)
-        text = f"no P > 0 can: mode at {in_words(found.eigenvalue)} 1/s along {names}"
+        text = f"no P > 0 can: mode at {eigenvalue_text(found.eigenvalue)} 1/s along {names}"
         remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
     elif not holds:
         text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
@@ -160,8 +160,8 @@ def _flat_lines() -> Iterator[Statement]:
     text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
     yield Statement(Topic.MONOTONE, Verdict.HOLDS, _PROOF, 0.0, "0", text)
     text = "for offsets of every flat output: they are symmetries of the chains"
-    yield Statement(Topic.ALONG, Verdict.HOLDS, _PROOF, text=text)
-    for name in (Topic.PRINTED, Topic.FINITE):
+    yield Statement(Topic.DRIFT_ALONG_Z, Verdict.HOLDS, _PROOF, text=text)
+    for name in (Topic.LMI_AS_PRINTED, Topic.FINITE):
         yield Statement(name, Verdict.NOT_NEEDED, _PROOF, text="T5 asks nothing of a P")
 
 

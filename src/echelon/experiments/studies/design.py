@@ -189,7 +189,7 @@ def because(best: Design, tried: tuple[Design, ...], dt: float) -> str:
     against = [
         each.reason
         for each in best.promise.hypotheses.values()
-        if each.fails and each.reason and each.statement is not Hypothesis.STEP
+        if each.fails and each.reason and each.statement is not Hypothesis.SAMPLING
     ]
     return f"{text} Nothing is promised with it: {'; '.join(against)}." if against else text
 

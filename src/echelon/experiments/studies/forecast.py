@@ -25,7 +25,10 @@ def outlook(parts: Parts, settings: Settings) -> str:
     """
     found = promise(parts, settings)
     # A step that is too long for a moment only has no reason to say so.
-    grows = any(found.hypotheses[each].reason for each in (Hypothesis.DECAYS, Hypothesis.STEP))
+    grows = any(
+        found.hypotheses[each].reason
+        for each in (Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING)
+    )
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
         return found.sentence()
@@ -34,7 +37,7 @@ def outlook(parts: Parts, settings: Settings) -> str:
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     """Yield the changes of a scenario, cheap to find, with which something is promised."""
-    step = promise(parts, settings).hypotheses[Hypothesis.STEP]
+    step = promise(parts, settings).hypotheses[Hypothesis.SAMPLING]
     if step.fails:
         longest = _ROOM * promise(parts, settings).longest_step(settings)
         # A whole part of the step keeps the horizon a whole number of steps.

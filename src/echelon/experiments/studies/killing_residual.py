@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.statement import Statement, Topic
 from echelon.core.types import Array, States
 from echelon.core.words import Kind, Verdict
@@ -56,7 +56,7 @@ def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[fl
     return 0.5 * float(np.abs(values).max()), Kind.SAMPLES
 
 
-@program
+@cached_jit
 def _input_slopes(model: ControlAffine, states: States) -> jax.Array:
     """Return the derivatives of g S, (S, n, m, n)."""
     return jax.vmap(jax.jacfwd(model.normalized_input_map))(states)

@@ -37,7 +37,7 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
         yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
         yield from _stopping_lines(parts, settings)
         return
-    if not promise.linear or promise.hypotheses[Hypothesis.DECAYS].fails:
+    if not promise.linear or promise.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails:
         verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
         if not promise.linear:
             verdict, text = Verdict.VACUOUS, "the model bends at the trim, and has no modes there"
@@ -68,7 +68,7 @@ def _turns_lines(promise: Promise) -> Iterator[Statement]:
     """Yield what is known of graphs that take turns: how weak the coupling may get (T8)."""
     edge, lines = promise.edge, promise.hypotheses
     anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
-    if not anywhere and edge is not None and not lines[Hypothesis.DECAYS].fails:
+    if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling with which one P serves all graphs, whenever they switch"
         yield Statement(Topic.GAIN, _HOLDS, _KIND, low, f"{low:.3g} to inf", what)
@@ -86,11 +86,11 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     ratio, shown = high / low, f"{high / low:.3g}"
     if not ratio > _WIDE:
         text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
-        return Statement(Topic.SPREAD, _HOLDS, _KIND, ratio, shown, text)
+        return Statement(Topic.EIGENVALUE_RATIO, _HOLDS, _KIND, ratio, shown, text)
     text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
     text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
     remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
-    return Statement(Topic.SPREAD, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
+    return Statement(Topic.EIGENVALUE_RATIO, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
 
 
 def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
@@ -155,9 +155,9 @@ def _push_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[Statement]:
         return Statement(name, _HOLDS, _KIND, worst, shown, text)
 
     text = "no push of that norm on all followers together takes any farther"
-    yield line(Topic.PUSHED, invariant_ellipsoid(loop.closed, E), text)
+    yield line(Topic.DISTURBANCE_NETWORK, invariant_ellipsoid(loop.closed, E), text)
     text = "the exact peak, for a push shaped like the worst eigenvector"
-    yield line(Topic.PUSHED_MODE, peak_gain(loop.closed, E), text)
+    yield line(Topic.DISTURBANCE_MODE, peak_gain(loop.closed, E), text)
 
 
 def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:

@@ -10,7 +10,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.eigenvalues import in_order
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.spectrum import Spectrum
-from echelon.core.linear import held_radius, longest_step
+from echelon.core.linear import longest_step, sampled_radius
 from echelon.core.types import Array
 from echelon.core.words import Feedforward
 from echelon.simulation.engine.parts import Parts
@@ -77,7 +77,7 @@ class LinearLoop(NamedTuple):
     def radius(self, settings: Settings) -> float:
         """Return the largest spectral radius of a step of the integrator that runs."""
         A, B = self.open
-        return held_radius(A, B, self.gains, settings.dt, settings.integrator)
+        return sampled_radius(A, B, self.gains, settings.dt, settings.integrator)
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) of that integrator with which every mode decays."""

@@ -50,10 +50,13 @@ def _stayed(promise: Promise) -> str:
         return "the leader stayed in the domain, and small errors about it shrink"
     starts = promise.hypotheses[Hypothesis.STARTS]
     if starts.fails:
-        text = f"the starts lie outside of the certified set ({starts.shown}), but all agents "
-        return f"{text}stayed in the domain at every stored frame"
+        return (
+            f"the starts lie outside of the certified set ({starts.number_text}), but all agents "
+            "stayed in the domain at every stored frame"
+        )
     return (
-        f"the starts lie in the certified set ({starts.shown}), and all agents stayed in the domain"
+        f"the starts lie in the certified set ({starts.number_text}), and all agents "
+        "stayed in the domain"
     )
 
 

@@ -14,8 +14,8 @@ import numpy as np
 from echelon.agents.models.heading import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.core import linear
-from echelon.core.compiled import program
-from echelon.core.linear import exponential, held_radius, held_step
+from echelon.core.compiled import cached_jit
+from echelon.core.linear import discretize, matrix_exponential, sampled_radius
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
@@ -93,7 +93,7 @@ class ModeMatrices(NamedTuple):
     def _exponent(self, span: float) -> float:
         """Return ln rho of the product of all flows over `span` (s), by the time that they take."""
         J = self.A[:, None] - self.B[:, None] @ self.gains
-        each = exponential(span * J)
+        each = matrix_exponential(span * J)
         product, logs = each[0], np.zeros(J.shape[1])
         for flow in each[1:]:
             sizes = np.linalg.norm(product, axis=(1, 2))
@@ -114,12 +114,12 @@ class ModeMatrices(NamedTuple):
         if not len(self.A):
             return 0.0
         A, B, gains = self.A[:, None], self.B[:, None], self.gains
-        return held_radius(A, B, gains, settings.dt, settings.integrator)
+        return sampled_radius(A, B, gains, settings.dt, settings.integrator)
 
     def decaying(self, settings: Settings) -> Array:
         """Return about which states, (K,), held steps decay wherever the loops themselves do."""
         A, B, gains = self.A[:, None], self.B[:, None], self.gains
-        F, G = held_step(A, B, settings.dt, settings.integrator)
+        F, G = discretize(A, B, settings.dt, settings.integrator)
         radii = np.abs(np.linalg.eigvals(F - G @ gains)).max(axis=(1, 2))
         return (self.growth() >= 0.0) | (radii < 1.0)
 
@@ -258,7 +258,7 @@ def _followers(parts: Parts, loop: LinearLoop, rows: PathSamples) -> ModeMatrice
     return ModeMatrices(A, B, alone[:, None] + few[:, None, None] * felt[:, None])
 
 
-@program
+@cached_jit
 def _about(
     model: ControlAffine, law: Law, t: jax.Array, x: States, v: jax.Array, y: States
 ) -> tuple[jax.Array, ...]:
@@ -292,7 +292,7 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
         return None
     S, P = np.asarray(model.input_scale, float), gain.P
     if headings.any():
-        D = exponential(headings[:, None, None] * state_turn(model).slope)
+        D = matrix_exponential(headings[:, None, None] * state_turn(model).slope)
         P = D @ P @ np.swapaxes(D, 1, 2)
     fed_back = gain.coupling * S @ gain.R_inverse @ S.T @ np.swapaxes(along.B, 1, 2) @ P
     return along._replace(gains=fed_back[:, None])

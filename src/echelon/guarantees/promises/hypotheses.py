@@ -12,7 +12,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import at_limits, is_limited, trim_shortfall
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
 from echelon.core.statement import Hypothesis, Statement
@@ -69,7 +69,7 @@ def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = 
         return np.asarray(_drifts(model, law, goals), np.float64)
 
 
-@program
+@cached_jit
 def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> jax.Array:
     if law is None:
         return jax.vmap(model.normalized_drift)(states)
@@ -78,7 +78,7 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
 
 def _trim_held(case: Case) -> Statement:
     """Within limits an agent holds its trim only if its actuators deliver that input."""
-    model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_HELD
+    model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
     moved = case.parts.world.plant_for(model)
     if not (case.settings.limits and is_limited(moved)):
         text = "no limit acts on the inputs"
@@ -119,12 +119,12 @@ def _exact(case: Case) -> Statement:
         remedy = "leave it out to see what it costs"
         text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
     verdict = Verdict.of(not case.disturbed)
-    return Statement(Hypothesis.EXACT, verdict, Kind.PROOF, text=text, remedy=remedy)
+    return Statement(Hypothesis.EXACT_STATES, verdict, Kind.PROOF, text=text, remedy=remedy)
 
 
 def _agreement(case: Case) -> Statement:
     """Several leaders are one if they start alike and do the same; else nobody can follow all."""
-    name, leaders = Hypothesis.AGREEMENT, case.leaders
+    name, leaders = Hypothesis.LEADERS_AGREE, case.leaders
     if len(leaders.starts) == 1:
         return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text="there is one")
     if leaders.agree:
@@ -205,7 +205,7 @@ def _smooth(case: Case) -> Statement:
 
 
 def _matched(case: Case) -> Statement:
-    name, leaders, reason = Hypothesis.MATCHED, case.leaders, ""
+    name, leaders, reason = Hypothesis.MATCHED_MOTION, case.leaders, ""
     text, remedy = "the leader has no input beyond its trim, so there is nothing to send", ""
     if leaders.alike:
         text = "the leaders obey the followers' law, so there is nothing to send"

@@ -7,7 +7,7 @@ import numpy as np
 
 from echelon.agents.models.heading import heading_index, input_turn, rest_heading, turned
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Input, State, States
 from echelon.guarantees.promises.leaders import Leaders, own_paths
 from echelon.simulation.engine.law_drive import Laws
@@ -107,13 +107,13 @@ def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPat
     return path._replace(states=back, inputs=sent, headings=away, rates=rates)
 
 
-@program
+@cached_jit
 def _turned_back(model: ControlAffine, states: States, angles: jax.Array) -> States:
     """Return states (K, n) in axes that are turned by angles (K,)."""
     return jax.vmap(lambda x, angle: turned(model, x, -angle))(states, angles)
 
 
-@program
+@cached_jit
 def _in_heading(
     model: ControlAffine, states: States, inputs: jax.Array, angles: jax.Array
 ) -> tuple[States, jax.Array, jax.Array]:
@@ -135,7 +135,7 @@ def _inputs(model: ControlAffine, now: Array, soon: Array) -> Array:
     return inputs
 
 
-@program
+@cached_jit
 def _pushes(model: ControlAffine, now: States, soon: States) -> tuple[States, jax.Array]:
     """Return what inputs add to the drift there (K, n), and their maps (K, n, m)."""
 

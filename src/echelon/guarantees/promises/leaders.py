@@ -10,7 +10,7 @@ from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, States
 from echelon.guarantees.promises.closed_loop import all_alike
 from echelon.laws.law import Law
@@ -132,6 +132,6 @@ def excursion(parts: Parts, paths: Array) -> Array:
     return np.abs(np.asarray(_differences(parts.model, states, trim))).max(axis=0)
 
 
-@program
+@cached_jit
 def _differences(model: ControlAffine, states: States, base: jax.Array) -> jax.Array:
     return jax.vmap(lambda x: model.difference(x, base))(states)

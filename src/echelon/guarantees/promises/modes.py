@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echelon.core.linear import held_radius
+from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.words import Kind, Theorem, Verdict
 from echelon.guarantees.promises.case import Case
@@ -38,26 +38,28 @@ def _linear(case: Case) -> Iterator[Statement]:
 
 def _bent(case: Case) -> Iterator[Statement]:
     """Yield what is left of these lines where there is no linearization: what a region says."""
-    for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLED, Hypothesis.ALONG):
+    for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
         yield Statement(name, Verdict.VACUOUS, _LINEAR, text=_BENT)
     region = case.region
     if region is None or region.theorem is Theorem.A5:
-        yield Statement(Hypothesis.DECAYS, Verdict.VACUOUS, _LINEAR, text=_BENT)
+        yield Statement(Hypothesis.DISAGREEMENT_DECAY, Verdict.VACUOUS, _LINEAR, text=_BENT)
     else:
         text = "by the slopes of all sides of the trim, where the model bends"
         rate, shown = -region.rate, f"{-region.rate:.3g} 1/s"
-        yield Statement(Hypothesis.DECAYS, Verdict.HOLDS, region.kind, rate, shown, text)
+        yield Statement(
+            Hypothesis.DISAGREEMENT_DECAY, Verdict.HOLDS, region.kind, rate, shown, text
+        )
     yield _held_beside(case)
 
 
 def _held_beside(case: Case) -> Statement:
     """Whether each side of a bend decays in steps of the integrator, as if it were all around."""
-    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
+    name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     shown = f"dt {settings.dt:g} s"
     if case.region is None or case.beside is None:
         return Statement(name, Verdict.VACUOUS, Kind.SAMPLES, None, shown, _BENT)
     A, dt = case.beside[:, None], settings.dt
-    radius = held_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
+    radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
     text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
         return Statement(name, Verdict.HOLDS, Kind.SAMPLES, radius, shown, text)
@@ -90,7 +92,7 @@ def _coupled(case: Case) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
         text = "no edge known"
-        return Statement(Hypothesis.COUPLED, Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
+        return Statement(Hypothesis.COUPLING, Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
     fine, shown = c >= edge, f"c {c:.4g}, edge {edge:.4g}"
     text, remedy = (
         "from the edge on every mode decays: near the trim, of linear agents anywhere",
@@ -99,12 +101,12 @@ def _coupled(case: Case) -> Statement:
     if not fine:
         text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
         remedy = f"raise `coupling` to {edge:.4g} or more"
-    return Statement(Hypothesis.COUPLED, Verdict.of(fine), Kind.PROOF, c, shown, text, remedy)
+    return Statement(Hypothesis.COUPLING, Verdict.of(fine), Kind.PROOF, c, shown, text, remedy)
 
 
 def _decaying(case: Case) -> Statement:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    name, loop, remedy, reason = Hypothesis.DECAYS, case.loop, "", ""
+    name, loop, remedy, reason = Hypothesis.DISAGREEMENT_DECAY, case.loop, "", ""
     if not case.governed:
         law = isinstance(case.parts.drive, Laws)
         text = "the followers' law does not act on the disagreement"
@@ -147,7 +149,7 @@ def _taking_turns(case: Case) -> Statement:
 
 def _along(case: Case) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
-    name, frozen = Hypothesis.ALONG, case.frozen
+    name, frozen = Hypothesis.ALONG_PATH, case.frozen
     if not (case.loop.every and case.governed):
         return Statement(name, Verdict.NOT_NEEDED, Kind.SAMPLES, text="there is nothing to lose")
     if frozen is None or not frozen.travelled:
@@ -168,7 +170,7 @@ def _along(case: Case) -> Statement:
 
 def held(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
-    name, loop, settings = Hypothesis.STEP, case.loop, case.settings
+    name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
         shown, text = f"dt {settings.dt:g} s", "there is nothing to lose"
         return Statement(name, Verdict.NOT_NEEDED, _LINEAR, None, shown, text)
@@ -188,7 +190,7 @@ def held(case: Case) -> Statement:
 
 def _step(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
     """Return the line of a step from a spectral radius and where it is met."""
-    name, dt = Hypothesis.STEP, case.settings.dt
+    name, dt = Hypothesis.SAMPLING, case.settings.dt
     if radius < 1.0:
         return Statement(name, Verdict.HOLDS, _LINEAR, radius, f"dt {dt:g} s", text)
     if not remedy:

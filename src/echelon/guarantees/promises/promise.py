@@ -49,7 +49,7 @@ from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
-_BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLED)
+_BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLING)
 
 
 @final
@@ -149,7 +149,7 @@ class Promise:
     @property
     def decays(self) -> bool:
         """Whether errors that are small enough are known to shrink, in continuous time."""
-        return self.hypotheses[Hypothesis.DECAYS].verdict is Verdict.HOLDS
+        return self.hypotheses[Hypothesis.DISAGREEMENT_DECAY].verdict is Verdict.HOLDS
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
@@ -164,10 +164,10 @@ class Promise:
         A mode that does not decay is explained by what the law cannot feel, or a weak coupling.
         """
         failed = {name: each for name, each in self.hypotheses.items() if each.fails}
-        grows = Hypothesis.DECAYS in failed
+        grows = Hypothesis.DISAGREEMENT_DECAY in failed
         why = tuple(failed[name].cause for name in _BEHIND_GROWTH if grows and name in failed)
         rest = (each for name, each in failed.items() if each.reason and name not in _BEHIND_GROWTH)
-        rest = (x for x in rest if not why or x.statement is not Hypothesis.DECAYS)
+        rest = (x for x in rest if not why or x.statement is not Hypothesis.DISAGREEMENT_DECAY)
         return (*why, *(each.cause for each in rest))
 
     def sentence(self) -> str:
@@ -348,9 +348,9 @@ def _started(
     if frozen is not None and began is not None:
         frozen = frozen._replace(starts=began)
         # The line tells of where they start only if steps grow there.
-        holds = lines[Hypothesis.STEP].verdict is Verdict.HOLDS
+        holds = lines[Hypothesis.SAMPLING].verdict is Verdict.HOLDS
         if case.smooth and not (holds and decays):
-            lines[Hypothesis.STEP] = held(case._replace(frozen=frozen))
+            lines[Hypothesis.SAMPLING] = held(case._replace(frozen=frozen))
     for line in set_lines(case.parts, states, first.region, first.certified):
         lines[cast(Hypothesis, line.statement)] = line
     told = MappingProxyType(lines)

@@ -58,7 +58,7 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
         return _beside_bends(parts, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
-        line = Statement(_NAME, Verdict.NOT_NEEDED, Kind.PROOF, shown="none", text=text)
+        line = Statement(_NAME, Verdict.NOT_NEEDED, Kind.PROOF, number_text="none", text=text)
         return Region(None, None, line)
     try:
         found = _computed(parts, gain, gain.certificate.region)
@@ -83,7 +83,7 @@ def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     It has no linearization there, but a hull holds the slopes of all its sides nearby.
     """
     text = "the slopes beside the trim, where the model bends, do not all contract in P"
-    none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, shown="none", text=text)
+    none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, number_text="none", text=text)
     try:
         pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
         found = pairs and _contraction(parts, gain, pairs, exact=False)

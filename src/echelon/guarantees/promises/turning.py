@@ -13,7 +13,7 @@ import numpy as np
 
 from echelon.agents.models.heading import heading_gap, heading_index, heading_of, state_turn
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
@@ -23,7 +23,7 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.certificates.lmi import rate_of
 from echelon.synthesis.gains.gain import Gain
 
-_NAME = Hypothesis.TURNING
+_NAME = Hypothesis.HEADING_FRAME
 _ROUNDS, _RESIDUAL = 20, 1e-10
 """Newton's, and what may be left of the rates, in units of the states."""
 _HALVINGS = 20
@@ -118,7 +118,7 @@ def steady_turn(model: ControlAffine, rate: float) -> tuple[Array, Array] | None
     return None
 
 
-@program
+@cached_jit
 def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return how a state and a normalized input z (n + m,) move in turning axes, with the slope."""
     n, spin = len(model.state_names), jnp.asarray(state_turn(model).slope)
@@ -131,7 +131,7 @@ def _left(model: ControlAffine, z: jax.Array, rate: jax.Array) -> tuple[jax.Arra
     return left(z), jax.jacfwd(left)(z)
 
 
-@program
+@cached_jit
 def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the slopes of the motion at a state and a normalized input, A (n, n) and B (n, m)."""
 

@@ -9,8 +9,15 @@ import numpy as np
 
 from echelon.agents.models.chains import Chains, derivatives_of
 from echelon.agents.models.model import ControlAffine, FlatBound
-from echelon.core.memoize import kept
-from echelon.simulation.codegen import Node, ScalarGraph, Unsupported, lower, needed, nodes
+from echelon.core.memoize import memoize
+from echelon.simulation.scalars import (
+    Node,
+    ScalarGraph,
+    Unsupported,
+    lower,
+    needed,
+    nodes,
+)
 
 _PARTIAL = {"exponent", "mantissa", "root_guess"}
 """Operations that are not defined for all numbers; quotients and roots are not for some."""
@@ -42,7 +49,7 @@ def _is_its_own_word(kind: type) -> bool:
     return all(place("flat_bounds") <= place(name) for name in _MOTION)
 
 
-@kept
+@memoize
 def _is_everywhere(model: ControlAffine, chains: Chains) -> bool:
     try:
         coordinates, moved = _traced(model, chains)

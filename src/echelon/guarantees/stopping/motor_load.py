@@ -10,7 +10,7 @@ import numpy as np
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.model import ControlAffine
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, point
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
@@ -224,7 +224,7 @@ class _Path(NamedTuple):
     asked: tuple[MotorDemand, ...]
 
 
-@kept
+@memoize
 def _path(leader: StoppingLeader, model: ControlAffine, horizon: float, chain: Chain) -> _Path:
     """Return what a leader's path asks on each slice of time."""
     pieces = pieces_of(leader, model, horizon, _OUTPUTS, max(_DEGREES))
@@ -280,7 +280,7 @@ def _largest(starts: Sequence[Pushed]) -> Pushed:
     return Pushed(sideways, upward, turn, _STILL.speeds)
 
 
-@kept
+@memoize
 def _pushed(
     chain: Chain, path: tuple[MotorDemand, ...], led: Pushed, speeds: tuple[Fraction, ...]
 ) -> tuple[MotorDemand, ...]:
@@ -332,7 +332,7 @@ def _ahead(frame: Airframe, path: Array) -> _Ahead:
     return _Ahead(speed, push, jerk, rise, lift, climb, start.turn[0])
 
 
-@kept
+@memoize
 def _alone(
     frame: Airframe, chain: Chain, base: tuple[MotorDemand, ...], path: _Ahead
 ) -> Alone | None:

@@ -14,7 +14,7 @@ from echelon.agents.references.reference import COORDINATES, Reference
 from echelon.core.enclosure.interval import ELEMENTARY, Interval, point
 from echelon.core.enclosure.series import enclose_derivatives
 from echelon.core.errors import GainError
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.words import Kind
 from echelon.laws.stopping_point import StoppingLeader
 
@@ -67,7 +67,7 @@ def pieces_of(
     return _pieces(leader.reference, horizon, tuple(outputs), order)
 
 
-@kept
+@memoize
 def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: int) -> Pieces:
     assert isinstance(reference, Reference)
     picked = np.array([COORDINATES.index(name) for name in outputs])

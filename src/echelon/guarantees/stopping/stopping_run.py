@@ -11,8 +11,8 @@ import scipy.linalg
 from echelon.agents.models.chains import flat_output, flatten
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import program
-from echelon.core.linear import held_radius
+from echelon.core.compiled import cached_jit
+from echelon.core.linear import sampled_radius
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Verdict
@@ -131,7 +131,7 @@ def stopping_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun 
     return StoppingRun(parts, settings, states, flat, beginning_of(drive.leader, parts.model))
 
 
-@program
+@cached_jit
 def _flat(
     model: ControlAffine, law: StoppingPoint, states: jax.Array, offsets: jax.Array
 ) -> jax.Array:
@@ -166,17 +166,19 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield Statement(Hypothesis.SMOOTH, Verdict.NOT_NEEDED, _PROOF, text=text)
     text = f"feedback makes chains of all {n} states and the integrators before inputs"
     yield Statement(Hypothesis.DETECTABLE, Verdict.NOT_NEEDED, _PROOF, text=text)
-    yield Statement(Hypothesis.MATCHED, Verdict.HOLDS, _PROOF, text=f"{run.law.information[1]}")
+    yield Statement(
+        Hypothesis.MATCHED_MOTION, Verdict.HOLDS, _PROOF, text=f"{run.law.information[1]}"
+    )
     c = run.coupling
     shown = f"c {c:.4g}, edge 0"
-    yield Statement(Hypothesis.COUPLED, Verdict.HOLDS, _PROOF, c, shown, "any coupling will do")
+    yield Statement(Hypothesis.COUPLING, Verdict.HOLDS, _PROOF, c, shown, "any coupling will do")
     text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
     if run.parts.graph.schedule is not None:
         text = "the slower of the slowest root and of what is left after a period, or in the end"
     shown = f"{-run.rate:.3g} 1/s"
-    yield Statement(Hypothesis.DECAYS, Verdict.HOLDS, _PROOF, -run.rate, shown, text)
+    yield Statement(Hypothesis.DISAGREEMENT_DECAY, Verdict.HOLDS, _PROOF, -run.rate, shown, text)
     text = "the law is linear in flat coordinates wherever it goes"
-    yield Statement(Hypothesis.ALONG, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield Statement(Hypothesis.ALONG_PATH, Verdict.NOT_NEEDED, _PROOF, text=text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
         yield _switching_line(run)
@@ -206,7 +208,7 @@ def _moves_others(run: StoppingRun) -> str:
 def _step_line(run: StoppingRun) -> Statement:
     """Return whether a held step keeps the largest stopping point from growing, c d_max dt <= 1."""
     assert run.law.reach is not None
-    name, dt, c = Hypothesis.STEP, run.settings.dt, run.coupling
+    name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
     share = c * run.law.reach.heaviest * dt
     radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
     led = float(run.leader.strength(dt)) * dt
@@ -244,7 +246,7 @@ def _held(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
         inner = np.append(0.0, stop[:-1])
         gains = inner + strengths[:, None] * stop
         dt, how = run.settings.dt, run.settings.integrator
-        found = max(found, held_radius(A, B, gains[:, None], dt, how))
+        found = max(found, sampled_radius(A, B, gains[:, None], dt, how))
     return found
 
 
@@ -299,10 +301,12 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     helps = "" if inner and current >= s else "set `observer: true`, or "
     remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
     fails = Verdict.FAILS
-    return Statement(Hypothesis.EXACT, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text)
+    return Statement(
+        Hypothesis.EXACT_STATES, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text
+    )
 
 
-@program
+@cached_jit
 def _pushed(
     model: ControlAffine, plant: ControlAffine, loop: FlatLoop, push: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -14,7 +14,7 @@ from typing import Any, final
 import numpy as np
 
 from echelon.core.errors import OutputError
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.core.provenance import versions
 from echelon.experiments.scenario.scenario import KEPT, Scenario
 from echelon.experiments.scenario.self_contained import self_contained
@@ -64,13 +64,13 @@ class Chunks:
         with write_errors(self.folder):
             for name, source in files.items():
                 (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
-                write_whole(self.folder / name, source.read_bytes())
+                write_atomic(self.folder / name, source.read_bytes())
             for name, content in more.items():
                 (self.folder / INPUTS).mkdir(exist_ok=True)
-                write_whole(self.folder / INPUTS / name, content)
-            write_whole(self.folder / KEPT, text)
+                write_atomic(self.folder / INPUTS / name, content)
+            write_atomic(self.folder / KEPT, text)
             begun = {"inputs": self._digest(), "versions": versions()}
-            write_whole(self.place / _BEGUN, json.dumps(begun) + "\n")
+            write_atomic(self.place / _BEGUN, json.dumps(begun) + "\n")
 
     def check(self) -> None:
         """Check that inputs and versions are those with which the run began.
@@ -124,10 +124,10 @@ class Chunks:
         Raises:
             OSError: they cannot be written.
         """
-        # In memory first, since `write_whole` takes all bytes of a file.
+        # In memory first, since `write_atomic` takes all bytes of a file.
         content = io.BytesIO()
         np.savez(content, allow_pickle=False, **arrays)
-        write_whole(self.place / f"{first}.npz", content.getvalue())
+        write_atomic(self.place / f"{first}.npz", content.getvalue())
 
     def stored(self, first: int) -> dict[str, Any] | None:
         """Return the arrays under a number; None where they are missing or damaged."""

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any, final
 
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.output.archive.folder import RUNS, write_errors
@@ -56,8 +56,8 @@ def write_comparison(
     """
     with write_errors(folder):
         content = json.dumps(summary, indent=2, allow_nan=False)
-        write_whole(folder / "comparison.json", content + "\n")
-        write_whole(folder / "comparison.txt", text + "\n")
+        write_atomic(folder / "comparison.json", content + "\n")
+        write_atomic(folder / "comparison.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.comparison_figures import save_comparison_figures

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError, did_you_mean, listing
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.experiments.results.recording import Recording
 from echelon.output.archive.folder import write_errors
 
@@ -29,7 +29,7 @@ def export(run: Recording, file: Path, kind: str) -> None:
         )
     content = _WRITERS[kind](run)
     with write_errors(file):
-        write_whole(file, content)
+        write_atomic(file, content)
 
 
 def table(run: Recording) -> "pd.DataFrame":

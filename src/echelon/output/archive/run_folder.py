@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from echelon.core.errors import OutputError
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import labelled, save_dataset, summary
 from echelon.experiments.results.recording import recording
@@ -37,7 +37,7 @@ def save_run(
     # A run from Python has no scenario file.
     if "scenario_text" in result.provenance:
         with write_errors(place):
-            write_whole(place / KEPT, result.provenance["scenario_text"])
+            write_atomic(place / KEPT, result.provenance["scenario_text"])
     write_findings(result, place, figures)
     Chunks(place).remove()
     return place
@@ -76,8 +76,8 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
         save_dataset(data, folder / DATA)
         # NaN is not JSON, and other parsers refuse it.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
-        write_whole(folder / SUMMARY, content + "\n")
-        write_whole(folder / "report.txt", report(result) + "\n")
+        write_atomic(folder / SUMMARY, content + "\n")
+        write_atomic(folder / "report.txt", report(result) + "\n")
         if result.drive.gain is not None:
             save_gain(result.drive.gain, result.model, result.graph, folder / GAIN)
         if figures and len(result.times):

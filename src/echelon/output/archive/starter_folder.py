@@ -5,7 +5,7 @@ from pathlib import Path
 from string import Template
 
 from echelon.core.errors import OutputError
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.output.archive.folder import write_errors
 
 _START = Path(__file__).resolve().parent / "start"
@@ -32,6 +32,6 @@ def create_starter(folder: Path) -> list[Path]:
         for source in sorted(_START.iterdir()):
             # Python files end in .txt here, so that nobody takes them for modules.
             file = folder / source.name.removesuffix(".txt")
-            write_whole(file, Template(source.read_text("utf-8")).safe_substitute(name=name))
+            write_atomic(file, Template(source.read_text("utf-8")).safe_substitute(name=name))
             files.append(file)
     return files

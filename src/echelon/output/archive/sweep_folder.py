@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, final
 
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.experiments.scenario.scenario import KEPT, load_scenario
 from echelon.experiments.sweeps.axes import read_axes
 from echelon.experiments.sweeps.plan import Sweep
@@ -74,8 +74,8 @@ def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = Tru
     """
     with write_errors(folder):
         # In memory first: on a full disk the HDF5 library would end the whole process.
-        write_whole(folder / "sweep.nc", bytes(data.to_netcdf(None, engine="h5netcdf")))
-        write_whole(folder / "sweep.txt", text + "\n")
+        write_atomic(folder / "sweep.nc", bytes(data.to_netcdf(None, engine="h5netcdf")))
+        write_atomic(folder / "sweep.txt", text + "\n")
         if figures:
             # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.sweep_figures import save_sweep_figures

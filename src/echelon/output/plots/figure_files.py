@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from echelon.core.files import make_whole
+from echelon.core.files import make_atomic
 from echelon.output.plots.style import style
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def save(
         for kind in kinds:
             path, told = folder / f"{name}.{kind}", dates.get(kind)
             with style():
-                make_whole(
+                make_atomic(
                     path, lambda part: figure.savefig(part, format=kind, dpi=dpi, metadata=told)
                 )
             paths.append(path)

@@ -10,7 +10,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, final
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, OutputError
-from echelon.core.files import make_whole
+from echelon.core.files import make_atomic
 from echelon.core.types import Array
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
@@ -44,7 +44,7 @@ def save_video(run: Recording, file: Path, speed: float = 1.0) -> int:
     program, pictures = encoder(), times_of(run, speed)
     with draw.style():
         film = _Film(run)
-        make_whole(file, lambda part: _encode(program, film, pictures, part, file.suffix.lower()))
+        make_atomic(file, lambda part: _encode(program, film, pictures, part, file.suffix.lower()))
     return len(pictures)
 
 

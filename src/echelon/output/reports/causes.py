@@ -65,7 +65,7 @@ def _slow(result: Result, found: Promise) -> Iterator[Cause]:
 
 def _lag(result: Result, numbers: Metrics, found: Promise) -> Iterator[Cause]:
     """Tell how far followers stay behind a leader whose input they are not sent."""
-    worst, matched = numbers.worst_steady, found.hypotheses[Hypothesis.MATCHED]
+    worst, matched = numbers.worst_steady, found.hypotheses[Hypothesis.MATCHED_MOTION]
     if worst is None or worst <= _LAG or not matched.fails or result.reference is None:
         return
     unit = "" if result.unit == "state" else f" {result.unit}"

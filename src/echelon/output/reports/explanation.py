@@ -86,7 +86,7 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
         return
     rises, forbidden = int(v.rises().sum()), int(v.forbidden().sum())
     # V' <= 0 is proved of the undisturbed loop that decays, and forbids nothing to others.
-    excused = result.world.disturbance or found.hypotheses[Hypothesis.DECAYS].fails
+    excused = result.world.disturbance or found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
     if forbidden and not excused:
         when = result.times[int(np.argmax(v.forbidden()))]
         yield (
@@ -94,10 +94,10 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
             "s) although V' <= 0 where they begin; the step `dt` is too long: halve it."
         )
     elif rises:
-        grows = found.hypotheses[Hypothesis.DECAYS].fails
+        grows = found.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails
         # Of a loop that grows by itself nobody can tell what part the wind has.
         excuse = "the loop grows by itself" if grows else "the disturbance pushes it up"
-        if found.hypotheses[Hypothesis.STEP].fails:
+        if found.hypotheses[Hypothesis.SAMPLING].fails:
             excuse = "the input is held over a `dt` too long, and V' is that of one that follows"
         elif result.world.disturbance is None:
             excuse = f"theory allows it, since {_excuse(v, found)}"
@@ -107,7 +107,7 @@ def _lyapunov_story(result: Result, found: Promise) -> Iterator[str]:
 
 
 def _excuse(v: Lyapunov, found: Promise) -> str:
-    coupled = found.hypotheses[Hypothesis.COUPLED]
+    coupled = found.hypotheses[Hypothesis.COUPLING]
     if coupled.fails:
         return coupled.text
     # Drifts cancel within V', so that rounding leaves some 1e-16 of its largest value.

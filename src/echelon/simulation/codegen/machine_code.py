@@ -11,8 +11,8 @@ import numpy as np
 
 from echelon.core import disk_cache
 from echelon.core.errors import MissingExtraError
-from echelon.core.trace import in_short
-from echelon.simulation.codegen.traced_entries import Unsupported
+from echelon.core.trace import error_summary
+from echelon.simulation.scalars.traced_entries import Unsupported
 
 
 @cache
@@ -104,7 +104,7 @@ class Code:
             module = binding.parse_assembly(text)
             module.verify()
         except RuntimeError as error:
-            raise Unsupported(f"what LLVM refuses ({in_short(error)})") from error
+            raise Unsupported(f"what LLVM refuses ({error_summary(error)})") from error
         options = binding.create_pipeline_tuning_options(speed_level=2)
         options.loop_vectorization = options.slp_vectorization = False
         passes = binding.create_pass_builder(self._machine, options)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_kind, listing
 from echelon.core.numerics import precision
 from echelon.core.types import Array, State
@@ -153,19 +153,19 @@ class _Given(NamedTuple):
     memory: Memory
 
 
-@program
+@cached_jit
 def _begin(loop: Loop, law: Law, x: State) -> Memory:
     return law.begin(loop.model, x)
 
 
-@program
+@cached_jit
 def _signal(loop: Loop, law: Law, own: _Given) -> jax.Array:
     """Return what neighbours hear."""
     said = law.signal(loop.model, *own)
     return own.x - own.offset if said is None else said
 
 
-@program
+@cached_jit
 def _step(
     loop: Loop,
     leads: bool,

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop, Moment, advance
@@ -42,7 +42,7 @@ def mesh_of(devices: int, agents: int) -> Mesh:
     return Mesh(np.array(there[:devices]), ("agents",))
 
 
-@program
+@cached_jit
 def advance_parted(
     mesh: Mesh, loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
 ) -> tuple[Moment, tuple[Any, Any], Sums]:

@@ -9,13 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, did_you_mean, listing
-from echelon.core.jaxpr import read_by
-from echelon.core.memoize import identify, kept
+from echelon.core.jaxpr import used_leaves
+from echelon.core.memoize import identify, memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.codegen import Unsupported
 from echelon.simulation.engine.content import content_of, copied, lasts
 from echelon.simulation.engine.law_drive import Laws, choose_engine
 from echelon.simulation.engine.parts import Parts
@@ -23,6 +22,7 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.native.backward import Backward, Wants
 from echelon.simulation.native.varying import VaryingNumbers, alike, bare
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.drive import Drive, Problem
 from echelon.simulation.step.loop import Loop, Moment, assemble, begin, control, step
 from echelon.simulation.step.meter import Sums, distance_of, reference_at
@@ -252,10 +252,10 @@ class Native:
         return way
 
 
-@kept
+@memoize
 def _is_spaced(cost: Cost, shapes: tuple[tuple[int, ...], ...]) -> bool:
     """Tell whether a cost rests on distances."""
-    return Sums(*read_by(cost, Sums(*map(np.zeros, shapes)))).spacing
+    return Sums(*used_leaves(cost, Sums(*map(np.zeros, shapes)))).spacing
 
 
 def _own(loop: Loop, names: Sequence[str]) -> tuple[VaryingNumbers, list[str]]:
@@ -273,7 +273,7 @@ def _own(loop: Loop, names: Sequence[str]) -> tuple[VaryingNumbers, list[str]]:
     return VaryingNumbers([loop], unlike), [leaf for leaf in marked if isinstance(leaf, str)]
 
 
-@program
+@cached_jit
 def _slopes_of(cost: Cost, sums: Sums) -> tuple[jax.Array, Sums]:
     """Return a cost of sums, and its slopes along those that have some."""
     names = ("errors", "tracking", "outputs", "effort", "spacing")
@@ -319,7 +319,7 @@ def _symmetric(name: str, slope: Array) -> Array:
     return 0.5 * (slope + slope.T) if name in ("P", "R") else slope
 
 
-@program
+@cached_jit
 def _differentiate(
     loop: Loop,
     values: dict[str, Array],

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array, Inputs, States
 from echelon.simulation.step.drive import Chunk, Problem, Stepper, Stopped
@@ -160,7 +160,7 @@ class _Made:
         return Chunk(now, states, inputs, on_host(self.sums), self.stopped)
 
 
-@program
+@cached_jit
 def _hold_inputs(
     motion: Motion,
     meter: Meter,

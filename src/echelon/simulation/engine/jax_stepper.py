@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.types import Array
 from echelon.simulation.engine.devices import advance_parted, mesh_of
 from echelon.simulation.native.varying import is_number
@@ -133,12 +133,12 @@ _ALL = Moment(None, 0, 0, 0, 0)  # type: ignore[arg-type]
 _SUMS: Any = Sums(*[0] * len(Sums._fields))._replace(steps=None, errors=1, tracking=1)
 
 
-@program
+@cached_jit
 def _begin_all(loop: Loop, axes: Any, states: jax.Array) -> Moment:
     return eqx.filter_vmap(begin, in_axes=(axes, 0), out_axes=_ALL)(loop, states)
 
 
-@program
+@cached_jit
 def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, wanted: Any) -> Any:
     each = (axes, _ALL, None, None)
     return eqx.filter_vmap(advance, in_axes=each, out_axes=(_ALL, 1, _SUMS))(

@@ -11,7 +11,7 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.world import World
 from echelon.core.errors import Outcome
-from echelon.core.pages import page_of
+from echelon.core.pages import notebook_page
 from echelon.core.types import Array
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.drive import Drive
@@ -119,7 +119,7 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Return the run as a notebook shows it: a table, with its picture."""
-        return page_of("result", self)
+        return notebook_page("result", self)
 
     def with_provenance(self, **texts: str) -> "Result":
         """Return the same run with more provenance."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from echelon.core.errors import MissingExtraError, ModelError
-from echelon.core.jaxpr import Algebra, Rule, dot, each, entrywise, evaluate, reduction
+from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, evaluate, map_entries, reduction
 
 
 def casadi() -> Any:
@@ -95,7 +95,7 @@ def symbols(owner: str) -> Algebra:
 def _rules(ca: Any) -> dict[str, Rule]:
     """Return what each primitive of JAX means for symbols, beyond what the walk itself knows."""
     written: dict[str, Rule] = {
-        "integer_pow": lambda params, x: each(lambda value: value ** params["y"], x),
+        "integer_pow": lambda params, x: map_entries(lambda value: value ** params["y"], x),
         # A symbol counts as finite; what is not, a solver finds out and reports.
         "is_finite": lambda params, x: np.full(x.shape, True),
         "round": functools.partial(_round, ca),
@@ -161,15 +161,15 @@ def _round(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
         up = ca.logic_or(size - low > 0.5, ca.logic_and(size - low == 0.5, tie))
         return ca.sign(value) * (low + up)
 
-    return each(one, x)
+    return map_entries(one, x)
 
 
 def _convert(ca: Any, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     """Return entries under another type; truth is one and falsehood zero among the symbols."""
     kind = np.dtype(params["new_dtype"]).kind
     if kind == "b":
-        return each(lambda value: value != 0.0, x)
+        return map_entries(lambda value: value != 0.0, x)
     if kind in "iu":
         # Toward zero, as JAX converts.
-        return each(lambda value: ca.sign(value) * ca.floor(ca.fabs(value)), x)
+        return map_entries(lambda value: ca.sign(value) * ca.floor(ca.fabs(value)), x)
     return x

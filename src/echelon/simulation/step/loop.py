@@ -14,7 +14,7 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.exchange import Exchange
 from echelon.agents.network.graph import Graph
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Input, Inputs, State, States
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, LocalView, Memory, without_certificates
@@ -130,7 +130,7 @@ def _levels(graph: Graph) -> Array:
     return np.stack([np.append(row, np.repeat(row[0], width - len(row))) for row in rows])
 
 
-@program
+@cached_jit
 def begin(loop: Loop, states: States) -> Moment:
     """Return the moment at which a run begins from states (N, n)."""
 
@@ -208,7 +208,7 @@ def _disagreement(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array:
     return exchange(y, y, jax.vmap(loop.model.difference))
 
 
-@program
+@cached_jit
 def signals(loop: Loop, now: Moment, offsets: jax.Array) -> jax.Array | None:
     """Return what neighbours hear of the agents (N, s); None where it is their states."""
     x = jnp.asarray(now.states)
@@ -301,7 +301,7 @@ def step(loop: Loop, now: Moment, acted: Control) -> Moment:
 # ---- many steps ----------------------------------------------------------------------------------
 
 
-@program
+@cached_jit
 def advance(
     loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
 ) -> tuple[Moment, tuple[Any, Any], Sums]:
@@ -330,7 +330,7 @@ def advance(
     return now, stored, sums
 
 
-@program
+@cached_jit
 def final_states(loop: Loop, starts: jax.Array, steps: int) -> jax.Array:
     """Return the states (S, N, n) after `steps` steps from each of the starts (S, N, n)."""
 

@@ -7,7 +7,7 @@ exact peak gain by quadrature of the impulse response.
 import numpy as np
 import scipy.linalg
 
-from echelon.core.linear import exponential
+from echelon.core.linear import matrix_exponential
 from echelon.core.types import Array
 from echelon.synthesis.certificates.margins import ClosedLoop, lowest, modes
 
@@ -63,7 +63,7 @@ def _impulse_norms(A: Array, E: Array) -> Array:
     """
     A, (d, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
     h, fast = -1.0 / float(np.linalg.eigvals(A).real.max()), 0.1 / float(np.linalg.norm(A, 2))
-    flow = exponential(A * h)
+    flow = matrix_exponential(A * h)
     # The tail beyond h is as small as exp(A h), so h grows by squaring until that is nothing.
     while np.linalg.norm(flow, 1) > 1e-12:
         flow, h = flow @ flow, 2.0 * h
@@ -73,7 +73,7 @@ def _impulse_norms(A: Array, E: Array) -> Array:
     closed, first = np.zeros(len(A)), True
     for _ in range(40):
         h *= 0.5
-        *steps, flow = exponential(A * (h * times))
+        *steps, flow = matrix_exponential(A * (h * times))
         starts = np.concatenate([starts, flow @ starts])
         # In parts, since matrices of all panels and nodes at once need not fit into memory.
         few = np.array_split(starts[:, None], 1 + len(starts) // 4096)

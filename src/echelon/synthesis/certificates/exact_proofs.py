@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from echelon.core.errors import GainError
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.types import Array
 
 Number: TypeAlias = float | Fraction
@@ -135,7 +135,7 @@ def _real(x: Fraction, bits: int) -> float:
     return float(x / (1 << bits))
 
 
-@kept
+@memoize
 def prove_contraction(
     vertices: Array, error: Array, B: Array, P: Array, rho: Number, rate: Number
 ) -> ContractionProof:

@@ -13,7 +13,7 @@ from echelon.core.enclosure.atoms import OpenError
 from echelon.core.enclosure.hull import Box, slope_columns, slope_hull
 from echelon.core.enclosure.slopes import JumpError
 from echelon.core.errors import GainError
-from echelon.core.memoize import kept
+from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
 from echelon.core.words import Kind
@@ -37,7 +37,7 @@ class Jacobians(NamedTuple):
     why: str = ""
 
 
-@kept
+@memoize
 def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     """Return the Jacobians of f + g (u* + S v) over a domain of states and normalized inputs.
 
@@ -51,7 +51,7 @@ def jacobians(model: ControlAffine, domain: Domain) -> Jacobians:
     return _enclose(model, domain, velocity_of(model))
 
 
-@kept
+@memoize
 def weighted_jacobians(model: ControlAffine, domain: Domain, R: Array) -> Jacobians:
     """Return the same with g S R^-1 (g S)' to the right of each Jacobian: (K, n, 2n).
 
@@ -106,7 +106,7 @@ def _freeze(found: Jacobians) -> Jacobians:
     return found
 
 
-@kept
+@memoize
 def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
     """Tell whether g is proved constant on the domain: the condition of the nonlocal theorem T1."""
 

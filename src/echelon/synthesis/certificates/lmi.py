@@ -20,7 +20,7 @@ import scipy.fft
 import scipy.linalg
 
 from echelon.core.errors import GainError, MissingExtraError, listing
-from echelon.core.linear import in_words, riccati, symmetric_basis, symmetric_part
+from echelon.core.linear import eigenvalue_text, riccati, symmetric_basis, symmetric_part
 from echelon.core.types import Array
 from echelon.synthesis.certificates.axis_modes import AXIS, axis_modes, obstacle, vertices_of
 
@@ -88,9 +88,8 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
     if found is not None:
         along = listing(names[i] if names else f"x{i + 1}" for i in found.states)
         kind = "a Jordan block on the imaginary axis" if found.defective else "an unstable mode"
-        what = (
-            f"matrix {found.vertex} has {kind}, at {in_words(found.eigenvalue)} 1/s along {along}"
-        )
+        mode = f"{eigenvalue_text(found.eigenvalue)} 1/s along {along}"
+        what = f"matrix {found.vertex} has {kind}, at {mode}"
         raise GainError(
             f"no P > 0 keeps this drift from expanding: {what}; damp it by an inner loop, shrink "
             "the domain, or take a method with feedback."

@@ -13,7 +13,7 @@ from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import GainError, OutputError
-from echelon.core.files import write_whole
+from echelon.core.files import write_atomic
 from echelon.core.types import Array, PathLike
 from echelon.core.words import Kind, Theorem
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate
@@ -172,7 +172,7 @@ def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) ->
     # A line a key: a diff then shows what changed. NaN is refused, since no promise rests on one.
     lines = [f"{json.dumps(key)}: {json.dumps(stored[key], allow_nan=False)}" for key in stored]
     try:
-        write_whole(Path(path), "{\n" + ",\n".join(lines) + "\n}\n")
+        write_atomic(Path(path), "{\n" + ",\n".join(lines) + "\n}\n")
     except OSError as error:
         raise OutputError(f"`{path}` cannot be written: {error.strerror or error}.") from error
 

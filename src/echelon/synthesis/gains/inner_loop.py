@@ -7,7 +7,7 @@ import scipy.linalg
 
 from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine
-from echelon.core.compiled import program
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import GainError, listing
 from echelon.core.linear import Weight, riccati, symmetric_part
 from echelon.core.types import Array
@@ -100,7 +100,7 @@ def symmetric_states(model: ControlAffine) -> list[int]:
     return [k for k in range(len(base)) if slopes[k] == 0.0]
 
 
-@program
+@cached_jit
 def _sensitivity(model: ControlAffine, states: jax.Array) -> jax.Array:
     """Return for each state the largest derivative of f and g along it, (n,)."""
 

@@ -7,7 +7,7 @@ import numpy as np
 from echelon.agents.models.linearization import Linearization
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError, listing
-from echelon.core.linear import Weight, in_words, riccati, uncontrollable_modes
+from echelon.core.linear import Weight, eigenvalue_text, riccati, uncontrollable_modes
 from echelon.synthesis.gains.gain import Feedback, Method
 from echelon.synthesis.gains.weights import weights_of
 
@@ -50,7 +50,7 @@ def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
             states = listing(itertools.compress(model.state_names, used))
             raise GainError(
                 f"the linearization of `{type(model).__name__}` at its trim cannot be stabilized: "
-                f"no input moves the mode at {in_words(eigenvalue)} 1/s, which lies along "
+                f"no input moves the mode at {eigenvalue_text(eigenvalue)} 1/s, which lies along "
                 f"{states}; give the gain yourself (method `given`) or choose another model of the "
                 "vehicle."
             )

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from echelon.core.jaxpr import Algebra, apply, each, walk
-from echelon.simulation.codegen.scalar import Node, ScalarGraph
-from echelon.simulation.codegen.traced_entries import (
+from echelon.core.jaxpr import Algebra, apply, map_entries, walk
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
+from echelon.simulation.scalars.traced_entries import (
     LARGEST,
     LONGEST,
     Unsupported,
@@ -43,9 +43,9 @@ def placed(
         if found is None:
             found = made
             continue
-        there = each(lambda *e, p=place: _is(graph, e, p), *(rows[..., k] for k in unknown))
+        there = map_entries(lambda *e, p=place: _is(graph, e, p), *(rows[..., k] for k in unknown))
         there = _spread(equation, there, made.ndim)
-        found = each(functools.partial(chosen, graph), there, made, found)
+        found = map_entries(functools.partial(chosen, graph), there, made, found)
     assert found is not None
     return [found]
 
@@ -121,7 +121,7 @@ def _clipped(graph: ScalarGraph, numbers: np.ndarray, end: int) -> np.ndarray:
     def one(e: Any) -> Any:
         return graph.make("min", graph.make("max", entry(e), 0.0), float(end))
 
-    return each(one, numbers) if numbers.dtype == object else np.clip(numbers, 0, end)
+    return map_entries(one, numbers) if numbers.dtype == object else np.clip(numbers, 0, end)
 
 
 def _spread(equation: Any, there: np.ndarray, axes: int) -> np.ndarray:
@@ -159,7 +159,7 @@ def cond(
         return made[0]
     [index] = which.flat
     return [
-        each(lambda *cases: one_of(graph, index, *cases), *results)
+        map_entries(lambda *cases: one_of(graph, index, *cases), *results)
         for results in zip(*made, strict=True)
     ]
 
@@ -198,7 +198,7 @@ def extreme(before: Callable[[Any, Any], tuple[Any, Any]]) -> Written:
             it = graph.make("or", beyond, graph.make("and", *both))
             return chosen(graph, it, b[0], a[0]), chosen(graph, it, b[1], a[1])
 
-        rows = np.moveaxis(each(lambda e: number(graph, e), x), axis, -1)
+        rows = np.moveaxis(map_entries(lambda e: number(graph, e), x), axis, -1)
         found = np.empty(rows.shape[:-1], object)
         for place in np.ndindex(*found.shape):
             pairs = ((e, float(k)) for k, e in enumerate(rows[place]))
@@ -220,11 +220,13 @@ def ordered(
         for k in range(end):
             # Slices, since of a row that is a lone entry no array would be left.
             one, next_one = slice(k, k + 1), slice(k + 1, k + 2)
-            later = each(functools.partial(less, graph), columns[0][next_one], columns[0][one])
+            later = map_entries(
+                functools.partial(less, graph), columns[0][next_one], columns[0][one]
+            )
             for x in columns:
                 a, b = x[one].copy(), x[next_one].copy()
-                x[one] = each(functools.partial(chosen, graph), later, b, a)
-                x[next_one] = each(functools.partial(chosen, graph), later, a, b)
+                x[one] = map_entries(functools.partial(chosen, graph), later, b, a)
+                x[next_one] = map_entries(functools.partial(chosen, graph), later, a, b)
     return [np.moveaxis(x, 0, axis) for x in columns]
 
 
@@ -247,7 +249,7 @@ def converted(
             return number(graph, e)
         return _whole(graph, e, to, of, where(equation))
 
-    return [each(one, x)]
+    return [map_entries(one, x)]
 
 
 def _whole(graph: ScalarGraph, e: Any, to: np.dtype, of: np.dtype, at: str) -> Any:
@@ -278,7 +280,7 @@ def divided(
         down, up = graph.make("floor", made), graph.make("ceil", made)
         return chosen(graph, graph.make("lt", made, 0.0), up, down)
 
-    return [each(one, *operands)]
+    return [map_entries(one, *operands)]
 
 
 def logical(name: str) -> Written:
@@ -289,7 +291,7 @@ def logical(name: str) -> Written:
     ) -> list[np.ndarray]:
         if np.dtype(equation.outvars[0].aval.dtype).kind != "b":
             raise Unsupported(f"`{name}` of whole numbers{where(equation)}")
-        return [each(lambda *e: graph.make(name, *map(entry, e)), *operands)]
+        return [map_entries(lambda *e: graph.make(name, *map(entry, e)), *operands)]
 
     return make
 

@@ -13,14 +13,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from echelon.core.jaxpr import Algebra, Rule, dot, each, entrywise, reduction, walk
+from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
-from echelon.core.trace import in_short
-from echelon.simulation.codegen import elementary
-from echelon.simulation.codegen.indexing import PICKED, RUNNING, less, one_of
-from echelon.simulation.codegen.scalar import Node, ScalarGraph
-from echelon.simulation.codegen.small_linear_systems import cholesky, factored, solve, triangular
-from echelon.simulation.codegen.traced_entries import (
+from echelon.core.trace import error_summary
+from echelon.simulation.scalars import elementary
+from echelon.simulation.scalars.indexing import PICKED, RUNNING, less, one_of
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
+from echelon.simulation.scalars.small_linear_systems import cholesky, factored, solve, triangular
+from echelon.simulation.scalars.traced_entries import (
     LONGEST,
     Unsupported,
     Written,
@@ -57,7 +57,7 @@ def lower(
             return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
         except (TypeError, ValueError, IndexError, KeyError, AttributeError) as error:
             # A trace is anyone's: what no rule was written for must end no run that JAX can make.
-            raise Unsupported(f"a trace that no rule fits ({in_short(error)})") from error
+            raise Unsupported(f"a trace that no rule fits ({error_summary(error)})") from error
 
 
 def _shape(leaf: np.ndarray) -> jax.ShapeDtypeStruct:
@@ -118,7 +118,7 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
         "select_n": functools.partial(one_of, graph),
     }
     written: dict[str, Rule] = {
-        "integer_pow": lambda params, x: each(
+        "integer_pow": lambda params, x: map_entries(
             lambda e: elementary.integer_power(node(graph, e), params["y"]), x
         ),
         "round": functools.partial(_round, graph),
@@ -143,8 +143,8 @@ _ELEMENTARY += ("cbrt", "rsqrt", "sign")
 def _round(graph: ScalarGraph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     to_even = int(params["rounding_method"]) == 1
     if to_even:
-        return each(lambda e: graph.make("rint", e), x)
-    return each(lambda e: elementary.round_half_away(node(graph, e)), x)
+        return map_entries(lambda e: graph.make("rint", e), x)
+    return map_entries(lambda e: elementary.round_half_away(node(graph, e)), x)
 
 
 # ---- primitives with functions of their own ------------------------------------------------------
