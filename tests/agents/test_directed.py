@@ -128,7 +128,7 @@ def test_who_hears_along_an_edge_is_who_has_the_other_as_a_neighbour():
 def test_networkx_means_the_same_by_arrows():
     given = nx.DiGraph([(0, 1), (1, 2), (2, 1)])
     graph = ech.Graph.from_networkx(given)
-    assert graph.directed and np.array_equal(graph.told().toarray(), nx.to_numpy_array(given))
+    assert graph.directed and np.array_equal(graph.outgoing().toarray(), nx.to_numpy_array(given))
     assert np.array_equal(graph.adjacency().toarray(), nx.to_numpy_array(given).T)
 
 
