@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -155,9 +155,8 @@ def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
     reason = f"{text}, so no tube is known"
     name = Hypothesis.SET if before else Hypothesis.REGION
     lines = [fails(name, _PROOF, text, None, "none", remedy=remedy, reason=reason)]
-    rest = {Hypothesis.REGION, Hypothesis.SET, Hypothesis.STARTS} - {name}
-    rest -= {cast(Hypothesis, line.statement) for line in before}
-    lines += [unneeded(each, _PROOF, "needs a tube") for each in rest]
+    others = (Hypothesis.SET, Hypothesis.STARTS) if not before else (Hypothesis.STARTS,)
+    lines += [unneeded(each, _PROOF, "needs a tube") for each in others]
     return _Found(None, (*before, *lines))
 
 
