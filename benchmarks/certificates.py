@@ -390,7 +390,7 @@ def _comes_back(model: ech.ControlAffine, gain: ech.Gain, name: str, size: float
 
 def table(rows: Sequence[Row]) -> str:
     """Return rows as a Markdown table."""
-    lines = ["| what | measured | asked or known |", "|---|---|---|"]
+    lines = ["| what | measured | goal or known value |", "|---|---|---|"]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 

@@ -86,7 +86,7 @@ def planar() -> Iterator[Sequence[str]]:
         plans = problem.plans(tree, offsets)
         gaps = [(plans[i].states - plans[j].states)[:, [0, 2]] for i, j in ((1, 0), (2, 1), (3, 1))]
         far = [f"{np.linalg.norm(gap, axis=1).max():.4g}" for gap in gaps]
-        text = f"followers {name}: greatest distance from their neighbour, wanted 0.5 m"
+        text = f"followers {name}: greatest distance from their neighbour, desired 0.5 m"
         yield text, ", ".join(far) + " m", "-"
 
 
@@ -105,7 +105,7 @@ def main() -> None:
         "## The optimization-based method on its own",
         "From the start of the paper's error figure: the leader 1.44 m off, F1 and F3 nearer to "
         "their neighbours by 0.193 and 0.180 m.",
-        table(("what", "measured", "asked or known"), list(optimization.rows())),
+        table(("what", "measured", "goal or known value"), list(optimization.rows())),
     ]
     parts += [
         "## The planar baseline",

@@ -89,7 +89,7 @@ def experiment(seeds: Sequence[int]) -> list[Row]:
                 "3e-5 / 1e-4 m" if scenario == "paper" else "-",
             ),
             (
-                f"`{scenario}`: time to 1 cm for good, median / worst seed",
+                f"`{scenario}`: time until the error stays below 1 cm, median / worst seed",
                 f"{np.median(within):.2f} / {within.max():.2f} s",
                 "-",
             ),
@@ -263,7 +263,7 @@ def spectra() -> list[Row]:
 
 def table(rows: Sequence[Row]) -> str:
     """Return rows as a Markdown table."""
-    lines = ["| what | measured | asked or known |", "|---|---|---|"]
+    lines = ["| what | measured | goal or known value |", "|---|---|---|"]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
