@@ -14,13 +14,22 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from echelon.simulation.codegen import SLOTS, Body, Code, Node, Plan, aligned, program, shared
-from echelon.simulation.codegen.fast_path import rewritten, whole
-from echelon.simulation.codegen.scalar import needed
+from echelon.simulation.codegen import (
+    SLOTS,
+    Body,
+    Code,
+    Plan,
+    aligned,
+    program,
+    shared,
+)
+from echelon.simulation.codegen.fast_path import whole
 from echelon.simulation.native.agent_step import body_of
 from echelon.simulation.native.kernel_cache import LANES
 from echelon.simulation.native.schedule import step_by_step
 from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.scalars import Node
+from echelon.simulation.scalars.scalar_graph import needed, rewritten
 
 Run: TypeAlias = Callable[[np.ndarray, int], None]
 """Takes some steps of agents in rows (blocks, rows, lanes)."""

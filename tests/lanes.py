@@ -7,14 +7,12 @@ from echelon.simulation.codegen import (
     Body,
     Code,
     Plan,
-    ScalarGraph,
     aligned,
-    lower,
-    nodes,
     program,
     shared,
     shortened,
 )
+from echelon.simulation.scalars import ScalarGraph, lower, nodes
 
 NOTHING = Body({}, {}, {}, {}, {}, [], [], [])
 

@@ -21,6 +21,7 @@ from runs import simulate
 import echelon as ech
 from echelon.core.errors import EchelonError, ScenarioError, listing
 from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.law_sections import GainSpec
 
 FILE = Path(__file__).with_name("sentences.txt")
 INDENT = "    "
@@ -41,7 +42,8 @@ LINES = {
     "report": "report: {steady_window: 10.0}",
     "seed": "seed: 0",
 }
-TABLES = [name for name in vars(registry) if name.isupper() and not name.startswith("_")]
+TABLES = {name: table for name, table in vars(registry).items() if re.fullmatch("[A-Z_]+", name)}
+TABLES["GAIN_KEYS"] = GainSpec.model_fields
 
 
 class Own(ech.Method):
@@ -121,8 +123,8 @@ def of_scenario(text):
         ech.load_scenario("s.yaml")
     except ScenarioError as error:
         answer = str(error)
-        for name in TABLES:
-            answer = answer.replace(listing(getattr(registry, name)), f"<{name}>")
+        for name, table in TABLES.items():
+            answer = answer.replace(listing(table), f"<{name}>")
         return answer
     return "accepted"
 

@@ -177,7 +177,7 @@ def test_without_ffmpeg_a_sentence_says_how_to_get_it(monkeypatch):
     [
         (("run.avi",), "`run.avi` ends in `.avi`, and must end in .mp4 or .gif."),
         (("run.mp4", "--speed", "0"), "`--speed` is 0, and must be from 0.01 to 100."),
-        (("none/run.mp4",), "`none` is no folder to write `run.mp4` into."),
+        (("none/run.mp4",), "`none` is not a folder; create it first to write `none/run.mp4`."),
     ],
 )
 def test_a_video_that_cannot_be_is_refused(echelon, file, name, sentence):
@@ -210,7 +210,7 @@ def test_init_takes_a_new_folder_and_no_other(echelon, here):
         "echelon: `full` exists and is not empty; choose another name.\n"
     )
     code, _, fault = echelon("init", "my swarm")
-    assert code == 2 and "`my swarm` is no name for a scenario" in fault
+    assert code == 2 and "`my swarm` cannot name a scenario" in fault
     assert not (here / "my swarm").exists()
 
 

@@ -286,7 +286,7 @@ def test_what_was_done_is_saved_and_repeats_to_the_bit(session, swarm):
 def test_a_run_refuses_what_was_done_live(echelon, here):
     (here / "live.yaml").write_text(dump_yaml(GIVEN | {"live": [{"at": 1.0, "coupling": 2.0}]}))
     code, _, fault = echelon("run", "live.yaml", "--out", "out")
-    assert code == 2 and "live: got 1 events, allowed is none in a run" in fault
+    assert code == 2 and "live: got 1 events, which only `echelon live` repeats" in fault
     assert not (here / "out").exists()
 
 

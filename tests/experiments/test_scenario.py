@@ -15,7 +15,9 @@ from sentences import LINES
 import echelon.experiments.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.part import accepted, resolve
+from echelon.experiments.scenario.checks import ROLES
+from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
+from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
     Fault,
@@ -24,6 +26,8 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
     scenario_from_mapping,
 )
+from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import read_yaml
 
 FOLDER = Path(echelon.experiments.scenario.scenario.__file__).parent
@@ -219,31 +223,36 @@ def test_further_sections_that_are_accepted(load, override):
     assert load(override).place(override.split("=")[0].split(".")[0])
 
 
-def test_the_tables_of_choices_cover_the_registry():
-    checks = echelon.experiments.scenario.checks
-    assert set(checks._GRAPH_KEYS) == {"edges", *GRAPHS}
-    assert set(checks._FORMATION_KEYS) == {"offsets", *FORMATIONS}
+@pytest.mark.parametrize("section", [GraphSpec, FormationSpec, GainSpec, LeaderSpec, FollowerSpec])
+def test_keys_belong_to_choices_that_exist(section):
+    choices = {
+        GraphSpec: {"edges", *GRAPHS},
+        FormationSpec: {"offsets", *FORMATIONS},
+        GainSpec: {*METHODS},
+        LeaderSpec: {*registry.LEADER_LAWS},
+        FollowerSpec: {*registry.FOLLOWER_LAWS},
+    }[section]
+    assert {name for mark in marked_keys(section).values() for name in mark.choices} <= choices
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_the_table_of_methods_says_what_their_classes_say(name):
-    entry, method = METHODS[name], resolve(METHODS[name])
+def test_a_method_takes_the_keys_that_its_class_takes(name):
+    method, marks = resolve(METHODS[name]), marked_keys(GainSpec)
     arguments = [field.name for field in dataclasses.fields(method)]
-    assert method.name == name and method.needs == entry.needs
-    assert sorted([*entry.needs, *entry.takes]) == sorted(arguments)
-    assert {*method.usual} <= {*method.needs}
+    assert sorted(key for key, mark in marks.items() if name in mark.choices) == sorted(arguments)
+    assert {key for key, mark in marks.items() if name in mark.needed_by} == {*method.needs}
+    assert method.name == name and {*method.usual} <= {*method.needs}
 
 
 @pytest.mark.parametrize("role", ["leader", "follower"])
-def test_the_table_of_laws_says_what_their_classes_say(role):
-    for name, entry in getattr(registry, f"{role.upper()}_LAWS").items():
-        stopping = ("roots", "rate", "coupling", "speed", "observer")
-        offered = {
-            "leader": ("gain", *stopping),
-            "follower": ("gain", "feedforward", "trim", "frame", *stopping, "hears"),
-        }[role]
-        taken = set(accepted(resolve(entry))) & {*offered}
-        assert {*entry.needs, *entry.takes} == taken, name
+def test_a_law_takes_the_keys_that_its_class_takes(role):
+    section, laws = ROLES[role]
+    for name, entry in laws.items():
+        taken = {key for key, mark in marked_keys(section).items() if name in mark.choices}
+        assert taken == set(accepted(resolve(entry))) & marked_keys(section).keys(), name
+        if role == "leader":
+            follows = "reference" in accepted(resolve(entry))
+            assert follows == (name in registry.TRACKING_LAWS), name
 
 
 def test_yaml_1_2_decides_what_a_word_is(load, refused):
@@ -553,5 +562,7 @@ def test_a_named_set_of_parameters_may_be_changed(load):
         with pytest.raises(echelon.EchelonError) as caught:
             echelon.build(load(f"model={{name: quadrotor, parameters: {parameters}}}"))
         assert said in str(caught.value)
-    with pytest.raises(echelon.EchelonError, match="`pendulum` has no named parameter sets"):
+    with pytest.raises(
+        echelon.EchelonError, match="got the parameter set `small`, but `pendulum` has none"
+    ):
         echelon.build(load("model={name: pendulum, parameters: {set: small}}"))

@@ -14,8 +14,9 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
-from echelon.simulation.codegen import ScalarGraph, Unsupported, machine_code, needed, shortened
-from echelon.simulation.codegen.scalar import OPERATIONS
+from echelon.simulation.codegen import machine_code, shortened
+from echelon.simulation.scalars import ScalarGraph, Unsupported, needed
+from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
 rng = np.random.default_rng(7)
 WIDE = rng.normal(size=4000) * 10.0 ** rng.uniform(-8.0, 1.0, 4000)

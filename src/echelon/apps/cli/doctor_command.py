@@ -5,19 +5,18 @@ import json
 import typer
 
 from echelon.apps.cli import tables
-from echelon.apps.cli.console import JsonOption
+from echelon.apps.cli.options import JsonOption
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Print versions and devices, and run the physics' self-checks."""
+    """Print versions and devices, and run the self-checks of the physics."""
     from echelon.experiments.studies.doctor import checks as all_checks
     from echelon.experiments.studies.doctor import facts as all_facts
 
     facts, checks = all_facts(), list(all_checks())
     if as_json:
-        print(
-            json.dumps({"facts": facts, "checks": [check._asdict() for check in checks]}, indent=2)
-        )
+        rows = [check._asdict() for check in checks]
+        print(json.dumps({"facts": facts, "checks": rows}, indent=2))
     else:
         from rich.markup import escape
 

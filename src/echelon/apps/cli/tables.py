@@ -31,6 +31,13 @@ def pairs(facts: dict[str, str]) -> "Table":
     return table
 
 
+def print_table(table: "Table", sentence: str) -> None:
+    """Print a table and a sentence, each row on one line where the output is no terminal."""
+    out = console()
+    out.print(table, soft_wrap=not out.is_terminal)
+    out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
+
+
 def design_row(design: "Design") -> dict[str, Any]:
     """Return what is told of a design; what does not exist is None."""
     row: dict[str, Any] = {"method": design.method, "reason": design.reason}

@@ -13,8 +13,9 @@ from echelon.core.errors import MissingExtraError
 from echelon.core.numerics import Precision, precision
 from echelon.core.types import Array
 from echelon.laws.law import Law
-from echelon.simulation.codegen import Unsupported, is_installed
+from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper, beyond
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, Moment, begin, control, step
 from echelon.simulation.step.settings import Settings
 

@@ -22,10 +22,10 @@ from echelon.experiments.results.metrics import metrics
 from echelon.experiments.scenario import registry
 from echelon.laws.consensus import Consensus
 from echelon.laws.tracking import Tracking
-from echelon.simulation.codegen import vectors
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.simulate import simulate
+from echelon.simulation.native import vectors
 from echelon.simulation.native.threads import processors
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import synthesize

@@ -9,9 +9,9 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.guarantees.promises.promise import Promise, promises
-from echelon.simulation.codegen import is_installed
 from echelon.simulation.engine.batch import Batch, Told
 from echelon.simulation.engine.result import Result
+from echelon.simulation.native import is_installed
 
 _AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
 """Of a batch: a second or two of native code, and as many runs as a vector has lanes."""

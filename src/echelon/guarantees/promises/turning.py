@@ -14,6 +14,7 @@ import numpy as np
 from echelon.agents.models.heading import heading_gap, heading_index, heading_of, state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
+from echelon.core.rational import bisect
 from echelon.core.statement import Hypothesis, Statement
 from echelon.core.types import Array
 from echelon.core.words import Kind, Verdict
@@ -143,10 +144,9 @@ def _slopes(model: ControlAffine, x: jax.Array, v: jax.Array) -> tuple[jax.Array
 
 def _fastest(case: Case, rate: float) -> float:
     """Return up to which rate of a turn this way modes decay, rad/s, by halving."""
-    low, high = 0.0, abs(rate)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        slowest = slowest_in_turn(case, float(np.copysign(middle, rate)))
-        decays = slowest is not None and slowest < 0.0
-        low, high = (middle, high) if decays else (low, middle)
-    return low
+
+    def decays(size: float) -> bool:
+        slowest = slowest_in_turn(case, float(np.copysign(size, rate)))
+        return slowest is not None and slowest < 0.0
+
+    return bisect(decays, 0.0, abs(rate), _HALVINGS)

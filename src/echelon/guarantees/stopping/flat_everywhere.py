@@ -10,7 +10,14 @@ import numpy as np
 from echelon.agents.models.chains import Chains, derivatives_of
 from echelon.agents.models.model import ControlAffine, FlatBound
 from echelon.core.memoize import memoize
-from echelon.simulation.codegen import Node, ScalarGraph, Unsupported, lower, needed, nodes
+from echelon.simulation.scalars import (
+    Node,
+    ScalarGraph,
+    Unsupported,
+    lower,
+    needed,
+    nodes,
+)
 
 _PARTIAL = {"exponent", "mantissa", "root_guess"}
 """Operations that are not defined for all numbers; quotients and roots are not for some."""

@@ -1,15 +1,12 @@
-"""Code for this machine: from a trace to scalars, to vectors, to the loops about them."""
+"""Machine code of a step: from a graph of scalars to vectors, to the loops around them."""
 
 from echelon.simulation.codegen.angle_differences import winds
 from echelon.simulation.codegen.block_copy import move
 from echelon.simulation.codegen.factoring import shortened
 from echelon.simulation.codegen.ir_blocks import SLOTS, TURN, Body, Plan, stride
 from echelon.simulation.codegen.kernel_text import program
-from echelon.simulation.codegen.lowering import lower
 from echelon.simulation.codegen.machine_code import Code, aligned, is_installed, vectors
-from echelon.simulation.codegen.scalar import Node, ScalarGraph, needed
 from echelon.simulation.codegen.tape import fed_widths, from_tape
-from echelon.simulation.codegen.traced_entries import Unsupported, nodes
 from echelon.simulation.codegen.uniform_values import shared
 
 __all__ = [
@@ -17,18 +14,12 @@ __all__ = [
     "TURN",
     "Body",
     "Code",
-    "ScalarGraph",
-    "Node",
     "Plan",
-    "Unsupported",
     "aligned",
     "fed_widths",
     "from_tape",
     "is_installed",
-    "lower",
     "move",
-    "needed",
-    "nodes",
     "program",
     "shared",
     "shortened",

@@ -8,10 +8,9 @@ differences tells whether the sums of plain ones are right.
 import math
 from collections.abc import Sequence
 
-from echelon.simulation.codegen.fast_path import rewritten
 from echelon.simulation.codegen.ir_blocks import Plan
-from echelon.simulation.codegen.scalar import Node
 from echelon.simulation.codegen.vector_ir import Writer, number
+from echelon.simulation.scalars.scalar_graph import Node, rewritten
 
 
 def limits(plan: Plan) -> dict[int, float]:

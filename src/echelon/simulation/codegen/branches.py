@@ -5,7 +5,7 @@ import heapq
 from collections.abc import Sequence
 from typing import final
 
-from echelon.simulation.codegen.scalar import Node, needed
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 _MANY = 40
 """Operations behind a choice from which on a branch is worth its cost."""

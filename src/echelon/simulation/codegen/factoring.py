@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias, final
 
 from echelon.simulation.codegen.quotients import inverses_shared
-from echelon.simulation.codegen.scalar import Node, needed
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 _OPEN = {"add", "sub", "mul", "neg"}
 _LARGEST = 1e30

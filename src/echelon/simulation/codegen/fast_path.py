@@ -7,12 +7,10 @@ is, without all that, and whole. The first is tried, and left for the second whe
 usual. What both make is the same to the bit.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
-from echelon.simulation.codegen.scalar import Node, ScalarGraph, needed
-
-Instead: TypeAlias = "Callable[[Node, Sequence[Node]], Node | float | bool | None]"
+from echelon.simulation.scalars.scalar_graph import Node, rewritten
 
 
 class FastPath(NamedTuple):
@@ -61,23 +59,3 @@ def usual(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> Fast
     made = rewritten(results, assume)
     levels = [[n for d, n in found if d == depth] for depth in sorted({d for d, _ in found})]
     return FastPath(made, [list(dict.fromkeys(level)) for level in levels])
-
-
-def rewritten(results: Sequence[Node], instead: Instead) -> dict[Node, Node]:
-    """Return what each needed node becomes, folded anew, where some become another."""
-    made = dict[Node, Node]()
-    for node in needed(results):
-        args = [made[a] for a in node.args]
-        other = instead(node, args)
-        if other is not None:
-            made[node] = _node(node.graph, other)
-        elif not args:
-            made[node] = node
-        else:
-            made[node] = node.graph.make(node.op, *args)
-            made[node].kept |= node.kept
-    return made
-
-
-def _node(graph: ScalarGraph, entry: Node | float | bool) -> Node:
-    return entry if isinstance(entry, Node) else graph.constant(entry)

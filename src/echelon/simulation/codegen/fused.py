@@ -7,10 +7,9 @@ decide by what stands in the same stretch of code, and the two would differ in t
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from echelon.simulation.codegen.fast_path import rewritten
 from echelon.simulation.codegen.ir_blocks import Body
-from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.scheduling import lateness
+from echelon.simulation.scalars.scalar_graph import Node, needed, rewritten
 
 
 def fused(body: Body) -> Body:

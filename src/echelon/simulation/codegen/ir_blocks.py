@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
-from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.vector_ir import Writer
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 NO_NEWS = 2**31 - 1
 """The least that a row keeps where it keeps none: no step has that number."""

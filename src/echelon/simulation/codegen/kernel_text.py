@@ -32,10 +32,10 @@ from echelon.simulation.codegen.ir_blocks import (
     store_row,
 )
 from echelon.simulation.codegen.neighbours import exchange, led, line, measure_edges, write_mirror
-from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.tape import record, taken, tape_at, tape_of
 from echelon.simulation.codegen.uniform_values import apart, shared
 from echelon.simulation.codegen.vector_ir import Emitter, Writer, number
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 
 def program(plan: Plan) -> str:

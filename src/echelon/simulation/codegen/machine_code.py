@@ -12,7 +12,7 @@ import numpy as np
 from echelon.core import disk_cache
 from echelon.core.errors import MissingExtraError
 from echelon.core.trace import error_summary
-from echelon.simulation.codegen.traced_entries import Unsupported
+from echelon.simulation.scalars.traced_entries import Unsupported
 
 
 @cache

@@ -17,8 +17,8 @@ from echelon.simulation.codegen.ir_blocks import (
     store_row,
     stride,
 )
-from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.vector_ir import Emitter, Writer
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 
 def exchange(

@@ -3,8 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from echelon.simulation.codegen.fast_path import rewritten
-from echelon.simulation.codegen.scalar import Node, needed
+from echelon.simulation.scalars.scalar_graph import Node, needed, rewritten
 
 _SMOOTH = {"add", "sub", "mul", "neg"}
 """What may read a quotient that is rounded otherwise; where it is cut to whole numbers or compared,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from echelon.simulation.codegen.scalar import Node
+from echelon.simulation.scalars.scalar_graph import Node
 
 _LONG = {"div": 3, "sqrt": 4, "select": 0, "neg": 0}
 """Operations that take longer than a product or less, in products."""

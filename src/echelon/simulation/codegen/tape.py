@@ -19,8 +19,8 @@ from echelon.simulation.codegen.ir_blocks import (
     stride,
 )
 from echelon.simulation.codegen.neighbours import transposed
-from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.vector_ir import Emitter, Writer
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 _KEPT = ("row", "z", "told", "leader")
 """Leaves that differ from step to step and are not the same for all agents."""

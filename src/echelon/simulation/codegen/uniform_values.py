@@ -6,9 +6,8 @@ follows. All groups of formations have it in common, and read it from memory, st
 
 from collections.abc import Sequence
 
-from echelon.simulation.codegen.fast_path import rewritten
 from echelon.simulation.codegen.ir_blocks import Body, Plan
-from echelon.simulation.codegen.scalar import Node, needed
+from echelon.simulation.scalars.scalar_graph import Node, needed, rewritten
 
 
 def shared(plan: Plan) -> list[Node]:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import final
 
 from echelon.simulation.codegen.branches import Branch, arms
-from echelon.simulation.codegen.scalar import Node, needed
 from echelon.simulation.codegen.scheduling import lateness, one_by_one
+from echelon.simulation.scalars.scalar_graph import Node, needed
 
 _INSTRUCTIONS = {
     **{name: f"f{name} {{T}} {{0}}, {{1}}" for name in ("add", "sub", "mul", "div")},

@@ -15,7 +15,6 @@ from echelon.core.jaxpr import used_leaves
 from echelon.core.memoize import identify, memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.codegen import Unsupported
 from echelon.simulation.engine.content import content_of, copied, lasts
 from echelon.simulation.engine.law_drive import Laws, choose_engine
 from echelon.simulation.engine.parts import Parts
@@ -23,6 +22,7 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
 from echelon.simulation.native.backward import Backward, Wants
 from echelon.simulation.native.varying import VaryingNumbers, alike, bare
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.drive import Drive, Problem
 from echelon.simulation.step.loop import Loop, Moment, assemble, begin, control, step
 from echelon.simulation.step.meter import Sums, distance_of, reference_at

@@ -18,9 +18,10 @@ from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward, Frame
 from echelon.laws.law import Law, gain_of
 from echelon.laws.law_check import leader_warnings, prepare_law
-from echelon.simulation.codegen import Unsupported, is_installed
 from echelon.simulation.engine.jax_stepper import JaxStepper
+from echelon.simulation.native import is_installed
 from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.drive import Drive, Information, Problem, Stepper
 from echelon.simulation.step.loop import assemble
 from echelon.simulation.step.settings import Settings

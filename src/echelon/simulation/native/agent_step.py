@@ -13,8 +13,9 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.simulation.codegen import Body, Node, ScalarGraph, Unsupported, lower, nodes, shortened
+from echelon.simulation.codegen import Body, shortened
 from echelon.simulation.native.varying import VaryingNumbers
+from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.loop import Loop, act_alone, tell, what_limits_did
 
 

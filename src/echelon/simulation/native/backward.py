@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.simulation.codegen import SLOTS, Body, Unsupported, aligned, fed_widths
+from echelon.simulation.codegen import SLOTS, Body, aligned, fed_widths
 from echelon.simulation.native.agent_step import BlockRows, signals_of
 from echelon.simulation.native.blocks import SwarmBlocks
 from echelon.simulation.native.kernel_cache import (
@@ -42,6 +42,7 @@ from echelon.simulation.native.transposed_graph import (
     turned_about,
 )
 from echelon.simulation.native.varying import VaryingNumbers
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, Moment, begin, signals
 from echelon.simulation.step.meter import Sums
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.simulation.codegen import aligned, needed, stride
+from echelon.simulation.codegen import aligned, stride
 from echelon.simulation.native.agent_step import memories_of, signals_of
 from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, heard
 from echelon.simulation.native.buffers import BufferPool
@@ -18,6 +18,7 @@ from echelon.simulation.native.signals import offsets_of, shown_by
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.native.wind_draws import draw_holds, holds_at_once
+from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
 from echelon.simulation.step.loop import Loop, Moment, begin, begin_forgetful, stretch_at
 from echelon.simulation.step.meter import ALWAYS, Sums

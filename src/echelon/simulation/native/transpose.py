@@ -13,16 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.simulation.codegen import (
-    Body,
-    Node,
-    ScalarGraph,
-    Unsupported,
-    from_tape,
-    lower,
-    nodes,
-    stride,
-)
+from echelon.simulation.codegen import Body, from_tape, stride
 from echelon.simulation.native.agent_step import (
     BlockRows,
     StepInputs,
@@ -37,6 +28,7 @@ from echelon.simulation.native.agent_step import (
 )
 from echelon.simulation.native.kernel_cache import LANES
 from echelon.simulation.native.varying import VaryingNumbers
+from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.meter import spacing_error
 

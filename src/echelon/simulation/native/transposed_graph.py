@@ -6,9 +6,10 @@ import numpy as np
 
 from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array
-from echelon.simulation.codegen import Unsupported, aligned, fed_widths, stride
+from echelon.simulation.codegen import aligned, fed_widths, stride
 from echelon.simulation.native.blocks import SwarmBlocks, heard, senders_of, smooth_blocks
 from echelon.simulation.native.kernel_cache import Kernel
+from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, stretch_at
 
 

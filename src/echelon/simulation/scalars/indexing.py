@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from echelon.core.jaxpr import Algebra, apply, map_entries, walk
-from echelon.simulation.codegen.scalar import Node, ScalarGraph
-from echelon.simulation.codegen.traced_entries import (
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
+from echelon.simulation.scalars.traced_entries import (
     LARGEST,
     LONGEST,
     Unsupported,

@@ -7,7 +7,7 @@ the rest. What each is off by is measured in the tests, in units of the last pla
 import math
 from fractions import Fraction
 
-from echelon.simulation.codegen.polynomials import (
+from echelon.simulation.scalars.polynomials import (
     EPS,
     LN2,
     PI,
@@ -22,7 +22,7 @@ from echelon.simulation.codegen.polynomials import (
     polynomial,
     sine_series,
 )
-from echelon.simulation.codegen.scalar import Node
+from echelon.simulation.scalars.scalar_graph import Node
 
 
 def _reduce(x: Node, k: Node, period: Fraction) -> Node:

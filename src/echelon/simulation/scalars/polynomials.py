@@ -11,7 +11,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from echelon.simulation.codegen.scalar import Node
+from echelon.simulation.scalars.scalar_graph import Node
 
 EPS = {64: 2.0**-53, 32: 2.0**-24}
 _PARTS = {64: (33, 53), 32: (11, 11, 24)}

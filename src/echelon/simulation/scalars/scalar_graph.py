@@ -7,7 +7,7 @@ same operands is the same node. All code for vectors is made from such a graph.
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias, final
 
 import numpy as np
@@ -199,6 +199,26 @@ def needed(results: Iterable[Node]) -> list[Node]:
             found[node] = None
             todo += node.args
     return sorted(found, key=lambda node: node.number)
+
+
+Instead: TypeAlias = Callable[[Node, Sequence[Node]], Node | float | bool | None]
+"""(node, what its operands have become) -> what it becomes; None where it stays that operation."""
+
+
+def rewritten(results: Iterable[Node], instead: Instead) -> dict[Node, Node]:
+    """Return what each needed node becomes, folded again, where some are replaced."""
+    after = dict[Node, Node]()
+    for node in needed(results):
+        args = [after[a] for a in node.args]
+        other = instead(node, args)
+        if other is not None:
+            after[node] = other if isinstance(other, Node) else node.graph.constant(other)
+        elif not args:
+            after[node] = node
+        else:
+            after[node] = node.graph.make(node.op, *args)
+            after[node].kept |= node.kept
+    return after
 
 
 # ---- what is simpler -----------------------------------------------------------------------------

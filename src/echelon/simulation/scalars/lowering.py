@@ -16,11 +16,11 @@ import numpy as np
 from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
 from echelon.core.trace import error_summary
-from echelon.simulation.codegen import elementary
-from echelon.simulation.codegen.indexing import PICKED, RUNNING, less, one_of
-from echelon.simulation.codegen.scalar import Node, ScalarGraph
-from echelon.simulation.codegen.small_linear_systems import cholesky, factored, solve, triangular
-from echelon.simulation.codegen.traced_entries import (
+from echelon.simulation.scalars import elementary
+from echelon.simulation.scalars.indexing import PICKED, RUNNING, less, one_of
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
+from echelon.simulation.scalars.small_linear_systems import cholesky, factored, solve, triangular
+from echelon.simulation.scalars.traced_entries import (
     LONGEST,
     Unsupported,
     Written,

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from echelon.core.jaxpr import Algebra, walk
-from echelon.simulation.codegen.scalar import ScalarGraph
-from echelon.simulation.codegen.traced_entries import (
+from echelon.simulation.scalars.scalar_graph import ScalarGraph
+from echelon.simulation.scalars.traced_entries import (
     LARGEST,
     Missing,
     Unsupported,

@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.core.errors import EchelonError
 from echelon.core.jaxpr import Algebra
-from echelon.simulation.codegen.scalar import Entry, Node, ScalarGraph
+from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
 
 LONGEST = 64
 """Rounds of a loop that are written out, and places of a table that are looked through."""

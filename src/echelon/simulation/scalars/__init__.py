@@ -1,0 +1,7 @@
+"""A function for JAX as a graph of scalar operations."""
+
+from echelon.simulation.scalars.lowering import lower
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph, needed
+from echelon.simulation.scalars.traced_entries import Unsupported, nodes
+
+__all__ = ["Node", "ScalarGraph", "Unsupported", "lower", "needed", "nodes"]
