@@ -11,7 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.heading import heading_gap, heading_index, heading_of, state_turn
+from echelon.agents.models.heading_symmetry import (
+    heading_gap,
+    heading_index,
+    heading_of,
+    state_turn,
+)
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.rational import bisect
