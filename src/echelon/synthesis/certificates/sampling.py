@@ -110,8 +110,8 @@ def _check_samples(model: ControlAffine, points: Array, velocity: _OfState) -> N
     gap = find_gap(entries, points[:_SEGMENTS])
     if gap is not None:
         raise GainError(
-            f"the derivative that JAX finds of `{name}` is {gap.said:.4g} inside the domain where "
-            f"its values change by {gap.seen:.4g}, and a promise would rest on it; write the model "
+            f"the derivative that JAX finds of `{name}` is {gap.derivative:.4g} inside the domain where "
+            f"its values change by {gap.slope:.4g}, and a promise would rest on it; write the model "
             "without `stop_gradient` and derivatives of its own."
         )
 
