@@ -72,9 +72,7 @@ def flat_output(model: ControlAffine, outputs: tuple[str, ...], x: State) -> jax
     return model.output(x)[np.array([model.output_names.index(name) for name in outputs])]
 
 
-def flatten(
-    model: ControlAffine, chains: Chains, x: State, e: Float[jax.Array, " k"]
-) -> Flattened:
+def flatten(model: ControlAffine, chains: Chains, x: State, e: Float[jax.Array, " k"]) -> Flattened:
     """Return the flat coordinates of a state with its integrators, and the inverse for inputs."""
     stated = model.flatten(x, e)
     return differentiate(model, chains, x, e) if stated is None else stated

@@ -14,6 +14,7 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_function, error_summary
+from echelon.core.types import Array
 
 # Far above the rounding of T/m - g, far below the error of a trim typed with a few digits.
 _TRIM_TOLERANCE = 1e-9
@@ -143,8 +144,8 @@ def _check_limits(model: ControlAffine, name: str, m: int) -> None:
     if type(model).limit is ControlAffine.limit:
         if k != m or not _has_inverse(np.asarray(limits.matrix, float)):
             raise ModelError(
-                f"`input_limits` of `{name}` has {k} rows for {m} inputs, which does not define the "
-                "input that is delivered beyond the limits; add the method `limit`."
+                f"`input_limits` of `{name}` has {k} rows for {m} inputs, which does not define "
+                "the input that is delivered beyond the limits; add the method `limit`."
             )
 
 
@@ -231,16 +232,16 @@ def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarr
 
 
 def _differentiate(model: ControlAffine, name: str) -> AtTrim:
-    """Return a model at its trim, after checking that JAX's derivatives are its slopes there."""
+    """Return a model at its trim, after checking JAX's derivatives against slopes of its values."""
     try:
-        there = at_trim(model)
-    # The model is anyone's code, and JAX says in many ways that it cannot derive it.
+        trim = at_trim(model)
+    # The model is the user's code, and JAX raises errors of many types where it has no derivative.
     except Exception as error:
         raise ModelError(
-            f"`{name}` has no derivative at its trim, by {error_summary(error)}; write it "
-            "with `jax.numpy` alone."
+            f"`{name}` has no derivative at its trim ({error_summary(error)}); write the model "
+            "with `jax.numpy` only."
         ) from error
-    gap = there.gap
+    gap = trim.gap
     if gap is not None:
         n, state = len(model.state_names), model.state_names[gap.variable]
         row, column = divmod(gap.entry - n, len(model.input_names))
@@ -251,8 +252,8 @@ def _differentiate(model: ControlAffine, name: str) -> AtTrim:
         )
         raise ModelError(
             f"the derivative of {which} of `{name}` in `{state}` at the trim is "
-            f"{gap.derivative:.4g} by JAX and {gap.slope:.4g} by its values; write the model without "
-            "`stop_gradient` and without derivatives of its own."
+            f"{gap.derivative:.4g} by JAX and {gap.slope:.4g} by its values; write the model "
+            "without `stop_gradient` and without derivatives of its own."
         )
     return trim
 

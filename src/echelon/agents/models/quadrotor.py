@@ -29,7 +29,7 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, State
 
 _IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
-"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015); none is published for other propellers."""
+"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015), the only one that is published."""
 
 
 def _crazyflie(mass: float, motor_thrust: float, torque_per_thrust: float) -> dict[str, Any]:
@@ -143,7 +143,7 @@ class Quadrotor(RigidVehicle):
 
     @property
     def damping(self) -> Rows:
-        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw; position has no feedback."""
+        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw, but not position."""
         # A tilt accelerates by g times itself, so 1.6/g rad per m/s damp at 1.6 1/s. Poles of the
         # attitude: s^2 + 16 s + 60 = (s + 6) (s + 10); of the yaw: (s + 2)^2.
         tilt, stiff, damp = 1.6 / self.gravity, 60.0, 16.0
