@@ -77,7 +77,8 @@ def switching_spectrum(Ls: Sequence[sp.csr_array]) -> Spectrum:
     """Return the spectrum of graphs that take turns: all eigenvalues, and their common decay.
 
     The sum of squared errors does not depend on the graph, so it can decrease through switches. Its
-    decay under a graph is the smallest eigenvalue of (L + L')/2; it may grow where that is 0 or less.
+    decay under a graph is the smallest eigenvalue of (L + L')/2; where that is not positive, the
+    sum may grow.
     """
     eigenvalues, weakest, lost = list[Array](), np.inf, 0.0
     for L in Ls:
@@ -142,8 +143,8 @@ def _contraction(L: sp.csr_array, low: float) -> tuple[float, Array | None]:
     """Return the decay of a sum of squares with weights w, and w; 0 and None if there is none.
 
     With (L - s) x = 1 and (L' - s) y = 1, s below lambda_min, x and y are positive. With w = y / x
-    the matrix W L + L'W - 2 s W has no positive entry off its diagonal and takes x > 0 to a positive
-    vector, so it is positive definite.
+    the matrix W L + L'W - 2 s W has no positive entry off its diagonal and takes x > 0 to a
+    positive vector, so it is positive definite.
     """
     ones = np.ones(len(L.diagonal()))
     shifted = sp.csc_array(L)
