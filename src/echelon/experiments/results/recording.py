@@ -256,7 +256,8 @@ def _check_format(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any
         by = attributes.get("version_echelon", "an unknown version")
         raise OutputError(
             f"the run was written in format {version} by echelon {by}, but this version reads "
-            f"format {FORMAT}; `echelon run FOLDER --out OTHER` computes it again from its scenario."
+            f"format {FORMAT}; `echelon run FOLDER --out OTHER` computes it again from its "
+            "scenario."
         )
 
 
