@@ -16,6 +16,7 @@ from echelon.experiments.scenario.values import (
     ClassInFile,
     MatrixOrIdentity,
     NameOrUserClass,
+    NeededBy,
     Numeric,
     OneOf,
     Positive,
@@ -52,6 +53,9 @@ def _close_gain_schema(schema: dict[str, Any]) -> None:
     ]
 
 
+_PER_STATE = Unit("1 over the states' squared")
+
+
 @final
 class GainSpec(BaseModel):
     """The gain of a law: a method with its arguments, or a gain file."""
@@ -63,9 +67,7 @@ class GainSpec(BaseModel):
     method: Annotated[str, OneOf(registry.METHODS)] = registry.DEFAULT_METHOD
     """Name of a method."""
     Q: Annotated[
-        WeightMatrix | None,
-        Unit("1 over the states' squared"),
-        TakenBy("riccati", "inner-loop", "robust-lqr"),
+        WeightMatrix | None, _PER_STATE, TakenBy("riccati", "inner-loop", "robust-lqr")
     ] = None
     """Weight of the states: its diagonal or rows; default the model's."""
     R: Annotated[
@@ -74,26 +76,22 @@ class GainSpec(BaseModel):
         TakenBy("riccati", "given", "inner-loop", "robust-lqr"),
     ] = None
     """Weight of the normalized inputs: its diagonal or rows; default the model's."""
-    P: Annotated[
-        MatrixOrIdentity | None, Unit("1 over the states' squared"), TakenBy(needed_by=["given"])
-    ] = None
+    P: Annotated[MatrixOrIdentity | None, _PER_STATE, NeededBy("given")] = None
     """The matrix P of the method `given`: `identity`, its diagonal or rows."""
     coupling: Annotated[Positive | None, Unit("1"), TakenBy(*registry.METHODS)] = None
     """Coupling strength; default the method's choice."""
     domain: Annotated[
         dict[str, Numeric] | None,
         Unit("the states'"),
-        TakenBy(needed_by=["monotone", "robust-lqr", "contraction"]),
+        NeededBy("monotone", "robust-lqr", "contraction"),
     ] = None
     """States about the trim for which a rate is proved: a half-width, or `[lower, upper]`, by
     state, group or normalized input."""
-    rate: Annotated[Positive | None, Unit("1/s"), TakenBy(needed_by=["contraction"])] = None
+    rate: Annotated[Positive | None, Unit("1/s"), NeededBy("contraction")] = None
     """Desired rate of the method `contraction`, 1/s."""
     exact: Annotated[bool | None, TakenBy("robust-lqr", "contraction")] = None
     """Whether a rate is proved in exact arithmetic where possible."""
-    symmetry_weight: Annotated[
-        Numeric | None, Unit("1 over the states' squared"), TakenBy("inner-loop")
-    ] = None
+    symmetry_weight: Annotated[Numeric | None, _PER_STATE, TakenBy("inner-loop")] = None
     """Weight of the symmetric states in the P of `inner-loop`."""
     python: ClassInFile | None = None
     """A method of yours, `file.py:Class`, the file relative to the scenario file; its arguments are
@@ -108,38 +106,9 @@ class GainSpec(BaseModel):
 
 
 _STOPPING = TakenBy("stopping-point")
-_Roots = Annotated[
-    Annotated[tuple[Positive, ...], Field(strict=False)] | None,
-    Unit("1/s"),
-    _STOPPING,
-    Field(
-        description="Of the law `stopping-point`: roots of the inner loop, 1/s, one fewer than the "
-        "longest chain of the model; different from each other."
-    ),
-]
-_Rate = Annotated[
-    Positive | None,
-    Unit("1/s"),
-    _STOPPING,
-    Field(description="Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."),
-]
-_Speed = Annotated[
-    Speed | None,
-    Unit("the outputs' per s"),
-    _STOPPING,
-    Field(
-        description="Of the law `stopping-point`: the largest speed that agreement commands, of "
-        "each flat output or of all, such as m/s; `inf` for no bound."
-    ),
-]
-_Observer = Annotated[
-    bool | None,
-    _STOPPING,
-    Field(
-        description="Of the law `stopping-point`: whether disturbances and model errors are "
-        "estimated and compensated."
-    ),
-]
+_Roots = Annotated[tuple[Positive, ...] | None, Field(strict=False), Unit("1/s"), _STOPPING]
+_Rate = Annotated[Positive | None, Unit("1/s"), _STOPPING]
+_Speed = Annotated[Speed | None, Unit("the outputs' per s"), _STOPPING]
 
 
 def law_arguments(section: BaseModel) -> dict[str, Any]:
@@ -164,12 +133,19 @@ class LeaderSpec(BaseModel, **STRICT):
     """Distance at which the leader starts from its reference, or from its trim without one, by
     state or group of states, in the states' units."""
     roots: _Roots = None
+    """Of the law `stopping-point`: roots of the inner loop, 1/s, one fewer than the longest chain
+    of the model; different from each other."""
     rate: _Rate = None
+    """Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."""
     coupling: Annotated[Positive | None, Unit("1/s"), _STOPPING] = None
     """Of the law `stopping-point`: rate at which the leader approaches its reference, 1/s; default
     twice the slowest root, or the largest that the step allows."""
     speed: _Speed = None
-    observer: _Observer = None
+    """Of the law `stopping-point`: the largest speed that agreement commands, of each flat output
+    or of all, such as m/s; `inf` for no bound."""
+    observer: Annotated[bool | None, _STOPPING] = None
+    """Of the law `stopping-point`: whether disturbances and model errors are estimated and
+    compensated."""
     gain: Annotated[GainSpec | None, TakenBy("tracking", "optimal-tracking")] = None
     """Gain of the leader's tracking, under `tracking` and `optimal-tracking`; default the model's
     Riccati gain."""
@@ -194,12 +170,19 @@ class FollowerSpec(BaseModel, **STRICT):
     gain: Annotated[GainSpec, TakenBy("consensus")] = Field(default_factory=GainSpec)
     """Gain of the law `consensus`."""
     roots: _Roots = None
+    """Of the law `stopping-point`: roots of the inner loop, 1/s, one fewer than the longest chain
+    of the model; different from each other."""
     rate: _Rate = None
+    """Of the law `stopping-point`: its slowest root, 1/s, instead of `roots`."""
     coupling: Annotated[Positive | None, Unit("1/s"), _STOPPING] = None
     """Of the law `stopping-point`: strength of the agreement, 1/s over the graph's weights; default
     twice the slowest root over lambda_min, or the largest that the step allows."""
     speed: _Speed = None
-    observer: _Observer = None
+    """Of the law `stopping-point`: the largest speed that agreement commands, of each flat output
+    or of all, such as m/s; `inf` for no bound."""
+    observer: Annotated[bool | None, _STOPPING] = None
+    """Of the law `stopping-point`: whether disturbances and model errors are estimated and
+    compensated."""
     hears: Annotated[Annotated[str, OneOf(map(str, NeighbourChoice))] | None, _STOPPING] = None
     """Of the law `stopping-point`: whether agents use the information of `all` neighbours, or only
     of those nearer to a leader (`leaderward`)."""

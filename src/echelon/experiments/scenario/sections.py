@@ -17,6 +17,7 @@ from echelon.experiments.scenario.values import (
     ClassInFile,
     Count,
     Edges,
+    NeededBy,
     NotNegative,
     Numbers,
     Numeric,
@@ -94,16 +95,14 @@ class GraphSpec(BaseModel, **_either("edges", "name")):
     """Name of a generated graph; the keys below are its parameters."""
     agents: Annotated[
         Count | None,
-        TakenBy("edges", "grid", needed_by=[name for name in registry.GRAPHS if name != "grid"]),
+        TakenBy("edges", "grid", needed_by=("path", "ring", "star", "complete", "geometric")),
     ] = None
     """Number of agents, leaders included; with `edges` the default is the largest number + 1."""
-    rows: Annotated[Count | None, TakenBy(needed_by=["grid"])] = None
+    rows: Annotated[Count | None, NeededBy("grid")] = None
     """Rows of the graph `grid`."""
-    columns: Annotated[Count | None, TakenBy(needed_by=["grid"])] = None
+    columns: Annotated[Count | None, NeededBy("grid")] = None
     """Columns of the graph `grid`."""
-    radius: Annotated[
-        Positive | None, Unit("sides of the square"), TakenBy(needed_by=["geometric"])
-    ] = None
+    radius: Annotated[Positive | None, Unit("sides of the square"), NeededBy("geometric")] = None
     """Of the graph `geometric`: agents at random places of a unit square are linked up to this
     distance, in sides of the square."""
     seed: Annotated[Seed, TakenBy("geometric")] = 0

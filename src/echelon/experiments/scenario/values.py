@@ -63,6 +63,11 @@ class TakenBy:
         self.choices = (*self.needed_by, *choices)
 
 
+def NeededBy(*choices: str) -> TakenBy:
+    """Mark a key that some choices of its section need."""
+    return TakenBy(needed_by=choices)
+
+
 def marked_keys(section: type[BaseModel]) -> dict[str, TakenBy]:
     """Return the keys of a section that belong to some of its choices, such as laws, only."""
     marks = ((key, mark) for key, field in section.model_fields.items() for mark in field.metadata)
