@@ -480,7 +480,7 @@ def test_a_plant_s_parameter_may_be_given_or_scaled():
         (
             {"disturbance": {"rms": {"vy": -1}}},
             "disturbance.rms.vy",
-            "got `-1`, allowed is a number from 0 on.",
+            "got `-1`, allowed is a number of at least 0.",
         ),
         (
             {"disturbance": {"hold": 0}},

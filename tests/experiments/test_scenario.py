@@ -292,7 +292,7 @@ def test_all_faults_of_a_file_are_told_at_once_by_line(refused):
         "s.yaml:7: follower.feedforward: got `rely`, allowed are `none`, `relay`,"
         " `relay-velocity`, `parent` (did you mean `relay`?).",
         "s.yaml:11: simulation.dt: got `0`, allowed is a number above 0.",
-        "s.yaml:14: seed: got this key twice, it stands at s.yaml:12 already.",
+        "s.yaml:14: seed: got this key twice, the first is at s.yaml:12.",
     ]
 
 
@@ -334,7 +334,7 @@ def test_the_error_carries_its_faults(load):
         load(seed="seed: -1", name="name: 3")
     assert caught.value.faults == (
         Fault("s.yaml:1", "name", f"got `3`, allowed is {FOLDER_NAME}."),
-        Fault("s.yaml:11", "seed", "got `-1`, allowed is a number from 0 on."),
+        Fault("s.yaml:11", "seed", "got `-1`, allowed is a number of at least 0."),
     )
     assert str(caught.value) == "\n".join(map(str, caught.value.faults))
     assert caught.value.exit_code == 2
@@ -431,7 +431,7 @@ def test_a_mapping_is_checked_like_a_file():
     assert (scenario.seed, scenario.folder, scenario.place("seed")) == (3, Path("here"), "mapping")
     with pytest.raises(ScenarioError) as caught:
         scenario_from_mapping(given | {"seed": -1})
-    assert str(caught.value) == "mapping: seed: got `-1`, allowed is a number from 0 on."
+    assert str(caught.value) == "mapping: seed: got `-1`, allowed is a number of at least 0."
 
 
 def test_a_scenario_cannot_be_changed(load):

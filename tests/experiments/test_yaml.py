@@ -146,8 +146,8 @@ def test_a_path_that_does_not_exist_has_the_place_of_its_parent():
 def test_repeated_keys_are_told_with_both_lines():
     document = read_yaml("a: 1\nb: {c: 1,\n  c: 2}\na: 3\n", "f.yaml")
     assert [tuple(fault) for fault in document.faults] == [
-        ("f.yaml:3", "b.c", "got this key twice, it stands at f.yaml:2 already."),
-        ("f.yaml:4", "a", "got this key twice, it stands at f.yaml:1 already."),
+        ("f.yaml:3", "b.c", "got this key twice, the first is at f.yaml:2."),
+        ("f.yaml:4", "a", "got this key twice, the first is at f.yaml:1."),
     ]
 
 
@@ -235,7 +235,7 @@ def test_an_override_is_a_path_and_a_value(text, data):
         ),
         (
             "a={x: 1, x: 2}",
-            "--set a={x: 1, x: 2}: got this key twice, it stands at --set a={x: 1, x: 2} already.",
+            "--set a={x: 1, x: 2}: got this key twice, the first is at --set a={x: 1, x: 2}.",
         ),
         (
             "s.x=1",

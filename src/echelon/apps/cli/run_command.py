@@ -97,12 +97,12 @@ def _new_run(
 
 def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
     """Return the scenario, its parts, and the job in a folder."""
-    from echelon.experiments.scenario.scenario import KEPT, load_scenario
+    from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
     from echelon.output.archive.chunks import Chunks
 
     job = Job("run", Chunks(folder))
     job.resume("summary.json")
-    scenario = load_scenario(folder / KEPT)
+    scenario = load_scenario(folder / SCENARIO_FILE)
     from echelon.experiments.scenario.build import build
 
     return scenario, build(scenario), job

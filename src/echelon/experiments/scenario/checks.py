@@ -16,7 +16,7 @@ from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
 from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
 from echelon.experiments.scenario.values import foreign_keys, marked_keys
-from echelon.experiments.scenario.yaml import Document, KeyPath, are, shown
+from echelon.experiments.scenario.yaml import Document, KeyPath, is_or_are, quoted
 
 Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
@@ -83,7 +83,7 @@ def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
         return
     number = number_of(value)
     if number is not None and not math.isfinite(number):
-        yield path, f"got {shown(value)}, allowed is a finite number."
+        yield path, f"got {quoted(value)}, allowed is a finite number."
 
 
 def _sources(data: Part) -> Iterator[Finding]:
@@ -111,7 +111,7 @@ def _taken(
     other = {"law", *SOURCES.get(path, ((), False))[0], *foreign}
     allowed = [key for key in kind.model_fields if key not in other]
     for key in (key for key in part if key in foreign):
-        said = f"allowed {are(allowed)}" if allowed else "it takes no keys"
+        said = f"allowed {is_or_are(allowed)}" if allowed else "it takes no keys"
         yield (*path, str(key)), f"got a key that `{choice}` does not take, {said}."
 
 
@@ -146,7 +146,10 @@ def _gain_choices(data: Part, path: KeyPath) -> Iterator[Finding]:
     # The schema accepts further keys, which a class of the user may have.
     keys = list(GainSpec.model_fields)
     for key in (key for key in gain if isinstance(key, str) and key not in keys):
-        yield (*path, key), f"got an unknown key, allowed {are(keys)}{did_you_mean(key, keys)}."
+        yield (
+            (*path, key),
+            f"got an unknown key, allowed {is_or_are(keys)}{did_you_mean(key, keys)}.",
+        )
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -312,7 +315,7 @@ def _durations(data: Part) -> Iterator[Finding]:
         return
     fault = horizon_fault(horizon, dt)
     if fault is not None:
-        got = f"got {shown(simulation['horizon'])}, which {fault}"
+        got = f"got {quoted(simulation['horizon'])}, which {fault}"
         yield ("simulation", "horizon"), f"{got}."
 
 

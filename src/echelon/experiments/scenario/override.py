@@ -1,4 +1,4 @@
-"""What the command line sets: where its paths lead, and what of the file gives way to it."""
+"""Overrides from the command line: they remove the keys of the file that they exclude."""
 
 import copy
 from collections.abc import Iterator
@@ -10,20 +10,20 @@ from echelon.experiments.scenario.yaml import Document, KeyPath
 
 
 def settle_overrides(document: Document) -> Document:
-    """Return a document whose overrides stand beside nothing that excludes them.
+    """Return a document without the keys that its overrides exclude.
 
-    A path that the command line sets is relative to the working folder, and becomes absolute.
+    A path on the command line is relative to the working folder, and becomes absolute.
     """
-    # The document that was read stays what the file says.
+    # The document that was read is not changed.
     data = copy.deepcopy(document.data)
     set_ = [path for path, _ in document.overrides]
     for path in set_:
         _make_absolute(data, path)
         part = _at(data, path[:-1])
         for rival in _rivals(path, part):
-            beside = (*path[:-1], rival)
-            # What the command line sets too is for the checks to refuse.
-            if not any(each[: len(beside)] == beside for each in set_):
+            other = (*path[:-1], rival)
+            # Two overrides that exclude each other are refused by the checks.
+            if not any(path[: len(other)] == other for path in set_):
                 del part[rival]
     return document._replace(data=data)
 
@@ -43,13 +43,12 @@ def _rivals(path: KeyPath, part: Any) -> list[Any]:
 
 
 def _make_absolute(data: Any, path: KeyPath) -> None:
-    found = _at(data, path)
-    for place, name, rest in named_files(found, path):
+    for place, name, rest in named_files(_at(data, path), path):
         _at(data, place[:-1])[place[-1]] = f"{Path(name).resolve()}{rest}"
 
 
 def named_files(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, str, str]]:
-    """Yield the place of every file that plain data name, its name, and what stands after that."""
+    """Yield the path of every file name in plain data, the name, and the text after it."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):
             yield from named_files(item, (*path, key))
@@ -65,6 +64,6 @@ def _at(data: Any, path: KeyPath) -> Any:
         try:
             data = data[key]
         except (LookupError, TypeError):
-            # A path through a number or a text leads nowhere; the checks of the file say so.
+            # A path through a number or a text leads nowhere; the checks report it.
             return None
     return data

@@ -1,7 +1,6 @@
-"""The scenario file: how it is read, and how its faults are told.
+"""The scenario file: loads and checks it, and reports its faults.
 
-Every fault of a file is reported at once, a line each: `file:line: field: what was got, what is
-allowed`.
+All faults of a file are reported at once, a line each: `file:line: field: got ..., allowed ...`.
 """
 
 import math
@@ -22,21 +21,21 @@ from echelon.experiments.scenario.yaml import (
     Fault,
     KeyPath,
     apply_overrides,
-    are,
     dump_yaml,
+    is_or_are,
     joined,
+    quoted,
     read_yaml,
-    shown,
 )
 
 _BUNDLED = Path(__file__).parent / "bundled"
-KEPT = "scenario.yaml"
+SCENARIO_FILE = "scenario.yaml"
 """The name of the scenario in the folder of a run."""
 
 
 @final
 class Scenario(BaseModel, **STRICT):
-    """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
+    """One experiment, checked and with its defaults; `load_scenario` returns one."""
 
     name: FolderName
     """Name of its folder."""
@@ -52,7 +51,7 @@ class Scenario(BaseModel, **STRICT):
     simulation: sections.SimulationSpec
     report: sections.ReportSpec = Field(default_factory=sections.ReportSpec)
     live: Annotated[tuple[sections.LiveSpec, ...], Field(strict=False)] = ()
-    """What `echelon live` does at its time, as it saved what a person did; no other command can."""
+    """Changes made during `echelon live`, which repeats them; no other command can."""
     seed: Seed = 0
     """Seed of everything random in the run."""
 
@@ -67,7 +66,7 @@ class Scenario(BaseModel, **STRICT):
 
     @property
     def data(self) -> dict[Any, Any]:
-        """The same as plain data; not to be changed."""
+        """The same as plain data; do not modify it."""
         return self._document.data
 
     @property
@@ -77,11 +76,11 @@ class Scenario(BaseModel, **STRICT):
 
     @property
     def file(self) -> Path:
-        """The file that it was read from; one that is not there for a mapping."""
+        """The file that it was read from; of a mapping, a file that does not exist."""
         return self._file
 
     def place(self, *path: str | int) -> str:
-        """Return where a key stands, as in `paper.yaml:4`; else its parent's place."""
+        """Return the place of a key, as in `paper.yaml:4`; else its parent's."""
         return self._document.place(path)
 
 
@@ -94,7 +93,7 @@ _ALLOWED = {
     "model_type": "is a mapping",
     "tuple_type": "is a list",
     "greater_than": "is a number above {gt:g}",
-    "greater_than_equal": "is a number from {ge:g} on",
+    "greater_than_equal": "is a number of at least {ge:g}",
     "less_than": "is a number below {lt}",
     "too_short": "is a list of at least {min_length} number",
 }
@@ -111,24 +110,24 @@ def _keys(path: KeyPath) -> list[str]:
 
 
 def _describe(error: ErrorDetails) -> tuple[KeyPath, str]:
-    """Return the path of a fault that the schema found, and its sentence."""
+    """Return the path and the sentence of a fault of the schema."""
     path, kind, context = error["loc"], error["type"], error.get("ctx", {})
     if path and path[-1] == "[key]":
-        kind = "a whole number, an agent's" if kind == "int_type" else "a name"
-        return path[:-1], f"got the key {shown(path[-2])}, allowed is {kind}."
+        kind = "the number of an agent" if kind == "int_type" else "a name"
+        return path[:-1], f"got the key {quoted(path[-2])}, allowed is {kind}."
     if kind == "missing":
         return path, "got nothing, this key is required."
     if kind in ("extra_forbidden", "invalid_key"):
         keys = _keys(path[:-1])
-        return path, f"got an unknown key, allowed {are(keys)}{did_you_mean(path[-1], keys)}."
+        return path, f"got an unknown key, allowed {is_or_are(keys)}{did_you_mean(path[-1], keys)}."
     got = context.get("got", error["input"])
     allowed = _ALLOWED[kind].format(**context) if kind in _ALLOWED else error["msg"]
     close = did_you_mean(got, context.get("names", "").split())
-    return path, f"got {shown(got)}, allowed {allowed}{close}."
+    return path, f"got {quoted(got)}, allowed {allowed}{close}."
 
 
-def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return the data with the defaults that hang on another section; an empty section is none."""
+def _with_defaults(data: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Return the data with the defaults that depend on another section, without empty sections."""
     filled = {key: value for key, value in data.items() if value is not None}
     leader, report = filled.get("leader", {}), filled.get("report", {})
     if isinstance(leader, dict):
@@ -141,16 +140,8 @@ def _filled(data: Mapping[Any, Any]) -> dict[Any, Any]:
     return filled
 
 
-def _validated(data: Mapping[Any, Any]) -> tuple[Scenario | None, list[tuple[KeyPath, str]]]:
-    """Return the scenario, or the faults that the schema finds."""
-    try:
-        return Scenario.model_validate(_filled(data)), []
-    except ValidationError as error:
-        return None, list(map(_describe, error.errors(include_url=False)))
-
-
 def _by_line(fault: Fault) -> tuple[bool, int]:
-    """Sort by line, what the command line set last."""
+    """Return a sort key: the line, with faults of the command line last."""
     line = fault.place.rpartition(":")[2]
     overridden = fault.place.startswith("--set ")
     return overridden, int(line) if line.isdigit() and not overridden else 0
@@ -171,15 +162,19 @@ def refuse(faults: Iterable[Fault]) -> NoReturn:
 def _scenario(document: Document, text: str, file: Path) -> Scenario:
     data = {} if document.data is None else document.data
     if not isinstance(data, dict):
-        said = f"got {shown(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
-        refuse([Fault(document.place(()), "", said)])
+        text = f"got {quoted(data)}, allowed is a mapping with the keys {listing(_keys(()))}."
+        refuse([Fault(document.place(()), "", text)])
     document = document._replace(data=data)
-    scenario, refused = _validated(data)
-    # One for each path: what a check says of it goes before what the schema says.
-    found: dict[KeyPath, str] = {}
-    for path, said in (*cross_faults(document), *refused):
-        found.setdefault(path, said)
-    faults = [Fault(document.place(path), joined(path), said) for path, said in found.items()]
+    scenario, errors = None, list[ErrorDetails]()
+    try:
+        scenario = Scenario.model_validate(_with_defaults(data))
+    except ValidationError as error:
+        errors = error.errors(include_url=False)
+    # One for each path: the sentence of a check replaces that of the schema.
+    sentences: dict[KeyPath, str] = {}
+    for path, sentence in (*cross_faults(document), *map(_describe, errors)):
+        sentences.setdefault(path, sentence)
+    faults = [Fault(document.place(path), joined(path), s) for path, s in sentences.items()]
     if scenario is None or faults or document.faults:
         refuse([*document.faults, *faults])
     scenario._document, scenario._text, scenario._file = document, text, file
@@ -187,25 +182,27 @@ def _scenario(document: Document, text: str, file: Path) -> Scenario:
 
 
 def bundled_scenarios() -> dict[str, str]:
-    """Return the bundled scenarios: each name with the line that says what it is."""
+    """Return the names of the bundled scenarios, each with its summary."""
     names = sorted(file.stem for file in _BUNDLED.glob("*.yaml"))
     texts = {name: (_BUNDLED / f"{name}.yaml").read_text("utf-8") for name in names}
     return {name: text.partition("\n")[0].lstrip("# ") for name, text in texts.items()}
 
 
-def _found(source: str | Path) -> tuple[Path, str]:
-    """Return the file that `source` means and the name under which messages show it."""
+def _locate(source: str | Path) -> tuple[Path, str]:
+    """Return the file that `source` means, and its name in messages."""
     names = list(bundled_scenarios())
     if str(source) in names:
         return _BUNDLED / f"{source}.yaml", f"{source}.yaml"
-    # The folder of a run holds the scenario that was run.
-    file = Path(source) / KEPT if Path(source).is_dir() else Path(source)
+    # The folder of a run contains its scenario.
+    file = Path(source) / SCENARIO_FILE if Path(source).is_dir() else Path(source)
     if file.is_file():
         return file, str(file)
-    what = f"it is a folder without `{KEPT}`" if file != Path(source) else "no such file exists"
-    said = f"{what}, allowed is a file, the folder of a run or a bundled scenario: {listing(names)}"
+    what = "no such file exists"
+    if file != Path(source):
+        what = f"it is a folder without `{SCENARIO_FILE}`"
+    allowed = f"allowed is a file, the folder of a run or a bundled scenario: {listing(names)}"
     close = did_you_mean(Path(source).stem, names)
-    raise ScenarioError(f"got the scenario `{source}`, {said}{close}.")
+    raise ScenarioError(f"got the scenario `{source}`, {what}, {allowed}{close}.")
 
 
 def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario:
@@ -214,16 +211,17 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     Args:
         source: Path to a YAML file, the folder of a run, or the name of a bundled scenario (which
             wins over a file).
-        overrides: Texts such as `simulation.horizon=10`, laid over the file before it is checked.
-            A path among them is relative to the working folder, one in the file to the file.
+        overrides: Texts such as `simulation.horizon=10` that replace keys of the file before it is
+            checked. A path among them is relative to the working folder, one in the file to the
+            file.
 
     Raises:
-        ScenarioError: There is no such scenario, or it has faults: one line for each of them, which
-            the error's `faults` holds as `Fault` records too.
+        ScenarioError: There is no such scenario, or it has faults: one line for each of them; the
+            error's `faults` are the same as `Fault` records.
     """
-    file, name = _found(source)
+    file, name = _locate(source)
     try:
-        # Some editors begin a file with a byte order mark, which is no part of its first key.
+        # Some editors write a byte order mark, which does not belong to the first key.
         text = file.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{name}: this file cannot be read as UTF-8 text: {error}.") from error
@@ -234,8 +232,8 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
     return _scenario(document, text, file)
 
 
-def varied(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
-    """Return a scenario with texts such as `simulation.horizon=10` laid over it.
+def with_overrides(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
+    """Return a scenario in which texts such as `simulation.horizon=10` replace keys.
 
     Raises:
         ScenarioError: It has faults, as in `load_scenario`.
@@ -245,7 +243,7 @@ def varied(scenario: Scenario, overrides: Sequence[str]) -> Scenario:
 
 
 def _plain(value: object) -> object:
-    """Return lists for tuples and arrays, and Python's own numbers for NumPy's."""
+    """Return data with lists for tuples and arrays, and Python numbers for NumPy numbers."""
     to_list: Callable[[], object] | None = getattr(value, "tolist", None)
     value = value if to_list is None else to_list()
     if isinstance(value, Mapping):
@@ -257,8 +255,8 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
     """Check a scenario given as a mapping, with the keys of the file.
 
     Args:
-        data: The scenario; tuples and NumPy arrays stand for lists.
-        folder: The folder to which `model.python` is relative.
+        data: The scenario; tuples and NumPy arrays count as lists.
+        folder: The folder to which paths are relative.
 
     Raises:
         ScenarioError: The scenario has faults, as in `load_scenario`.
@@ -268,6 +266,6 @@ def scenario_from_mapping(data: Mapping[str, Any], folder: str | Path = ".") -> 
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of the scenario file, which editors can check and complete with."""
+    """Return the JSON schema of the scenario file, for checks and completion in editors."""
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return draft | Scenario.model_json_schema()

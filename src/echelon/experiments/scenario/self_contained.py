@@ -1,4 +1,4 @@
-"""A scenario with all the files that it names, so that its folder alone repeats the run."""
+"""A scenario together with all files that it names, so that its folder repeats the run."""
 
 import copy
 from pathlib import Path
@@ -10,10 +10,10 @@ from echelon.experiments.scenario.yaml import KeyPath, dump_yaml
 
 
 def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]]:
-    """Return the YAML in which every named file lies in the folder `place` beside it.
+    """Return the YAML in which every named file is in the folder `place` next to it.
 
-    With it come the names there, each with the file that belongs there. A scenario that names no
-    file is as it was, comments included.
+    The second value maps each name there to the file to copy. The text of a scenario that names no
+    file is unchanged, comments included.
     """
     data = copy.deepcopy(scenario.data)
     files: dict[str, Path] = {}
@@ -26,12 +26,12 @@ def self_contained(scenario: Scenario, place: str) -> tuple[str, dict[str, Path]
 
 
 def files_of(scenario: Scenario) -> list[Path]:
-    """Return the file of a scenario and all that it names."""
+    """Return the file of a scenario and all files that it names."""
     return [scenario.file, *self_contained(scenario, "")[1].values()]
 
 
 def _free(name: str, source: Path, taken: dict[str, Path]) -> str:
-    """Return a name that no other file has, such as `inputs/2/gain.json`."""
+    """Return a name that is free, such as `inputs/2/gain.json`."""
     folder, _, base = name.rpartition("/")
     count = 1
     while taken.get(name, source) != source:

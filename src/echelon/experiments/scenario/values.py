@@ -1,7 +1,7 @@
 """The kinds of value in a scenario file, each with its check, its sentence and its JSON schema.
 
-Numbers are real numbers only: neither truth values nor text that looks like a number. Values that
-are not finite pass here; they are refused for the whole file at once.
+A number is neither a truth value nor text that looks like a number. Values that are not finite pass
+here; they are refused for the whole file at once.
 """
 
 import math
@@ -20,7 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from echelon.experiments.scenario.yaml import are
+from echelon.experiments.scenario.yaml import is_or_are
 
 STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docstrings=True)
 """The configuration of every section."""
@@ -28,9 +28,9 @@ STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docs
 
 @final
 class Allowed:
-    """Marks a type of which one phrase says what is allowed, whichever part of it fails.
+    """Marks a type with one phrase for what is allowed, whichever part of it fails.
 
-    The names are what a misspelt word may have meant; the schema replaces the type's own.
+    `names` are what a misspelt word may have meant; `schema` replaces the type's.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Allowed:
 
 
 def Unit(text: str) -> Any:
-    """Mark a number with its SI unit, `1` where it has none; the schema and its page tell it."""
+    """Mark a number with its SI unit, `1` without one, for the schema and its page."""
     return Field(json_schema_extra={"unit": text})
 
 
@@ -82,18 +82,18 @@ def foreign_keys(section: type[BaseModel], choice: str) -> list[str]:
 def OneOf(names: Iterable[str]) -> Allowed:
     """Mark text that must be one of the names of a registry table."""
     listed = list(names)
-    # `Literal[*names]` makes the same schema, and no type checker reads it
-    return Allowed(are(listed), listed, core_schema.literal_schema(listed))
+    # `Literal[*names]` gives the same schema, but type checkers reject it
+    return Allowed(is_or_are(listed), listed, core_schema.literal_schema(listed))
 
 
 def NameOrUserClass(names: Iterable[str]) -> Allowed:
     """Mark what is a name of a registry table or a class in a user's file."""
     listed = list(names)
-    return Allowed(f"{are(listed)}, or `python: file.py:Class`", listed)
+    return Allowed(f"{is_or_are(listed)}, or `python: file.py:Class`", listed)
 
 
 def _weighted(edge: object) -> object:
-    """Return an edge with its weight, 1 unless it is given."""
+    """Return an edge with its weight, by default 1."""
     if not isinstance(edge, list) or len(edge) not in (2, 3):
         raise PydanticCustomError("allowed", "is a pair `[i, j]` or a triple `[i, j, weight]`")
     return (*edge, 1.0)[:3]
@@ -122,7 +122,7 @@ def _numeric(value: object) -> object:
     if isinstance(value, list):
         return tuple(map(_numeric, value))
     if isinstance(value, bool) or not isinstance(value, int | float):
-        # the list may be long, so the message shows what is no number and not the whole list
+        # the list may be long, so the message has only the value that is not a number
         allowed = "is a number or a nested list of numbers"
         raise PydanticCustomError("allowed", allowed, {"got": value})
     if isinstance(value, int) and abs(value) >= _WHOLE:
@@ -144,7 +144,7 @@ ClassInFile = Annotated[
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 _WHOLE = 2**63
-"""The first whole number that NumPy and JAX do not know."""
+"""The first whole number that NumPy and JAX cannot represent."""
 Count = Annotated[int, Field(ge=1, lt=_WHOLE)]
 Seed = Annotated[int, Field(ge=0, lt=_WHOLE)]
 Agent = Annotated[int, Field(ge=0, lt=_WHOLE)]

@@ -1,9 +1,9 @@
-"""Reads YAML 1.2 into plain data, and remembers on which line each value stands.
+"""Reads YAML 1.2 into plain data with the line of each value, and applies overrides.
 
-ruamel.yaml composes the text into nodes, says what a word means and writes. Its constructor would
-stop at the first repeated key and drop the lines, so the walk over the nodes is here. Values given
-on the command line (`--set a.b=3`) are read the same way and laid over the file's before anything
-is checked, so both meet the same rules.
+ruamel.yaml composes the text into nodes, interprets words and writes YAML. Its constructor would
+stop at the first repeated key and drop the line numbers, so the nodes are traversed here. Values
+from the command line (`--set a.b=3`) are read the same way and replace the file's before anything
+is checked, so the same rules apply to both.
 """
 
 import io
@@ -26,16 +26,16 @@ Where = Callable[[int], str]
 
 
 class Fault(NamedTuple):
-    """One fault of a scenario: where it stands, its key (joined by dots), and a sentence."""
+    """One fault of a scenario: its place, its key (joined by dots), and a sentence."""
 
     place: str
     field: str
     message: str
 
     def __str__(self) -> str:
-        # What the command line sets names its own field.
-        said = self.place.startswith(f"--set {self.field}=")
-        parts = (self.place, "" if said else self.field, self.message)
+        # The place of an override contains its key.
+        override = self.place.startswith(f"--set {self.field}=")
+        parts = (self.place, "" if override else self.field, self.message)
         return ": ".join(part for part in parts if part)
 
 
@@ -51,9 +51,9 @@ class Document(NamedTuple):
     overrides: tuple[tuple[KeyPath, str], ...] = ()
 
     def place(self, path: KeyPath) -> str:
-        """Return the place of `path`, or of the nearest part above it that stands somewhere.
+        """Return the place of `path`, or of the nearest part above it that has one.
 
-        Where the command line set it, something inside or something around, that is the place.
+        If the command line set it, something inside it or something around it, that is the place.
         """
         while path:
             for exact, place in reversed(self.overrides):
@@ -66,20 +66,20 @@ class Document(NamedTuple):
 
 
 def joined(path: KeyPath) -> str:
-    """Return the keys of a path joined by dots, as messages and the command line have them."""
+    """Return the keys of a path joined by dots, as in messages and on the command line."""
     return ".".join(map(str, path))
 
 
 _WORDS = {f"tag:yaml.org,2002:{kind}" for kind in ("null", "bool", "int", "float")}
-"""What an unquoted word may be other than text."""
+"""The types of an unquoted word, other than text."""
 _ALIASED = 10_000
-"""Values that aliases may add. Without them there is one for each character of the text at most;
-aliases of aliases multiply without end."""
+"""Values that aliases may add. Without aliases there is at most one value for each character of the
+text; aliases of aliases multiply without bound."""
 
 
 @final
 class _Reading:
-    """One walk over the composed nodes; collects places and faults on its way."""
+    """Traverses the composed nodes, and collects the places of values and the faults."""
 
     def __init__(self, where: Where, text: str) -> None:
         self.where, self.most = where, len(text) + _ALIASED
@@ -93,11 +93,11 @@ class _Reading:
     def value(self, node: Node, path: KeyPath) -> object:
         self.places.setdefault(path, self.line(node))
         if len(self.places) > self.most:
-            said = f"got aliases for more than {_ALIASED} values, allowed is a plain tree."
-            raise ScenarioError(f"{self.line(node)}: {said}")
+            text = f"got aliases for more than {_ALIASED} values, allowed is a plain tree."
+            raise ScenarioError(f"{self.line(node)}: {text}")
         if node.ctag.handle is not None:
             tag = f"{node.ctag.handle}{node.ctag.suffix}"
-            self.blame(node, path, f"got the tag `{tag}`, allowed are values without a tag.")
+            self.add_fault(node, path, f"got the tag `{tag}`, allowed are values without a tag.")
         if isinstance(node, ScalarNode):
             return self.meaning(node)
         if isinstance(node, MappingNode):
@@ -105,15 +105,15 @@ class _Reading:
         return [self.value(item, (*path, i)) for i, item in enumerate(node.value)]
 
     def meaning(self, node: ScalarNode) -> object:
-        """Return what a word means by YAML 1.2; ruamel.yaml departs from it in two things."""
+        """Return the value of a word in YAML 1.2; ruamel.yaml differs in two respects."""
         text = str(node.value)
         if not node.style and re.fullmatch(r"[-+]?\.[0-9]+[eE][0-9]+", text):
-            return float(text)  # it wants a sign in the exponent of `.5e3`
+            return float(text)  # ruamel.yaml needs a sign in the exponent of `.5e3`
         if node.tag not in _WORDS or "_" in text:
-            return text  # it takes `1_000` for a number, dates and `<<` for more than text
+            return text  # ruamel.yaml reads `1_000` as a number, dates and `<<` not as text
         try:
             return self.yaml.constructor.construct_object(node)
-        except (ValueError, LookupError):  # more digits than Python reads, or a false tag
+        except (ValueError, LookupError):  # more digits than Python reads, or an invalid tag
             return text
 
     def mapping(self, node: MappingNode, path: KeyPath) -> dict[str | int, object]:
@@ -122,8 +122,8 @@ class _Reading:
             key = self.key(key_node, path)
             below = (*path, key)
             if key in data:
-                sentence = f"got this key twice, it stands at {self.places[below]} already."
-                self.blame(key_node, below, sentence)
+                sentence = f"got this key twice, the first is at {self.places[below]}."
+                self.add_fault(key_node, below, sentence)
                 continue
             self.places[below] = self.line(key_node)
             data[key] = self.value(value_node, below)
@@ -131,24 +131,26 @@ class _Reading:
 
     def key(self, node: Node, path: KeyPath) -> str | int:
         if not isinstance(node, ScalarNode):
-            self.blame(node, path, "got a list or mapping as a key, allowed is a word or a number.")
+            self.add_fault(
+                node, path, "got a list or mapping as a key, allowed is a word or a number."
+            )
             return "?"
         key = self.meaning(node)
         return key if type(key) is int else str(node.value)
 
-    def blame(self, node: Node, path: KeyPath, message: str) -> None:
+    def add_fault(self, node: Node, path: KeyPath, message: str) -> None:
         self.faults.append(Fault(self.line(node), joined(path), message))
 
 
 def _reason(error: Exception, text: str) -> tuple[int, str]:
-    """Return the line, counted from 1, at which reading stopped, and why it did."""
+    """Return the line, counted from 1, at which reading stopped, and the reason."""
     if isinstance(error, ReaderError):
         line = text.count("\n", 0, error.position) + 1
         return line, f"the character {error.character:#x} is not allowed"
     if not isinstance(error, MarkedYAMLError) or error.problem_mark is None:
-        # ruamel.yaml stumbles over a few texts, such as the escape of an impossible character
+        # ruamel.yaml raises other errors for a few texts, such as the escape of no character
         return 1, "it cannot be read"
-    # some problems begin with "but", as the second half of their context
+    # some problems begin with "but", and continue their context
     context = f"{error.context}, " if error.problem.startswith("but ") else ""
     return error.problem_mark.line + 1, " ".join(f"{context}{error.problem}".split())
 
@@ -161,8 +163,8 @@ def _read(text: str, where: Where) -> Document:
             node = reading.yaml.compose(text)
         data = None if node is None else reading.value(node, ())
     except RecursionError as error:
-        said = "got values nested too deep or within themselves, allowed is a plain tree."
-        raise ScenarioError(f"{where(1)}: {said}") from error
+        text = "got values nested too deep or within themselves, allowed is a plain tree."
+        raise ScenarioError(f"{where(1)}: {text}") from error
     except (YAMLError, ValueError, ArithmeticError, LookupError, AssertionError) as error:
         line, reason = _reason(error, text)
         raise ScenarioError(f"{where(line)}: this is not YAML: {reason}.") from error
@@ -171,13 +173,13 @@ def _read(text: str, where: Where) -> Document:
 
 
 def read_yaml(text: str, file: str) -> Document:
-    """Read one YAML 1.2 document; `file` is the name that places show.
+    """Read one YAML 1.2 document; `file` is the name in places.
 
     Mappings become dicts with keys of text or int, sequences lists. A repeated key, a tag, or a key
     that is a list or a mapping becomes a `Fault`.
 
     Raises:
-        ScenarioError: The text is no YAML; one sentence, `file:line: ...`.
+        ScenarioError: The text is not YAML; one sentence, `file:line: ...`.
     """
     return _read(text, lambda line: f"{file}:{line}")
 
@@ -190,8 +192,8 @@ def _override(text: str) -> tuple[KeyPath, object, str]:
         raise ScenarioError(f"{place}: got no `=`, allowed is `key=value`, as in `seed=7`.")
     parts = [part.strip() for part in name.split(".")]
     if not all(parts):
-        said = "got an empty key, allowed are keys joined by dots, as in `simulation.dt=0.01`."
-        raise ScenarioError(f"{place}: {said}")
+        text = "got an empty key, allowed are keys joined by dots, as in `simulation.dt=0.01`."
+        raise ScenarioError(f"{place}: {text}")
     document = _read(value, lambda line: place)
     if document.faults:
         raise ScenarioError(f"{place}: {document.faults[0].message}")
@@ -208,14 +210,14 @@ def _replace(
     copy: Any = dict(at or {}) if at is None or isinstance(at, dict) else at
     key: Any = rest[0]
     if isinstance(copy, dict):
-        # a whole number means an int key (an agent), unless the mapping has it as text already
+        # a whole number is an int key (an agent), unless the mapping has it as text already
         key = str(key) if str(key) in copy else key
         copy.setdefault(key)
     elif isinstance(copy, list) and isinstance(key, int) and key < len(copy):
         copy = list(copy)
     else:
         field = joined(done) or "the file"
-        other = f"a key inside a mapping or a list, but `{field}` is {shown(at)}"
+        other = f"a key inside a mapping or a list, but `{field}` is {quoted(at)}"
         allowed = f"an index of a list of {len(copy)}, from 0" if isinstance(at, list) else other
         raise ScenarioError(f"{place}: got `{key}` inside `{field}`, allowed is {allowed}.")
     copy[key], exact = _replace(copy[key], rest[1:], value, (*done, key), place)
@@ -223,12 +225,13 @@ def _replace(
 
 
 def apply_overrides(document: Document, overrides: Iterable[str]) -> Document:
-    """Lay `a.b=3` texts over a document, in their order; such a value's place is `--set a.b=3`.
+    """Replace values of a document by `a.b=3` texts, in order; their place is `--set a.b=3`.
 
-    A whole number in a path indexes a list or is a mapping's int key; missing mappings are made.
+    A whole number in a path indexes a list or is a mapping's int key; missing mappings are created.
 
     Raises:
-        ScenarioError: An override is malformed, or leads into something that is no mapping or list.
+        ScenarioError: An override is malformed, or its path leads through a value that is neither a
+            mapping nor a list.
     """
     for text in overrides:
         path, value, place = _override(text)
@@ -239,7 +242,7 @@ def apply_overrides(document: Document, overrides: Iterable[str]) -> Document:
 
 @final
 class _Representer(SafeRepresenter):
-    """Writes every value in full, where ruamel.yaml would put an alias for one that it has met."""
+    """Writes every value in full, where ruamel.yaml would write an alias for a repeated one."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
@@ -251,7 +254,8 @@ class _Representer(SafeRepresenter):
         return self.represent_scalar("tag:yaml.org,2002:str", text, style)
 
 
-# A mapping may hold anything: what only Python has is written as text, and refused by the schema.
+# A mapping may contain any object: those unknown to YAML are written as text, and the schema
+# refuses them.
 for _kind in (str, bytes, set, None):
     _Representer.add_representer(_kind, _Representer.text)
 
@@ -275,8 +279,8 @@ def dump_yaml(data: object) -> str:
     return _written(data, None)
 
 
-def shown(value: object) -> str:
-    """Return a value as a message shows it: in back-ticks, and short."""
+def quoted(value: object) -> str:
+    """Return a value for a message: in back-ticks, and short."""
     if value is None:
         return "nothing"
     if isinstance(value, dict):
@@ -285,6 +289,6 @@ def shown(value: object) -> str:
     return f"`{text}`" if len(text) <= 60 else f"`{text[:57]}...`"
 
 
-def are(names: Sequence[str]) -> str:
-    """Return names as a message lists them: ``are `a`, `b```, or ``is `a```."""
+def is_or_are(names: Sequence[str]) -> str:
+    """Return names for a message: ``are `a`, `b```, or ``is `a```."""
     return f"{'is' if len(names) == 1 else 'are'} {listing(names)}"

@@ -8,7 +8,7 @@ import numpy as np
 
 from echelon.core.errors import ScenarioError
 from echelon.core.limits import excess_runs
-from echelon.experiments.scenario.scenario import Scenario, varied
+from echelon.experiments.scenario.scenario import Scenario, with_overrides
 from echelon.experiments.sweeps.axes import SEED, Axis
 
 
@@ -92,7 +92,7 @@ class Sweep:
 
     def _varied(self, overrides: list[str]) -> Scenario:
         try:
-            return varied(self.scenario, overrides)
+            return with_overrides(self.scenario, overrides)
         except ScenarioError as error:
             # Name the option that was used: `--set` has the same texts.
             text = str(error)

@@ -16,7 +16,7 @@ import numpy as np
 from echelon.core.errors import OutputError
 from echelon.core.files import write_atomic
 from echelon.core.provenance import versions
-from echelon.experiments.scenario.scenario import KEPT, Scenario
+from echelon.experiments.scenario.scenario import SCENARIO_FILE, Scenario
 from echelon.experiments.scenario.self_contained import self_contained
 from echelon.output.archive.folder import CHUNKS, INPUTS, write_errors
 from echelon.simulation.engine.record import Stretch
@@ -68,7 +68,7 @@ class Chunks:
             for name, content in more.items():
                 (self.folder / INPUTS).mkdir(exist_ok=True)
                 write_atomic(self.folder / INPUTS / name, content)
-            write_atomic(self.folder / KEPT, text)
+            write_atomic(self.folder / SCENARIO_FILE, text)
             begun = {"inputs": self._digest(), "versions": versions()}
             write_atomic(self.place / _BEGUN, json.dumps(begun) + "\n")
 
@@ -101,7 +101,7 @@ class Chunks:
 
     def _digest(self) -> str:
         """Return a digest of the scenario and of every file that it names."""
-        files = [self.folder / KEPT, *sorted((self.folder / INPUTS).rglob("*"))]
+        files = [self.folder / SCENARIO_FILE, *sorted((self.folder / INPUTS).rglob("*"))]
         digest = hashlib.sha256()
         for file in (file for file in files if file.is_file()):
             # Names too, each followed by a byte that no name has: the same bytes under other names
@@ -166,7 +166,7 @@ class Chunks:
         shutil.rmtree(self.folder / INPUTS, ignore_errors=True)
         # A folder that a user has put a file into is not empty, and stays.
         with contextlib.suppress(OSError):
-            (self.folder / KEPT).unlink(missing_ok=True)
+            (self.folder / SCENARIO_FILE).unlink(missing_ok=True)
             self.folder.rmdir()
 
 

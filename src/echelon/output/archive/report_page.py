@@ -8,7 +8,7 @@ from typing import Any
 
 from echelon import __version__
 from echelon.experiments.results.recording import Recording
-from echelon.experiments.scenario.scenario import KEPT
+from echelon.experiments.scenario.scenario import SCENARIO_FILE
 from echelon.output.plots.run_figures import USUAL, figures
 
 _STYLE = """
@@ -44,7 +44,7 @@ def report_page(run: Recording, folder: Path | None) -> str:
         folder: of the run; None where there is none, as for a dataset alone.
     """
     told = run.attributes
-    scenario = _text(folder, KEPT) or str(told.get("scenario_text", ""))
+    scenario = _text(folder, SCENARIO_FILE) or str(told.get("scenario_text", ""))
     parts = [
         f"<h1>{escape(run.name)}</h1>",
         f'<p class="facts">{escape(_facts(run))}</p>',

@@ -9,7 +9,7 @@ from echelon.core.types import PathLike
 from echelon.experiments.results.dataset import labelled, save_dataset, summary
 from echelon.experiments.results.recording import recording
 from echelon.experiments.scenario.build import build, note_origin
-from echelon.experiments.scenario.scenario import KEPT, load_scenario
+from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.output.archive.chunks import Chunks
 from echelon.output.archive.folder import DATA, GAIN, SUMMARY, claim_folder, write_errors
 from echelon.output.reports.run_report import report
@@ -37,7 +37,7 @@ def save_run(
     # A run from Python has no scenario file.
     if "scenario_text" in result.provenance:
         with write_errors(place):
-            write_atomic(place / KEPT, result.provenance["scenario_text"])
+            write_atomic(place / SCENARIO_FILE, result.provenance["scenario_text"])
     write_findings(result, place, figures)
     Chunks(place).remove()
     return place
@@ -60,7 +60,7 @@ def load_run(folder: PathLike) -> Result:
         if (place / DATA).is_file():
             raise OutputError(f"the run in `{place}` is complete; open its `{DATA}`.")
         raise OutputError(f"`{place}` holds no unfinished run; give the folder of one.")
-    scenario = load_scenario(place / KEPT)
+    scenario = load_scenario(place / SCENARIO_FILE)
     return note_origin(reassemble(*build(scenario), Chunks(place).read()), scenario)
 
 

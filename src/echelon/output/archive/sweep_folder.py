@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, final
 
 from echelon.core.files import write_atomic
-from echelon.experiments.scenario.scenario import KEPT, load_scenario
+from echelon.experiments.scenario.scenario import SCENARIO_FILE, load_scenario
 from echelon.experiments.sweeps.axes import read_axes
 from echelon.experiments.sweeps.plan import Sweep
 from echelon.experiments.sweeps.workers import SweepBatch
@@ -47,7 +47,7 @@ class Batches:
         """
         self.chunks.check()
         over = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
-        return Sweep(load_scenario(self.folder / KEPT), read_axes(over))
+        return Sweep(load_scenario(self.folder / SCENARIO_FILE), read_axes(over))
 
     def write(self, batch: SweepBatch) -> None:
         """Write a batch completely or not at all.
