@@ -447,7 +447,7 @@ def test_a_run_that_will_grow_says_what_would_not(echelon):
     quick = ["--set", "simulation.horizon=0.5", "--set", "simulation.dt=0.05", "--no-figures"]
     code, out, err = echelon("run", "planar-quadrotor", *quick, "--out", "o")
     assert code == 0 and err.startswith("echelon: Nothing is promised: with the input held over")
-    assert "It will grow; what would not: `--set simulation.dt=" in err
+    assert "Errors will grow; to avoid that: `--set simulation.dt=" in err
     shorter = err.partition("`--set simulation.dt=")[2].partition("`")[0]
     change = f"simulation.dt={shorter}"
     assert ech.promise(*ech.build(ech.load_scenario("planar-quadrotor", [change]))).promised

@@ -44,11 +44,11 @@ def foretell(experiment: "Experiment", quiet: bool) -> None:
     """Print the guarantee of a run on a terminal; anywhere, if nothing is guaranteed."""
     if quiet:
         return
-    from echelon.experiments.studies.forecast import outlook
+    from echelon.experiments.studies.forecast import forecast
     from echelon.guarantees.promises.promise import promise
 
     if sys.stderr.isatty() or not promise(*experiment).promised:
-        print(f"echelon: {outlook(*experiment)}", file=sys.stderr, flush=True)
+        print(f"echelon: {forecast(*experiment)}", file=sys.stderr, flush=True)
 
 
 def print_folder(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""The paper's assumptions and lemmas on parts of one's own, and what is promised of them."""
+"""Checks parts against the paper's assumptions and lemmas, and computes what is guaranteed."""
 
 from typing import NamedTuple
 
@@ -16,31 +16,31 @@ __all__ = ["CheckResult", "check"]
 
 
 class CheckResult(NamedTuple):
-    """All lines, the hypotheses of the promise among them, and the promise."""
+    """All lines, including the hypotheses of the promise, and the promise."""
 
     lines: tuple[Statement, ...]
     promise: Promise
 
     @property
     def promised(self) -> bool:
-        """Whether anything is promised."""
+        """Whether anything is guaranteed."""
         return self.promise.promised
 
 
 def check(parts: Parts, settings: Settings) -> CheckResult:
-    """Walk through the paper's statements on parts, the hypotheses of their promise, and margins.
+    """Check the paper's statements for parts, the hypotheses of their promise, and margins.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
     parts = prepare(parts, settings).parts
-    found = promise(parts, settings)
+    guarantee = promise(parts, settings)
     with precision("float64"):
         lines = (
             *graph_lines(parts),
-            *drift_lines(parts, settings, found),
-            *found.hypotheses.values(),
-            killing_line(parts, found),
-            *margin_lines(parts, settings, found),
+            *drift_lines(parts, settings, guarantee),
+            *guarantee.hypotheses.values(),
+            killing_line(parts, guarantee),
+            *margin_lines(parts, settings, guarantee),
         )
-    return CheckResult(lines, found)
+    return CheckResult(lines, guarantee)

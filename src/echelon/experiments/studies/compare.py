@@ -1,4 +1,4 @@
-"""Methods side by side on one scenario: the same agents, starts, limits and disturbance."""
+"""Compares methods on one scenario: the same agents, starts, limits and disturbance."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -32,29 +32,29 @@ from echelon.synthesis.gains.inner_loop import InnerLoop
 from echelon.synthesis.gains.riccati import Riccati
 
 OWN = "own"
-"""Asks for what drives the agents in the scenario itself."""
+"""Label of the scenario's drive."""
 
 
 class Flight(NamedTuple):
-    """What a method made of the scenario.
+    """The run of a method on the scenario.
 
     Attributes:
         result: the run.
-        promise: of what flew.
-        told: what each agent must be told by others, in words.
-        computing: seconds of computing for one agent and one second of flight, compilation apart.
-        solver: what solving took; None for a law.
+        promise: of its parts.
+        received: the information that each follower receives, in words.
+        computing: computing time (s) for one agent and one second of flight, without compilation.
+        solver: statistics of the solver; None for a law.
     """
 
     result: Result
     promise: Promise
-    told: tuple[str, ...]
+    received: tuple[str, ...]
     computing: float
     solver: SolverStats | None
 
 
 class ComparisonRow(NamedTuple):
-    """A method's label, its flight and numbers; or else the reason why there are none."""
+    """A method's label with its flight and numbers, or the reason why there are none."""
 
     label: str
     flight: Flight | None
@@ -63,16 +63,16 @@ class ComparisonRow(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether every follower settled for good."""
+        """Whether every follower settled."""
         return self.numbers is not None and self.settled is not None
 
     @property
     def settled(self) -> float | None:
-        """When the last follower came within 1 cm for good, s; None where one did not."""
+        """Time (s) after which all followers stay within 1 cm; None where one does not."""
         times = [each.settling_time for each in self.numbers.followers] if self.numbers else []
-        known = [time for time in times if time is not None]
-        # The swarm has settled when all have; those that did say nothing for one that did not.
-        return max(known) if known and len(known) == len(times) else None
+        settled = [time for time in times if time is not None]
+        # The swarm has settled only if all followers have.
+        return max(settled) if settled and len(settled) == len(times) else None
 
     @property
     def whole(self) -> float | None:
@@ -88,14 +88,14 @@ class ComparisonRow(NamedTuple):
     def effort(self) -> float | None:
         """Root mean square of the followers' normalized inputs about the trim."""
         values = [each.effort for each in self.numbers.followers] if self.numbers else []
-        known = [value for value in values if value is not None]
-        # The mean of squares and not of their roots, so that it is that of all inputs together.
-        return float(np.sqrt(np.mean(np.square(known)))) if known else None
+        finite = [value for value in values if value is not None]
+        # The mean of the squares: the root mean square of all inputs together.
+        return float(np.sqrt(np.mean(np.square(finite)))) if finite else None
 
     def _worst(self, name: str) -> float | None:
         values = [getattr(each, name) for each in self.numbers.followers] if self.numbers else []
-        known = [value for value in values if value is not None]
-        return max(known) if known and len(known) == len(values) else None
+        finite = [value for value in values if value is not None]
+        return max(finite) if finite and len(finite) == len(values) else None
 
 
 class Comparison(NamedTuple):
@@ -103,10 +103,10 @@ class Comparison(NamedTuple):
 
     Attributes:
         scenario: its name.
-        rows: one a method.
-        horizon: s, alike for all.
-        steady_window: its last part that counts as steady, s.
-        conditions: wind and plant, in words; empty where the run is ideal.
+        rows: one for each method.
+        horizon: s, the same for all.
+        steady_window: the last part of it, which counts as steady, s.
+        conditions: wind and plant, in words; empty where there are none.
     """
 
     scenario: str
@@ -121,13 +121,13 @@ _LAW_NAMES = {
 }
 
 DriveOf = Callable[[Parts], Drive]
-"""What drives the agents of a scenario under a method."""
+"""Returns the drive of a method for the parts of a scenario."""
 
 
 def _consensus(
     gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
 ) -> DriveOf:
-    """Return the drive under the consensus law with a gain, the scenario's leader kept."""
+    """Return the drive with the consensus law under a gain and the scenario's leader."""
     return lambda parts: parts.drive.with_follower(
         Consensus(gain(parts), feedforward, trim, parts.drive.frame)
     )
@@ -138,15 +138,15 @@ def _synthesized(method: Method) -> Callable[[Parts], Gain]:
 
 
 def _riccati(parts: Parts) -> Gain:
-    """Return the scenario's own Riccati gain, or the model's default one."""
-    own = parts.drive.gain
-    if own is not None and own.method == Riccati.name:
-        return own
+    """Return the scenario's Riccati gain, or the model's default one."""
+    gain = parts.drive.gain
+    if gain is not None and gain.method == Riccati.name:
+        return gain
     return synthesize(parts.model, parts.graph, Riccati())
 
 
 def _reference(parts: Parts) -> Any:
-    """Return what the scenario's leader follows, if anything."""
+    """Return the reference of the scenario's leader; None without one."""
     return getattr(getattr(parts.drive, "leader", None), "reference", None)
 
 
@@ -167,20 +167,20 @@ LABELS = tuple(_DRIVES)
 """The methods that are compared."""
 
 
-def known_labels(asked: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the methods asked for in the order of `LABELS`, then `own`; all where none is named.
+def known_labels(requested: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the requested methods in the order of `LABELS`, then `own`; by default all.
 
     Raises:
-        LawError: a name is no method's.
+        LawError: a label is unknown.
     """
     allowed = (*LABELS, OWN)
-    for label in asked or ():
+    for label in requested or ():
         if label not in allowed:
             raise LawError(
                 f"`--method` is `{label}`, allowed are {listing(allowed)}"
                 f"{did_you_mean(label, allowed)}."
             )
-    return tuple(label for label in allowed if not asked or label in asked)
+    return tuple(label for label in allowed if not requested or label in requested)
 
 
 def compare(
@@ -191,22 +191,22 @@ def compare(
     check: Callable[[], None] = lambda: None,
     landed: Callable[[ComparisonRow], None] = lambda row: None,
 ) -> Comparison:
-    """Fly each method on a scenario from the same starts, under the same limits and wind.
+    """Run each method on a scenario from the same starts, under the same limits and wind.
 
     Args:
-        scenario: the agents, their graph, formation, starts and conditions; its horizon is flown.
-        built: its parts and settings, built unless given.
-        only: the labels of the methods to fly, `own` among them for the scenario's own drive.
-        began: called with each method's label before it flies.
-        check: called between chunks of steps and between flights; where it raises
-            KeyboardInterrupt, what is left is not flown, and has a row that says so.
-        landed: called with each row as soon as it is there.
+        scenario: the agents, their graph, formation, starts, conditions and horizon.
+        built: its parts and settings; built if None.
+        only: the labels of the methods; `own` for the scenario's drive.
+        began: called with each method's label before its run.
+        check: called between chunks of steps and between runs; if it raises KeyboardInterrupt, the
+            remaining methods have a row with that reason.
+        landed: called with each row as soon as it is complete.
 
-    A method that does not apply, or whose solver is missing, is a row with its reason. The
-    scenario's own drive is a row under the name of its gain, unless another row is the same.
+    A method that does not apply, or whose solver is missing, has a row with the reason. The
+    scenario's drive has a row under the name of its gain, unless another row has the same drive.
 
     Raises:
-        ScenarioError: a part cannot be made.
+        ScenarioError: a part cannot be built.
     """
     parts, settings = build(scenario) if built is None else built
     scene = _with_starts(parts, settings)
@@ -219,7 +219,7 @@ def compare(
             rows.append(_row(label, drive, scene, settings, check))
         except KeyboardInterrupt:
             rows.append(
-                ComparisonRow(label, None, None, "it was not flown, since it was interrupted.")
+                ComparisonRow(label, None, None, "it was not run because of an interruption.")
             )
         landed(rows[-1])
 
@@ -244,32 +244,32 @@ def _row(
 
 
 def _with_starts(parts: Parts, settings: Settings) -> Parts:
-    """Return the parts with the starts drawn once, the leader's error included."""
+    """Return the parts with random starts drawn once, the leader's error included."""
     with precision("float64"):
         drive = parts.drive.prepare(parts.model, parts.graph)
         states = initial_states(parts.replace(drive=drive), settings.seed)
-    # The leader's error is in the states already, and would be added once more.
+    # The states contain the leader's error already.
     return parts.replace(initial=states, start_error={})
 
 
 def _conditions(parts: Parts) -> tuple[str, ...]:
-    """Return what differs from the model in every run, in words."""
+    """Return what differs from the model in all runs, in words."""
     described = parts.world.describe(parts.model)
     return tuple(f"{name}: {text}" for name, text in described.items() if text)
 
 
 def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> Flight:
-    """Run a method, and take its time: of solving, or else of the compiled steps."""
+    """Run a method, and measure the time of solving, or of the compiled steps."""
     watch = _Watch(check)
     result = simulate(parts, settings, watch)
     seconds = watch.seconds if result.work is None else result.work.seconds
     computing = seconds / (parts.graph.agents * settings.horizon)
-    told, found = result.drive.information.follower, promise(result.parts, settings)
-    return Flight(result, found, told, computing, result.work)
+    received = result.drive.information.follower
+    return Flight(result, promise(result.parts, settings), received, computing, result.work)
 
 
 class _Watch:
-    """Times the steps of a run, all but the first chunk, which compiles."""
+    """Measures the time of a run's steps, without the first chunk, which includes compilation."""
 
     def __init__(self, check: Callable[[], None]) -> None:
         self.ticks: list[tuple[float, int, int]] = []
@@ -281,17 +281,17 @@ class _Watch:
 
     @property
     def seconds(self) -> float:
-        """Seconds that the whole run takes at the pace of its compiled steps."""
+        """Time (s) of the whole run at the speed of its compiled steps."""
         (first, begun, total), (last, done, _) = self.ticks[0], self.ticks[-1]
         return (last - first) * total / max(1, done - begun)
 
 
 def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
-    """Return what to call the scenario's own drive; None where a row has flown it already."""
+    """Return the label of the scenario's drive; None if another row has the same drive."""
     drive = parts.drive.prepare(parts.model, parts.graph)
-    flown = (row.flight.result.drive for row in rows if row.flight is not None)
-    # By value, gains included: a scenario that says by hand what a method is would else fly twice.
-    if any(eqx.tree_equal(drive, each) for each in flown):
+    others = (row.flight.result.drive for row in rows if row.flight is not None)
+    # By value, gains included: the scenario may describe one of the methods.
+    if any(eqx.tree_equal(drive, other) for other in others):
         return None
     gain, feedforward = drive.gain, drive.feedforward
     name = _law_name(drive) if gain is None else gain.method
@@ -300,6 +300,6 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
 
 
 def _law_name(drive: Drive) -> str:
-    """Return a scenario's name of the followers' law, or that of the class that drives them."""
+    """Return the name of the followers' law in scenarios, or that of the drive's class."""
     kind = type(getattr(drive, "follower", drive)).__name__
     return _LAW_NAMES.get(kind, kind)

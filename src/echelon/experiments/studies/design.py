@@ -1,4 +1,4 @@
-"""All gain methods on one scenario, side by side, and one of them recommended."""
+"""Compares all gain methods on a scenario, and recommends one of them."""
 
 import time
 from collections.abc import Mapping
@@ -35,24 +35,24 @@ from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 
 _ADVISED = 100
-"""Followers of the largest swarm that is advised on its graph; of more it would take minutes."""
+"""Most followers for which a change of the graph is recommended; more would take minutes."""
 
 
 class Design(NamedTuple):
-    """One method on the scenario: its gain and what is known of it, or why there is none.
+    """A method on the scenario: its gain with its properties, or the reason why there is none.
 
     Attributes:
         method: its name.
-        gain: None where there is none, and then `reason` says why.
+        gain: None where the method fails, for the `reason`.
         parts: of the scenario with that gain.
         promise: of these parts.
         reason: empty where there is a gain.
         fastest: largest modulus of a pole of the loop, 1/s.
-        step: the longest step (s) with inputs held with which every mode looked at decays.
-        factors: the interval of factors on the coupling that it bears; None if unstable.
-        delay: of all disagreements that it bears, s; None if unstable.
-        advice: what else a user of the method should know.
-        seconds: what the synthesis took.
+        step: the longest sampling period (s) for which all checked modes remain stable.
+        factors: the interval of stable factors on the coupling; None if unstable.
+        delay: the largest stable delay of all disagreements, s; None if unstable.
+        advice: a recommendation for users of the method.
+        seconds: computing time of the synthesis.
     """
 
     method: str
@@ -70,14 +70,13 @@ class Design(NamedTuple):
     @property
     def stable(self) -> bool:
         """Whether every mode of the disagreement decays."""
-        found = self.promise
-        return found is not None and found.decays
+        return self.promise is not None and self.promise.decays
 
     def merit(self, dt: float) -> tuple[bool, int, int, float]:
-        """Return what stable designs are ranked by, the better the larger.
+        """Return the key by which stable designs are ranked, larger for better ones.
 
-        First that the step dt (s) is short enough, then the kind of argument, then its theorem,
-        then the rate: of the theorem, or of the slowest mode near the trim.
+        First whether the step dt (s) is short enough, then the kind of argument, its theorem, and
+        the rate: of the theorem, or of the slowest mode of the linearization.
         """
         assert self.promise is not None
         region, slowest = self.promise.region, self.promise.loop.slowest
@@ -88,14 +87,14 @@ class Design(NamedTuple):
 
 
 _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
-"""Of errors of all sizes, of small ones, and of none that shrinks."""
+"""For errors of all sizes, for small errors, and without decay."""
 
 
 class Designs(NamedTuple):
-    """The methods that were tried, the one that is recommended if any, and why.
+    """The designs of all methods, the recommended one if any, and the reason.
 
-    `settings` are those that all were tried under. Of followers under the law `stopping-point`,
-    `stopping` is what motors are certified with, if anything is.
+    `settings` are those of all designs. For the law `stopping-point`, `stopping` is a design that is
+    certified with motors, if there is one.
     """
 
     designs: tuple[Design, ...]
@@ -106,12 +105,12 @@ class Designs(NamedTuple):
 
 
 def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
-    """Try the gain methods on a scenario, and recommend one.
+    """Apply the gain methods to a scenario, and recommend one.
 
     Args:
-        scenario: a scenario, or its parts and settings. Of a scenario a method keeps the keys that
-            are its own, and its domain; of parts, the domain that their gain was made for.
-        method: the only one to try.
+        scenario: a scenario, or its parts and settings. A method uses its keys in the scenario and
+            the domain there; with parts, the domain of their gain.
+        method: the only method, all by default.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others. A method that does not apply
@@ -126,35 +125,36 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     built = _built(scenario) if isinstance(scenario, Scenario) else Experiment(*scenario)
     names = registry.METHODS if method is None else [method]
     methods = [resolve(registry.METHODS[name]) for name in names]
-    tried = tuple(
-        _tried(each, _arguments(each, spec, built.parts), built)
-        for each in methods
-        if method is not None or _chooses(each)
+    designs = tuple(
+        _design(cls, _arguments(cls, spec, built.parts), built)
+        for cls in methods
+        # A method that needs a P, for example, does not compute a gain by itself.
+        if method is not None or {*cls.needs} <= {"domain", *cls.usual}
     )
-    best, dt = recommended(tried, built.settings.dt), built.settings.dt
-    why = "No method gives a stable loop here." if best is None else because(best, tried, dt)
+    best, dt = recommended(designs, built.settings.dt), built.settings.dt
+    reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
     stopping = design_stopping(*built) if method is None else None
-    return Designs(tried, best, why, built.settings, stopping)
+    return Designs(designs, best, reason, built.settings, stopping)
 
 
-_ALWAYS = GainSpec(method=FixedGain.name, P="identity")
-"""A gain that there is for every model."""
+_SIMPLE_GAIN = GainSpec(method=FixedGain.name, P="identity")
+"""A gain that exists for every model."""
 
 
 def _built(scenario: Scenario) -> Experiment:
-    """Build a scenario; where its own gain alone cannot be made, with one that always can."""
+    """Build a scenario; if only its gain cannot be computed, with a gain that exists always."""
     try:
         return build(scenario)
     except ScenarioError as error:
         faults: tuple[Fault, ...] = getattr(error, "faults", ())
-        own = scenario.follower.gain
-        # A file that is not there was meant to be, while a method that fails has its row.
-        if own.file or own.python or {fault.field for fault in faults} != {"follower.gain"}:
+        spec = scenario.follower.gain
+        # A missing file is a mistake, while a method that fails is a design with its reason.
+        if spec.file or spec.python or {fault.field for fault in faults} != {"follower.gain"}:
             raise
-        follower = scenario.follower.model_copy(update={"gain": _ALWAYS})
+        follower = scenario.follower.model_copy(update={"gain": _SIMPLE_GAIN})
         built = build(scenario.model_copy(update={"follower": follower}))
-        # A domain that is none is a mistake, and not what a method fails at.
-        if own.domain is not None and not _is_domain(built.parts.model, own.domain):
+        # An invalid domain is a mistake too.
+        if spec.domain is not None and not _is_domain(built.parts.model, spec.domain):
             raise
         return built
 
@@ -167,104 +167,102 @@ def _is_domain(model: ControlAffine, bounds: Mapping[str, Any]) -> bool:
     return True
 
 
-def _chooses(method: type[Method]) -> bool:
-    """Whether a method finds a gain by itself: one that wants a P, say, is no choice of design."""
-    return {*method.needs} <= {"domain", *method.usual}
-
-
-def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
+def recommended(designs: tuple[Design, ...], dt: float) -> Design | None:
     """Return the best of the stable designs; None without any."""
-    return max((d for d in tried if d.stable), key=lambda d: d.merit(dt), default=None)
+    return max((d for d in designs if d.stable), key=lambda d: d.merit(dt), default=None)
 
 
-def because(best: Design, tried: tuple[Design, ...], dt: float) -> str:
+def because(best: Design, designs: tuple[Design, ...], dt: float) -> str:
     """Return why a design is recommended, from the numbers by which it was chosen."""
     assert best.promise is not None
-    others = [d for d in tried if d.stable and d is not best]
-    rivals = [d for d in others if (d.step > dt) == (best.step > dt)]
-    step = f"the scenario's step of {dt:g} s is short enough for it"
+    step = f"The scenario's step of {dt:g} s is short enough."
     if best.step <= dt:
-        step = f"it needs a step below {best.step:.3g} s, and the scenario's is {dt:g} s"
-    text = f"Recommended: {best.method}, because {_why(best, others, rivals, dt)}; {step}."
-    # The step has been spoken of.
-    against = [
-        each.reason
-        for each in best.promise.hypotheses.values()
-        if each.fails and each.reason and each.statement is not Hypothesis.SAMPLING
+        step = f"It needs a step below {best.step:.3g} s; the scenario's is {dt:g} s."
+    others = [d for d in designs if d.stable and d is not best]
+    text = f"Recommended: {best.method}. {_advantage(best, others, dt)} {step}"
+    # The step has been mentioned.
+    reasons = [
+        line.reason
+        for line in best.promise.hypotheses.values()
+        if line.fails and line.reason and line.statement is not Hypothesis.SAMPLING
     ]
-    return f"{text} Nothing is promised with it: {'; '.join(against)}." if against else text
+    return f"{text} Nothing is guaranteed with it: {'; '.join(reasons)}." if reasons else text
 
 
-def _why(best: Design, others: list[Design], rivals: list[Design], dt: float) -> str:
-    """Return what sets a design apart from its rivals, those with which it shares the step."""
+def _advantage(best: Design, others: list[Design], dt: float) -> str:
+    """Return the advantage of a design over those for which the step is equally suitable."""
     assert best.promise is not None
     _, *argument, rate = best.merit(dt)
+    rivals = [d for d in others if (d.step > dt) == (best.step > dt)]
     if not others:
-        return "it is the only one whose loop is stable"
+        return "It is the only stable design."
     if not rivals:
-        return f"of {1 + len(others)} stable loops it alone holds the scenario's step"
-    loops = f"{1 + len(rivals)} stable loops"
+        return (
+            f"Of {1 + len(others)} stable designs only this one is stable at the scenario's step."
+        )
+    number = {1: "both"}.get(len(rivals), f"all {1 + len(rivals)}") + " stable designs"
     if len(rivals) < len(others):
-        loops += f" that {'hold' if best.step > dt else 'do not hold'} the scenario's step"
+        number += f" with a step {'above' if best.step > dt else 'below'} the scenario's"
     region = best.promise.region
     if region is None:
-        text = f"of {loops}, none with more than a promise at the trim, its slowest mode is the "
-        return f"{text}fastest, {-rate:.3g} 1/s"
-    alike = 1 + sum([*d.merit(dt)[1:3]] == argument for d in rivals)
-    text = f"it promises most of {loops}: {rate:.3g} 1/s on its domain "
+        local = f"{number[0].upper()}{number[1:]} are only locally guaranteed"
+        return f"{local}; this one converges fastest ({-rate:.3g} 1/s)."
+    same = 1 + sum([*d.merit(dt)[1:3]] == argument for d in rivals)
+    text = f"Of {number} it has the strongest guarantee: {rate:.3g} 1/s on its domain "
     text += f"({region.kind}, {region.theorem})"
-    return text if alike == 1 else f"{text}, the fastest of {alike} by that argument"
+    return f"{text}." if same == 1 else f"{text}, the fastest of {same} with this argument."
 
 
-def _tried(method: type[Method], arguments: dict[str, Any], built: Experiment) -> Design:
-    """Try one method; an optional part that is missing is a reason like any other."""
+def _design(method: type[Method], arguments: dict[str, Any], built: Experiment) -> Design:
+    """Return the design of a method; a missing optional dependency is a reason like any other."""
     name, (parts, settings) = method.name, built
     missing = [key for key in method.needs if key not in arguments]
     if missing:
-        return Design(name, None, reason=_wish(name, missing, parts))
+        return Design(name, None, reason=_missing_keys(name, missing, parts))
     began = time.perf_counter()
     try:
         gain = synthesize(parts.model, parts.graph, method(**arguments))
     except EchelonError as error:
         return Design(name, None, reason=str(error), seconds=time.perf_counter() - began)
-    # Of the synthesis alone; what is promised is computed alike for all.
+    # Without the promise, whose computing time is the same for all.
     seconds = time.perf_counter() - began
     parts = with_gain(parts, gain)
-    found = promise(parts, settings)
+    guarantee = promise(parts, settings)
     with precision("float64"):
-        return _known(gain, parts, settings, found)._replace(seconds=seconds)
+        return _evaluate(gain, parts, settings, guarantee)._replace(seconds=seconds)
 
 
-def _wish(method: str, missing: list[str], parts: Parts) -> str:
-    """Return how a scenario gives a method the keys that it misses."""
+def _missing_keys(method: str, missing: list[str], parts: Parts) -> str:
+    """Return how to give a method its missing keys."""
     model = parts.model
     state = [*model.state_groups, *model.state_names][0]
-    shown = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
-    keys = ", ".join(shown.get(key, f"{key}: ...") for key in missing)
+    examples = {"domain": f"domain: {{{state}: HALF_WIDTH, ...}}"}
+    keys = ", ".join(examples.get(key, f"{key}: ...") for key in missing)
     gain = f"{{method: {method}, {keys}}}"
     if parts.drive.gain is None:
-        # The scenario's own law takes none, so that a gain beside it would be refused.
-        return f"give `follower={{law: consensus, gain: {gain}}}` to try it"
-    return f"give `follower.gain={gain}` to try it"
+        # The scenario's law takes no gain, so it must be replaced too.
+        law = registry.DEFAULT_FOLLOWER_LAW
+        return f"set `follower={{law: {law}, gain: {gain}}}` to try it"
+    return f"set `follower.gain={gain}` to try it"
 
 
 def with_gain(parts: Parts, gain: Gain) -> Parts:
-    """Return the parts under another gain, the feed-forward kept."""
+    """Return the parts with another gain and the same feed-forward."""
     drive = parts.drive
     law = Consensus(gain, drive.feedforward, drive.trimmed, drive.frame)
     return parts.replace(drive=drive.with_follower(law))
 
 
-def _known(gain: Gain, parts: Parts, settings: Settings, found: Promise) -> Design:
-    """Return what is known of a gain."""
-    loop = found.loop
+def _evaluate(gain: Gain, parts: Parts, settings: Settings, guarantee: Promise) -> Design:
+    """Return the design of a gain, with its margins."""
+    loop = guarantee.loop
     (A, B), closed = loop.linear, loop.closed
     poles = np.linalg.eigvals(A - closed.strengths[:, None, None] * (B @ closed.K))
-    known = Design(gain.method, gain, parts, found, fastest=float(np.abs(poles).max()))
-    if not (loop.every and found.linear):
-        return known if found.linear else known._replace(fastest=None)
-    return known._replace(
-        step=found.longest_step(settings),
+    design = Design(gain.method, gain, parts, guarantee, fastest=float(np.abs(poles).max()))
+    if not (loop.every and guarantee.linear):
+        return design if guarantee.linear else design._replace(fastest=None)
+    return design._replace(
+        step=guarantee.longest_step(settings),
         factors=margins.gain_margin(closed),
         delay=margins.delay_margin(closed).delay,
         advice=_advice(gain, parts),
@@ -272,28 +270,28 @@ def _known(gain: Gain, parts: Parts, settings: Settings, found: Promise) -> Desi
 
 
 def _advice(gain: Gain, parts: Parts) -> str:
-    """Return what else to know: of an inner loop, an edge or a leader that makes it faster.
+    """Return a recommendation for an inner loop: an edge or a leader that makes it faster.
 
-    Any graph keeps it stable, and so the graph alone sets its rate.
+    It is stable on any graph, so its rate depends only on the graph.
     """
     graph = parts.graph
     followers, pairs = len(graph.followers), graph.agents * (graph.agents - 1) // 2
     fixed = not graph.directed and graph.schedule is None
     if gain.inner is None or followers > _ADVISED or not fixed:
         return ""
-    # The last follower must stay one, and a complete graph has no pair left to link.
+    # One follower must remain, and a complete graph has no pair left to link.
     more = int(followers > 1), int(len(graph.edges) < pairs)
     return speedup(parts.model, graph, gain, *more).sentence()
 
 
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
-    """Return what the scenario says of this method, and its domain for those that need one."""
-    made = spec is not None and spec.file is None and spec.python is None
-    if spec is not None and made and spec.method == method.name:
+    """Return the scenario's arguments of this method, and its domain if the method needs one."""
+    if spec is not None and not spec.file and not spec.python and spec.method == method.name:
         return {**method.usual, **spec.arguments}
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region
     domain = claim.domain if spec is None and claim is not None else None
     domain = spec.domain if spec is not None else domain
-    given = {} if domain is None or "domain" not in method.needs else {"domain": domain}
-    return {**method.usual, **given}
+    if domain is None or "domain" not in method.needs:
+        return {**method.usual}
+    return {**method.usual, "domain": domain}

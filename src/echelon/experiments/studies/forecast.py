@@ -1,4 +1,4 @@
-"""What is promised of a run before it starts, and what would not grow where it will."""
+"""The forecast of a run: its guarantee, and if it is unstable, changes that make it stable."""
 
 import math
 from collections.abc import Iterator
@@ -13,34 +13,32 @@ from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import synthesize
 from echelon.synthesis.gains.inner_loop import InnerLoop
 
-_ROOM = 0.9
-"""Of the longest step with which the modes looked at decay, since others lie between them."""
+_SHARE = 0.9
+"""Share of the longest stable step for the checked modes, since further modes lie between them."""
 
 
-def outlook(parts: Parts, settings: Settings) -> str:
-    """Return what is promised of a run; where it will grow, with the options that would not.
+def forecast(parts: Parts, settings: Settings) -> str:
+    """Return the guarantee of a run; if its errors will grow, with options that make it stable.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    found = promise(parts, settings)
-    # A step that is too long for a moment only has no reason to say so.
-    grows = any(
-        found.hypotheses[each].reason
-        for each in (Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING)
-    )
+    guarantee = promise(parts, settings)
+    hypotheses = Hypothesis.DISAGREEMENT_DECAY, Hypothesis.SAMPLING
+    # A step that is too long for a short time only has no reason.
+    grows = any(guarantee.hypotheses[hypothesis].reason for hypothesis in hypotheses)
     changes = " or ".join(f"`--set {change}`" for change in _changes(parts, settings) if grows)
     if not changes:
-        return found.sentence()
-    return f"{found.sentence()} It will grow; what would not: {changes}."
+        return guarantee.sentence()
+    return f"{guarantee.sentence()} Errors will grow; to avoid that: {changes}."
 
 
 def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
-    """Yield the changes of a scenario, cheap to find, with which something is promised."""
+    """Yield the changes of a scenario, quickly computed, under which something is guaranteed."""
     step = promise(parts, settings).hypotheses[Hypothesis.SAMPLING]
     if step.fails:
-        longest = _ROOM * promise(parts, settings).longest_step(settings)
-        # A whole part of the step keeps the horizon a whole number of steps.
+        longest = _SHARE * promise(parts, settings).longest_step(settings)
+        # With an integer fraction of the step, the horizon remains a whole number of steps.
         shorter = settings.dt / math.ceil(settings.dt / longest) if longest > 0.0 else settings.dt
         if promise(parts, settings._replace(dt=shorter)).promised:
             yield f"simulation.dt={shorter:.6g}"
@@ -48,7 +46,7 @@ def _changes(parts: Parts, settings: Settings) -> Iterator[str]:
     if not isinstance(law, Consensus):
         return
     try:
-        # Any coupling and any graph keep an inner loop stable.
+        # An inner loop is stable with any coupling on any graph.
         gain = synthesize(parts.model, parts.graph, InnerLoop())
     except EchelonError:
         return

@@ -1,9 +1,10 @@
-"""How far the loop near the trim is from losing what it promises."""
+"""Stability margins of the linearized loop: gain, delay, model errors, disturbances, chains."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
@@ -29,82 +30,82 @@ from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
 
 _KIND = Kind.LINEARIZATION
 _WIDE = 4
-"""Of lambda_max by lambda_min; beyond it little is left of the delay that could be borne."""
+"""Ratio of lambda_max to lambda_min above which the delay margin is reduced much."""
 _STIFF = 1e10
-"""Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
+"""Ratio of modes above which the slowest one has fewer than six digits."""
 
 
 def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
-    """Yield the margins of a loop that decays."""
+    """Yield the margins of a stable loop."""
     loop = promise.loop
     if parts.graph.schedule is not None:
-        yield from _turns_lines(promise)
+        yield from _switching_lines(promise)
         return
     if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
-        text = "any coupling; what delay is left depends on c and the graph alone"
+        text = "any coupling; the delay margin depends only on c and the graph"
         yield unneeded(Topic.MARGINS, _KIND, text)
         yield from _stopping_lines(parts, settings)
         return
     if not promise.linear:
-        text = "the model bends at the trim, and has no modes there"
+        text = "the model is not smooth at the trim, and has no modes there"
         yield vacuous(Topic.MARGINS, _KIND, text)
         return
     if promise.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails:
-        yield unneeded(Topic.MARGINS, _KIND, "there is nothing to lose")
+        yield unneeded(Topic.MARGINS, _KIND, "the loop is not stable")
         return
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
-        text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
+        text = f"the fastest mode is {stiffness:.2g} times the slowest, which is lost in rounding"
         yield unneeded(Topic.MARGINS, _KIND, text, stiffness)
         return
     low, high = margins.gain_margin(loop.closed)
     yield holds(Topic.GAIN, _KIND, "factors on the coupling", low, f"{low:.3g} to {high:.3g}")
     delay = margins.delay_margin(loop.closed)
     time = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
-    text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
+    text = f"uniform delay of z, critical mode lambda = {delay.eigenvalue:.3g}; {loop.where}"
     yield holds(Topic.DELAY, _KIND, text, delay.delay, time)
     low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
-    alike = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
-    yield _spread_line(low, high, delay.delay, alike)
+    best = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
+    yield _spread_line(low, high, delay.delay, best)
     yield _scaling_line(parts.model, loop)
-    # The bound of the network rests on a symmetric matrix.
-    yield from _push_lines(parts.model, loop) if loop.symmetric else ()
+    # The bound for the network needs a symmetric matrix.
+    yield from _disturbance_lines(parts.model, loop) if loop.symmetric else ()
     yield from _string_line(parts, loop)
 
 
-def _turns_lines(promise: Promise) -> Iterator[Statement]:
-    """Yield what is known of graphs that take turns: how weak the coupling may get (T8)."""
+def _switching_lines(promise: Promise) -> Iterator[Statement]:
+    """Yield the margins for switching graphs: the smallest factor on the coupling (T8)."""
     edge, lines = promise.edge, promise.hypotheses
     anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
     if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
-        what = "factors on the coupling with which one P serves all graphs, whenever they switch"
+        what = "factors on the coupling for which one P serves all graphs, however they switch"
         yield holds(Topic.GAIN, _KIND, what, low, f"{low:.3g} to inf")
     text = "any coupling; " if anywhere else ""
-    text += "what delay is left is of one graph, and none is known for graphs that take turns"
+    text += "delay margins are known for one graph only, not for switching graphs"
     yield unneeded(Topic.MARGINS, _KIND, text)
 
 
 def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
-    """Warn where the graph makes its fastest mode many times as strong as its slowest.
+    """Return whether the ratio of the graph's eigenvalues reduces the delay margin much.
 
-    Couplings are chosen for lambda_min, and what delay a mode bears falls with c lambda; `best` is
-    the delay that is left at lambda_min alone.
+    Couplings are chosen for lambda_min, and the delay margin of a mode decreases with c lambda;
+    `best` is the delay margin at lambda_min.
     """
     ratio = high / low
     if not ratio > _WIDE:
-        text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
+        text = f"at most {_WIDE}, so the fastest mode reduces the delay margin little"
         return holds(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}")
-    text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
-    text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
-    remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
+    text = f"delay margin {1e3 * delay:.3g} ms; it would be {1e3 * best:.3g} ms if all eigenvalues "
+    text += f"of the graph were equal (their ratio is {ratio:.3g})"
+    remedy = "let agents send only away from the leader, by `graph.directed: true`"
     return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
 
 
 def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
-    """Yield what delay agreement bears where zeta' = -c L zeta: pi/2 - |arg lambda| by c |lambda|.
+    """Yield the delay margin of zeta' = -c L zeta: (pi/2 - |arg lambda|) / (c |lambda|).
 
-    A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and reaches the axis first at that
+    A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and first reaches the axis at that
     delay.
     """
     law, dt = getattr(parts.drive, "follower", None), settings.dt
@@ -112,18 +113,18 @@ def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
     c, values = float(law.strength(dt)), agreement_modes(parts.graph, law)
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
-    text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"
+    text = f"uniform delay of z, critical mode lambda = {values[at]:.3g}"
     yield holds(Topic.DELAY, _KIND, text, float(delays[at]), f"{1e3 * delays[at]:.3g} ms")
     best = 0.5 * np.pi / (c * float(np.real(values).min()))
     yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
 
 
 def _scaling_line(model: ControlAffine, loop: LinearLoop) -> Statement:
-    # The trim input, and an inner loop's, weaken with the rest.
+    # The factors also scale the trim input and the inner loop.
     slopes = trim_slopes(model) - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
     worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
-    text = "each input 30 % weaker or stronger (at these corners, not between them), as by a wrong "
-    text += "mass or inertia"
+    text = "each input 30 % weaker or stronger (checked only at these corners), as by a wrong mass "
+    text += "or inertia"
     number = worst, f"{worst:.3g} 1/s"
     if worst < 0.0:
         return holds(Topic.SCALING, _KIND, text, *number)
@@ -131,44 +132,45 @@ def _scaling_line(model: ControlAffine, loop: LinearLoop) -> Statement:
     return fails(Topic.SCALING, _KIND, text, *number, remedy=remedy)
 
 
-class _Push(NamedTuple):
-    """A disturbance w that enters by E (n, q), and the states that are watched."""
+class _DisturbanceInput(NamedTuple):
+    """A disturbance w that enters by E, and the states whose deviation is bounded."""
 
-    E: Array
+    E: Float[Array, "n q"]
     where: str
-    watched: tuple[int, ...]
+    bounded: tuple[int, ...]
 
 
-def _push(model: ControlAffine) -> _Push:
-    """Return accelerations of a vehicle, or else of all states; positions, or else all states."""
+def _disturbance_input(model: ControlAffine) -> _DisturbanceInput:
+    """Return a disturbance of velocities, or of all states, and the states that it affects."""
     n, groups = len(model.state_names), model.state_groups
-    # Wind is a force, and enters a vehicle's equations as an acceleration alone.
-    pushed = model.states_called("velocity") if "velocity" in groups else tuple(range(n))
-    names = ", ".join(f"`{model.state_names[k]}`" for k in pushed)
-    units = {model.state_units[k] for k in pushed}
+    # Wind is a force, and enters a vehicle's equations only as an acceleration.
+    disturbed = model.states_called("velocity") if "velocity" in groups else tuple(range(n))
+    names = ", ".join(f"`{model.state_names[k]}`" for k in disturbed)
+    units = {model.state_units[k] for k in disturbed}
     unit = units.pop() if len(units) == 1 else ""
     per = {"m/s": " m/s^2", "": ""}.get(unit, f" {unit}/s")
-    return _Push(np.eye(n)[:, pushed], f"1{per} on {names}", model.position_indices() or pushed)
+    bounded = model.position_indices() or disturbed
+    return _DisturbanceInput(np.eye(n)[:, disturbed], f"1{per} on {names}", bounded)
 
 
-def _push_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[Statement]:
-    E, where, watched = _push(model)
-    units = {model.state_units[k] for k in watched}
+def _disturbance_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[Statement]:
+    E, where, bounded = _disturbance_input(model)
+    units = {model.state_units[k] for k in bounded}
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
-    def line(name: Topic, bounds: Array, text: str) -> Statement:
-        each = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
-        worst, text = float(bounds[list(watched)].max()), f"{unit}per {where}: {text}; {loop.where}"
-        return holds(name, _KIND, text, worst, each)
+    def line(name: Topic, bounds: Float[Array, " n"], text: str) -> Statement:
+        sizes = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in bounded)
+        worst, text = float(bounds[list(bounded)].max()), f"{unit}per {where}: {text}; {loop.where}"
+        return holds(name, _KIND, text, worst, sizes)
 
-    text = "no push of that norm on all followers together takes any farther"
+    text = "bound for any disturbance of that norm on all followers together"
     yield line(Topic.DISTURBANCE_NETWORK, invariant_ellipsoid(loop.closed, E), text)
-    text = "the exact peak, for a push shaped like the worst eigenvector"
+    text = "exact peak, for a disturbance along the worst eigenvector"
     yield line(Topic.DISTURBANCE_MODE, peak_gain(loop.closed, E), text)
 
 
 def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
-    """On a tree with unit weights: what a chain of parents' inputs would amplify."""
+    """Yield, on a tree with unit weights, the amplification along a chain of parents' inputs."""
     graph = parts.graph
     tree = len(graph.edges) == graph.agents - 1 and len(graph.leaders) == 1
     tree = tree and graph.schedule is None
@@ -177,10 +179,13 @@ def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
     gain = margins.string_gain(loop.closed).gain
     depth = int(graph.depths().max())
     number = gain**depth, f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
-    # Heard one way, a branch is such a chain whatever is fed forward.
+    # On a directed graph a branch is such a chain under any feed-forward.
     if parts.drive.feedforward is Feedforward.PARENT or graph.directed:
-        text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
+        text = (
+            "largest amplification of a disturbance along a branch; fewer links or more `coupling` "
+        )
+        text += "reduce it"
         yield holds(Topic.STRING, _KIND, text, *number)
     else:
-        text = "what feeding forward the parent's input would amplify; it is not used here"
+        text = "amplification if the parent's input were fed forward, which is not used here"
         yield unneeded(Topic.STRING, _KIND, text, *number)

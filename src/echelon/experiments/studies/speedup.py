@@ -1,4 +1,4 @@
-"""How long the slowest disagreement lives, and which leaders or edges would shorten it."""
+"""The time constant of the slowest disagreement, and leaders or edges that would reduce it."""
 
 from typing import NamedTuple
 
@@ -14,12 +14,12 @@ from echelon.synthesis.gains.gain import Gain
 
 
 class Speedup(NamedTuple):
-    """How long the slowest disagreement lives, 1/|abscissa| in s, and what would shorten it.
+    """The time constant of the slowest disagreement, 1/|abscissa| in s, and what would reduce it.
 
     Attributes:
-        now: on the graph as it is; infinite where a disagreement does not decay.
-        leaders: agents to make leaders, and `with_leaders` the time with them.
-        edges: pairs to link with weight 1, and `with_edges` the time with them.
+        now: on the present graph; infinite where a disagreement does not decay.
+        leaders: agents to make leaders, with the time constant `with_leaders`.
+        edges: pairs to link with weight 1, with the time constant `with_edges`.
     """
 
     now: float
@@ -30,47 +30,46 @@ class Speedup(NamedTuple):
 
     def sentence(self) -> str:
         """Return it as a sentence."""
-        told = f"The slowest disagreement lives {self.now:.3g} s (1/lambda_min: N^2 on a line of N)"
-        parts = []
+        parts = [f"The slowest disagreement decays with a time constant of {self.now:.3g} s"]
         if self.leaders:
-            named = ", ".join(map(str, self.leaders))
-            as_ = "as a leader" if len(self.leaders) == 1 else "as leaders"
-            agents = "agent" if len(self.leaders) == 1 else "agents"
-            parts.append(f"{self.with_leaders:.3g} s with {agents} {named} {as_} too")
+            names = ", ".join(map(str, self.leaders))
+            role = f"leader {names}" if len(self.leaders) == 1 else f"leaders {names}"
+            parts.append(f"{self.with_leaders:.3g} s with the further {role}")
         if self.edges:
-            named = ", ".join(f"{i}-{j}" for i, j in self.edges)
+            names = ", ".join(f"{i}-{j}" for i, j in self.edges)
             edges = "edge" if len(self.edges) == 1 else "edges"
-            parts.append(f"{self.with_edges:.3g} s with the {edges} {named} more")
-        return f"{told}; {', '.join(parts)}." if parts else f"{told}."
+            parts.append(f"{self.with_edges:.3g} s with the further {edges} {names}")
+        return f"{'; '.join(parts)}."
 
 
 def speedup(
     model: ControlAffine, graph: Graph, gain: Gain, leaders: int = 1, edges: int = 1
 ) -> Speedup:
-    """Return the time constant of a gain's slowest disagreement, and what would shorten it.
+    """Return the time constant of a gain's slowest disagreement, and what would reduce it.
 
-    The coupling stays as it is, which suits an inner loop: any graph keeps it stable. What does not
-    shorten it after all, since the slowest mode need not be that of lambda_min, is left out.
+    The coupling is not changed, which suits an inner loop: it is stable on any graph. Leaders or
+    edges that do not reduce the time constant are left out; this happens because the slowest mode
+    need not be that of lambda_min.
 
     Raises:
-        GraphError: there are not so many followers to make leaders, or pairs to link.
+        GraphError: there are fewer followers than `leaders`, or fewer pairs than `edges`.
     """
-    led, linked = recommend_leaders(graph, leaders), recommend_edges(graph, edges)
+    more_leaders, more_edges = recommend_leaders(graph, leaders), recommend_edges(graph, edges)
     now = time_constant(model, graph, gain)
-    with_leaders = time_constant(model, graph.with_leaders(led), gain)
-    with_edges = time_constant(model, graph.with_edges(linked), gain)
-    # Infinity is not below infinity: what stays unstable is no speedup.
+    with_leaders = time_constant(model, graph.with_leaders(more_leaders), gain)
+    with_edges = time_constant(model, graph.with_edges(more_edges), gain)
+    # Infinity is not below infinity: an unstable loop has no speedup.
     if not with_leaders < now:
-        led, with_leaders = (), now
+        more_leaders, with_leaders = (), now
     if not with_edges < now:
-        linked, with_edges = (), now
-    return Speedup(now, led, with_leaders, linked, with_edges)
+        more_edges, with_edges = (), now
+    return Speedup(now, more_leaders, with_leaders, more_edges, with_edges)
 
 
 def time_constant(model: ControlAffine, graph: Graph, gain: Gain) -> float:
     """Return 1/|abscissa| of a gain on a graph, in s.
 
-    In it the slowest disagreement falls to 1/e; it is infinite where one does not decay.
+    The slowest disagreement decays to 1/e in this time; it is infinite where one does not decay.
     """
     closed = linearize(model).with_inner(gain.inner)
     spectrum = graph.spectrum()

@@ -1,4 +1,4 @@
-"""Roots and speeds of the law `stopping-point` under which the motors are certified to suffice."""
+"""Design of the law `stopping-point`: roots and speeds for which the motors provably suffice."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -16,20 +16,19 @@ from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.settings import Settings
 
 _RATES = (4.0, 3.0, 2.0)
-"""Of the slowest root, 1/s; between them the best differs little."""
+"""Slowest roots that are tried, 1/s; the best one between them differs little."""
 _SPEEDS, _LEAD = (1.4, 1.4, 0.7, 0.3), (0.7, 0.7, 0.7, 0.3)
-"""Of a body in space, at a factor of 1: with the slowest roots these leave motors half
-their range."""
+"""Speeds of a body in space at a factor of 1; with the slowest roots motors use half the range."""
 _FACTORS = (1.0, 0.7, 0.5, 0.35, 0.25)
 
 
 class StoppingDesign(NamedTuple):
-    """Roots and speeds that are certified with motors, as a scenario has them.
+    """Roots and speeds with which motors provably suffice, as keys of a scenario.
 
     Attributes:
-        rate: of the slowest root, 1/s.
-        speed, leader: of each output.
-        promise: of the parts under them.
+        rate: the slowest root, 1/s.
+        speed, leader: the followers' and the leader's speed for each output.
+        promise: of the parts with them.
     """
 
     rate: float
@@ -39,28 +38,30 @@ class StoppingDesign(NamedTuple):
 
     @property
     def time(self) -> float:
-        """From when on followers are promised within 1 cm, s; infinite where that is not known."""
+        """The time (s) after which followers provably stay within 1 cm; infinite where unknown."""
         tube = self.promise.tube
         arrival = None if tube is None else tube.arrival
         return float("inf") if arrival is None else arrival.time
 
     def sentence(self) -> str:
-        """Return what to set, and what is promised then."""
-        told = f"follower.rate={self.rate:g}", f"leader.rate={self.rate:g}"
-        shown = *told, f"follower.speed={list(self.speed)}", f"leader.speed={list(self.leader)}"
-        changes = " ".join(f'--set "{change}"' for change in shown)
+        """Return the keys to set, and the guarantee with them."""
+        keys = (
+            *(f"follower.rate={self.rate:g}", f"leader.rate={self.rate:g}"),
+            *(f"follower.speed={list(self.speed)}", f"leader.speed={list(self.leader)}"),
+        )
+        changes = " ".join(f'--set "{key}"' for key in keys)
         return f"Certified with motors: {changes}. {self.promise.sentence()}"
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return it ready for JSON."""
+        """Return the design as JSON data."""
         numbers = {"rate": self.rate, "speed": list(self.speed), "leader": list(self.leader)}
         return {**numbers, "promise": self.promise.as_mapping()}
 
 
 def design_stopping(parts: Parts, settings: Settings) -> StoppingDesign | None:
-    """Return the laws with which these starts are soonest within 1 cm, the motors certified.
+    """Return the fastest design for these starts for which the motors provably suffice.
 
-    None where the followers have another law, or none of what is tried bears these starts.
+    None where the followers have another law, or no design that is tried suffices.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
@@ -68,35 +69,37 @@ def design_stopping(parts: Parts, settings: Settings) -> StoppingDesign | None:
     drive = parts.drive
     if not isinstance(drive, Laws) or not isinstance(drive.follower, StoppingPoint):
         return None
-    told = drive.follower.feedforward is Feedforward.PARENT
-    links = int(parts.graph.depths().max()) if told else 1
-    found = [each for rate in _RATES for each in _certified(parts, settings, rate, links)]
-    return min(found, key=lambda each: each.time, default=None)
+    by_parents = drive.follower.feedforward is Feedforward.PARENT
+    links = int(parts.graph.depths().max()) if by_parents else 1
+    designs = [design for rate in _RATES for design in _certified(parts, settings, rate, links)]
+    return min(designs, key=lambda design: design.time, default=None)
 
 
 def _certified(
     parts: Parts, settings: Settings, rate: float, links: int
 ) -> Iterator[StoppingDesign]:
-    """Yield the fastest speeds that are certified at a rate, if any are."""
+    """Yield the design with the largest certified speeds at a rate, if there is one."""
     for factor in _FACTORS:
         speed = tuple(round(factor * s / links, 4) for s in _SPEEDS)
         leader = tuple(round(factor * s, 4) for s in _LEAD)
-        tried = _under(parts, rate, speed, leader)
+        candidate = _with_laws(parts, rate, speed, leader)
         try:
-            prepared = prepare(tried, settings)
+            prepared = prepare(candidate, settings)
             with precision("float64"):
                 run = stopping_of(prepared.parts, settings, prepared.problem.states)
-                borne = run is not None and motors_bear(run)
+                suffices = run is not None and motors_bear(run)
         except EchelonError:
-            # Roots of another number than the model's, say.
+            # For example, a number of roots other than the model's.
             return
-        if borne and promise(tried, settings).promised:
-            yield StoppingDesign(rate, speed, leader, promise(tried, settings))
+        if suffices and promise(candidate, settings).promised:
+            yield StoppingDesign(rate, speed, leader, promise(candidate, settings))
             return
 
 
-def _under(parts: Parts, rate: float, speed: tuple[float, ...], leader: tuple[float, ...]) -> Parts:
-    """Return parts under the law with other roots and speeds, and the coupling that suits them."""
+def _with_laws(
+    parts: Parts, rate: float, speed: tuple[float, ...], leader: tuple[float, ...]
+) -> Parts:
+    """Return parts with other roots and speeds, and the default coupling for them."""
     law, lead = parts.drive.follower, parts.drive.leader  # pyright: ignore
     assert isinstance(law, StoppingPoint) and isinstance(lead, StoppingLeader)
     follower = StoppingPoint(

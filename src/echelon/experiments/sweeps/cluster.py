@@ -11,16 +11,16 @@ from echelon.experiments.sweeps.workers import SweepBatch, Workers
 
 _PATIENCE = 10.0
 """Seconds in which a scheduler must answer."""
-_LOOK = 0.2
-"""Seconds between two looks at what is done, so that Ctrl-C is heard at once."""
-_crews: dict[str, Workers] = {}
+_POLL = 0.2
+"""Seconds between two checks for finished batches, so that Ctrl-C takes effect at once."""
+_workers: dict[str, Workers] = {}
 _one_at_a_time = threading.Lock()
 
 
 def fly_on(
-    address: str, plan: Sweep, todo: Sequence[tuple[int, int]], told: Callable[[], None]
+    address: str, plan: Sweep, todo: Sequence[tuple[int, int]], progress: Callable[[], None]
 ) -> Iterator[SweepBatch]:
-    """Yield batches (first, count) of a sweep as the workers of a cluster have done them.
+    """Yield batches (first, count) of a sweep as the workers of a cluster complete them.
 
     A batch whose worker is lost is computed again by another, to the same bits. Workers must have
     echelon, and see the files that the scenario names.
@@ -29,42 +29,42 @@ def fly_on(
         address: of the scheduler, such as `tcp://host:8786`.
         plan: the sweep.
         todo: the batches.
-        told: called several times a second; what it raises ends the sweep.
+        progress: called several times a second; an error that it raises ends the sweep.
 
     Raises:
         MissingExtraError: dask.distributed is not installed.
         EchelonError: there is no such scheduler, or a batch fails on it.
     """
     distributed = _distributed()
-    client = _connected(distributed, address)
+    client = _connect(distributed, address)
     try:
-        # Its name decides where a worker keeps it: another sweep is another crew.
+        # Each sweep has workers under a name of its own.
         name = f"echelon-{id(plan)}-{time.time_ns()}"
-        sent = client.scatter(plan, broadcast=False)
-        left = {client.submit(_fly, name, sent, *each, pure=False) for each in todo}
+        remote = client.scatter(plan, broadcast=False)
+        left = {client.submit(_fly, name, remote, *batch, pure=False) for batch in todo}
         while left:
-            done = {each for each in left if each.done()}
+            done = {future for future in left if future.done()}
             for future in done:
-                yield _received(future)
+                yield _result(future)
             left -= done
-            told()
+            progress()
             if left and not done:
-                time.sleep(_LOOK)
+                time.sleep(_POLL)
     finally:
         client.close()
 
 
 def _fly(name: str, plan: Sweep, first: int, count: int) -> SweepBatch:
-    """Return a batch, computed here; what was built for another of the sweep is there."""
-    # The threads of a worker would else compile the same twice, and share the processors twice.
+    """Return a batch, computed by this worker, which builds the sweep's parts once."""
+    # Two threads of a worker would compile the same code, and use more threads than processors.
     with _one_at_a_time:
-        if name not in _crews:
-            _crews.clear()
-            _crews[name] = Workers(plan)
-        return _crews[name].batch(first, count, lambda done, steps: None)
+        if name not in _workers:
+            _workers.clear()
+            _workers[name] = Workers(plan)
+        return _workers[name].batch(first, count, lambda done, steps: None)
 
 
-def _received(future: Any) -> SweepBatch:
+def _result(future: Any) -> SweepBatch:
     try:
         return future.result()
     except EchelonError:
@@ -73,7 +73,7 @@ def _received(future: Any) -> SweepBatch:
         raise OutputError(f"a batch of the sweep failed on the cluster: {error}.") from error
 
 
-def _connected(distributed: Any, address: str) -> Any:
+def _connect(distributed: Any, address: str) -> Any:
     try:
         return distributed.Client(address, timeout=_PATIENCE)
     except (OSError, ValueError, TypeError) as error:

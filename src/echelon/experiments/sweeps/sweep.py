@@ -1,4 +1,4 @@
-"""The verb: all runs of a sweep, batch by batch."""
+"""Runs a sweep: a scenario with all combinations of values of some of its keys."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Called between two stretches of computing, with the runs done and the runs in all."""
+"""Called during the computation, with the runs done and the runs in total."""
 Keep: TypeAlias = Callable[[SweepBatch], None]
-"""Called with every batch as soon as it is there."""
+"""Called with every batch as soon as it is computed."""
 
 
 def sweep(
@@ -24,18 +24,18 @@ def sweep(
     """Run a scenario with all combinations of values of some of its keys.
 
     Args:
-        scenario: what does not vary.
+        scenario: the keys that do not vary.
         over: the values of each key, such as `{"seed": range(100), "follower.gain.coupling": [1,
             2]}`; a key's parts are joined by dots.
-        threads: on which native code runs; one for each processor when left out. No number depends
-            on it.
+        threads: threads of native code; by default one for each processor. No number depends on
+            them.
 
     Returns:
         A dataset with a dimension for each key, and `agent`: outcomes, errors, settling times,
-        saturation, and what is promised of each run.
+        saturation, and the guarantee of each run.
 
     Raises:
-        ScenarioError: a key is unknown, a value is no value of it, or there are too many runs.
+        ScenarioError: a key is unknown, a value is not allowed, or there are too many runs.
     """
     plan = Sweep(scenario, axes_of(over))
     batches = list[SweepBatch]()
@@ -51,55 +51,54 @@ def compute(
     threads: int | None = None,
     cluster: str | None = None,
 ) -> None:
-    """Compute the runs of a sweep that no batch holds yet.
+    """Compute the runs of a sweep that are in no batch yet.
 
     Args:
         plan: the sweep.
         keep: takes every batch.
-        progress: called several times a second; what it raises ends the sweep.
-        before: batches that are there already.
+        progress: called several times a second; an error that it raises ends the sweep.
+        before: batches that were computed earlier.
         threads: as in `sweep`.
-        cluster: address of a dask scheduler, whose workers compute the batches; this process does
-            when left out.
+        cluster: address of a dask scheduler, whose workers compute the batches; by default this
+            process does.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C; all batches that were kept are whole.
-        EchelonError: the cluster cannot be reached, or gives up.
+        KeyboardInterrupt: Ctrl-C; all batches that `keep` received are complete.
+        EchelonError: the cluster does not answer, or a batch fails on it.
     """
-    crew, done = Workers(plan, threads), sum(batch.runs for batch in before)
+    workers, done = Workers(plan, threads), sum(batch.runs for batch in before)
 
-    def told(_: int = 0, __: int = 0) -> None:
+    def report(_: int = 0, __: int = 0) -> None:
         if progress is not None:
             progress(done, plan.count)
 
-    told()
-    todo = list(_missing(plan.count, before, crew.size, plan.seeds))
-    made: Iterator[SweepBatch] = (crew.batch(*each, told) for each in todo)
+    report()
+    todo = list(_missing(plan.count, before, workers.size, plan.seeds))
+    batches: Iterator[SweepBatch] = (workers.batch(*batch, report) for batch in todo)
     if cluster is not None:
-        # Here, since it comes with an extra.
+        # Here, since it needs an extra.
         from echelon.experiments.sweeps.cluster import fly_on
 
-        made = fly_on(cluster, plan, todo, told)
-    for batch in made:
+        batches = fly_on(cluster, plan, todo, report)
+    for batch in batches:
         keep(batch)
         done += batch.runs
-        told()
+        report()
 
 
 def _missing(
     runs: int, before: Sequence[SweepBatch], size: int, seeds: int = 1
 ) -> Iterator[tuple[int, int]]:
-    """Yield the batches (first, count) that are to do, of so many runs.
+    """Yield the batches (first, count) that are still to compute.
 
-    Of more seeds than a batch holds none shares a batch with another case's; else all of a case
-    are in one.
+    If a case has more seeds than a batch has runs, no batch contains two cases; otherwise all runs
+    of a case are in one batch.
     """
     whole = seeds if seeds > size else size - size % seeds
     at = 0
     for first, end in [*sorted((b.first, b.first + b.runs) for b in before), (runs, runs)]:
         while at < first:
-            # Cut where batches begin, so that the same runs are computed together as without a
-            # break, to the same bits.
+            # The same batches as without an interruption, so that numbers agree to the bit.
             begun = at - at % whole
             inner = at - (at - begun) % size + size
             count = min(first, inner, begun + whole) - at

@@ -1,4 +1,4 @@
-"""What computes the runs of a sweep, batch by batch."""
+"""Computes the runs of a sweep, batch by batch."""
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -14,22 +14,22 @@ from echelon.simulation.engine.result import Result
 from echelon.simulation.native import is_installed
 
 _AGENT_STEPS, _MOST, _LEAST = 20_000_000, 2_500, 16
-"""Of a batch: a second or two of native code, and as many runs as a vector has lanes."""
+"""Size of a batch: one or two seconds of native code, and at least one run for each vector lane."""
 _SLOWER = 20
-"""How many times slower JAX is."""
+"""Factor by which JAX is slower than native code."""
 _FRAMES = 20
-"""That a run is looked at: for what is not finite, or beyond the range of native code."""
+"""Frames of a run checked for numbers that are not finite or exceed native code's range."""
 
 
 class SweepBatch(NamedTuple):
-    """Some runs of a sweep, one after the other: the number of the first, and what they came to."""
+    """Consecutive runs of a sweep: the number of the first one, and their columns of numbers."""
 
     first: int
     columns: Columns
 
     @property
     def runs(self) -> int:
-        """How many runs there are."""
+        """The number of runs."""
         return len(self.columns["outcome"])
 
 
@@ -44,7 +44,7 @@ class Workers:
 
     def __init__(self, plan: Sweep, threads: int | None = None) -> None:
         """Build the first case."""
-        self.plan, self.fleet = plan, Batch(threads)
+        self.plan, self.runs = plan, Batch(threads)
         first = build(plan.case((0,) * len(plan.axes)))
         self._last: tuple[int, Experiment | str] = 0, first
         settings, graph = first.settings, first.parts.graph
@@ -52,47 +52,46 @@ class Workers:
         most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
         self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
 
-    def batch(self, first: int, count: int, told: Told) -> SweepBatch:
-        """Return what some runs come to; `told` is called several times a second.
+    def batch(self, first: int, count: int, progress: Told) -> SweepBatch:
+        """Return the numbers of some runs; `progress` is called several times a second.
 
         Raises:
             KeyboardInterrupt: Ctrl-C.
         """
-        built = [self._built(run) for run in self.plan.runs(first, count)]
-        flown = [each for each in built if not isinstance(each, str)]
-        results, told_of = self.fleet.fly(flown, told), _promised(flown)
+        runs = [self._build(run) for run in self.plan.runs(first, count)]
+        valid = [run for run in runs if not isinstance(run, str)]
+        results, guarantees = self.runs.fly(valid, progress), _promises(valid)
         rows = list[dict[str, Any]]()
-        for each in built:
-            found = each if isinstance(each, str) else next(results)
-            before = None if isinstance(each, str) else next(told_of)
-            if isinstance(found, Result) and isinstance(before, Promise):
-                if found.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
+        for run in runs:
+            result = run if isinstance(run, str) else next(results)
+            guarantee = None if isinstance(run, str) else next(guarantees)
+            if isinstance(result, Result) and isinstance(guarantee, Promise):
+                if result.outcome in (Outcome.INTERRUPTED, Outcome.STOPPED):
                     raise KeyboardInterrupt
-                rows.append(numbers_of(found, before))
+                rows.append(numbers_of(result, guarantee))
             else:
-                rows.append(refused(str(before if isinstance(found, Result) else found)))
-            told(0, 0)
+                rows.append(refused(str(guarantee if isinstance(result, Result) else result)))
+            progress(0, 0)
         return SweepBatch(first, columns_of(rows))
 
-    def _built(self, run: SweepRun) -> Experiment | str:
-        """Return the parts and settings of a run, or why they cannot be made."""
+    def _build(self, run: SweepRun) -> Experiment | str:
+        """Return the parts and settings of a run, or why they cannot be built."""
         if self._last[0] != run.case:
             try:
-                made: Experiment | str = build(self.plan.case(run.place))
+                case: Experiment | str = build(self.plan.case(run.place))
             except EchelonError as error:
-                made = str(error)
-            self._last = run.case, made
-        made = self._last[1]
-        if isinstance(made, str):
-            return made
-        settings = made.settings
+                case = str(error)
+            self._last = run.case, case
+        case = self._last[1]
+        if isinstance(case, str):
+            return case
+        settings = case.settings
         settings = settings if run.seed is None else settings._replace(seed=run.seed)
-        return Experiment(made.parts, settings._replace(store_every=-(-settings.steps // _FRAMES)))
+        return Experiment(case.parts, settings._replace(store_every=-(-settings.steps // _FRAMES)))
 
 
-def _promised(built: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:
-    """Yield what is promised of runs, of which neighbours often differ in the seed alone."""
-    for _, alike in groupby(built, key=lambda each: id(each.parts)):
-        runs = list(alike)
-        # A dataset has no place for what motors give.
-        yield from promises(runs[0].parts, [each.settings for each in runs], briefly=True)
+def _promises(experiments: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:
+    """Yield the promises of runs; consecutive runs often differ only in the seed."""
+    for _, same_parts in groupby(experiments, key=lambda experiment: id(experiment.parts)):
+        runs = list(same_parts)
+        yield from promises(runs[0].parts, [run.settings for run in runs], briefly=True)

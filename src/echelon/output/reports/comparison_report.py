@@ -116,7 +116,7 @@ def _costs_table(comparison: Comparison) -> "Table":
             _number(row.numbers.minimum_distance),
             f"{1e3 * row.flight.computing:.3g}",
             _promised(row.flight.promise),
-            ", ".join(row.flight.told) or "nothing",
+            ", ".join(row.flight.received) or "nothing",
         )
     return table
 
@@ -304,6 +304,6 @@ def _row_mapping(row: ComparisonRow) -> dict[str, Any]:
         "minimum_distance": numbers.minimum_distance,
         "computing_s_per_agent_s": row.flight.computing,
         "promise": row.flight.promise.as_mapping(),
-        "told": list(row.flight.told),
+        "told": list(row.flight.received),
         "solver": None if row.flight.solver is None else row.flight.solver._asdict(),
     }
