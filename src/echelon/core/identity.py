@@ -7,13 +7,12 @@ changes, as long as a process runs: what holds one has no digest, only a key for
 
 import dataclasses
 import enum
+import functools
 import hashlib
 import sys
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from types import FunctionType
 from typing import Any, Final, final
-
-from echelon.core.types import Array
 
 _LARGE: Final = 4096
 """Bytes of an array that is hashed where it is, and not copied beside the rest first."""
@@ -56,21 +55,35 @@ def array_bits(array: Any) -> bytes:
         ValueError: its entries are objects, whose bits are addresses; or it is traced, and has
             none.
     """
-    # Here, since the command line asks for places on the disk before it needs any of them.
-    import jax
-    import jax.numpy as jnp
+    # Here, since the command line opens its cache before it needs them.
     import numpy as np
-    from jax.core import Tracer
 
-    # Keys of random numbers are no numbers of NumPy's.
-    if jnp.issubdtype(getattr(array, "dtype", float), jax.dtypes.extended):
-        array = jax.random.key_data(array)
-    numbers: Array = np.asarray(None if isinstance(array, Tracer) else array)
+    numbers = array if isinstance(array, np.ndarray) else np.asarray(_untraced(array))
     if numbers.dtype.hasobject:
         raise ValueError("got an array of objects or a traced one, allowed are numbers.")
     if numbers.nbytes < _LARGE:
         return numbers.tobytes()
     return hashlib.sha256(np.ascontiguousarray(numbers).data).digest()
+
+
+def _untraced(array: Any) -> Any:
+    """Return what NumPy can take of an array of JAX; None of a traced one."""
+    import jax
+    from jax.core import Tracer
+
+    if isinstance(array, Tracer):
+        return None
+    # Keys of random numbers are no numbers of NumPy's.
+    keys = isinstance(array, jax.Array) and jax.numpy.issubdtype(array.dtype, jax.dtypes.extended)
+    return jax.random.key_data(array) if keys else array
+
+
+@functools.lru_cache(1024)
+def _fields(kind: type) -> tuple[str, ...] | None:
+    """Return the names of the fields of a dataclass; None of another class."""
+    if not dataclasses.is_dataclass(kind):
+        return None
+    return tuple(field.name for field in dataclasses.fields(kind))
 
 
 @final
@@ -93,7 +106,26 @@ class _Walk:
         if kind in _PLAIN:
             # `repr` of a float has all its digits, and the sign of 0.
             self._bits.append(f"{kind.__name__} {value!r}".encode())
-        elif isinstance(value, type | FunctionType):
+            return
+        names = _fields(kind)
+        if names is not None:
+            # Equinox leaves out what is an attribute of the class.
+            self._inner(kind, [getattr(value, name) for name in names])
+        elif isinstance(value, tuple | list):
+            self._inner(kind, value)
+        elif isinstance(value, dict):
+            self._inner(kind, [entry for pair in value.items() for entry in pair])
+        else:
+            self._leaf(value, kind)
+
+    def _inner(self, kind: type, parts: Sequence[Any]) -> None:
+        self._name(kind)
+        self._bits.append(b"%d" % len(parts))
+        for part in parts:
+            self.visit(part)
+
+    def _leaf(self, value: Any, kind: type) -> None:
+        if isinstance(value, type | FunctionType):
             self._name(value)
         elif hasattr(value, "dtype") and hasattr(value, "shape"):
             self._array(value)
@@ -101,23 +133,7 @@ class _Walk:
             self._name(kind)
             self._bits.append(value.name.encode())
         else:
-            self._inner(value, kind)
-
-    def _inner(self, value: Any, kind: type) -> None:
-        if isinstance(value, tuple | list):
-            parts = list(value)
-        elif isinstance(value, dict):
-            parts = [entry for pair in value.items() for entry in pair]
-        elif dataclasses.is_dataclass(kind):
-            # Equinox leaves out what is an attribute of the class.
-            parts = [getattr(value, field.name) for field in dataclasses.fields(kind)]
-        else:
             self._unknown(value)
-            return
-        self._name(kind)
-        self._bits.append(b"%d" % len(parts))
-        for part in parts:
-            self.visit(part)
 
     def _array(self, array: Any) -> None:
         try:
