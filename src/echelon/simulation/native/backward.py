@@ -215,7 +215,8 @@ class Backward:
             # The last stretch is the first that is taken back.
             self.stepper.record(self.tape if first + self.stretch >= self.steps else None, first)
             made = self._advance(now, first)
-            now, sums = made.now, made.sums if sums is None else sums.plus(made.sums)
+            now, more = made.now, made.sums.of(0)
+            sums = more if sums is None else sums.plus(more)
             if any_beyond(now.states, BITS):
                 self.moments.clear()
                 return None
