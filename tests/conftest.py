@@ -1,4 +1,4 @@
-"""Settings of every test: no silent broadcasting, checked shapes, repeatable examples, a time limit."""
+"""Settings of every test: no silent broadcasting, checked shapes, repeatable draws, a time limit."""
 
 import gc
 import os
