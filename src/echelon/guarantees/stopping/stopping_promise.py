@@ -33,10 +33,14 @@ class StoppingPromise(Promise):
     Attributes:
         run: what it was computed of.
         tube: what is guaranteed; None for nothing.
+        coupling: c.
+        hold: the longest step (s) that keeps the largest stopping point from growing.
     """
 
     run: StoppingRun
     tube: Tube | None
+    coupling: float
+    hold: float
 
     @classmethod
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "StoppingPromise":
@@ -56,6 +60,9 @@ class StoppingPromise(Promise):
             leader_mode=leaders.slowest,
             complete=not brief,
             run=run,
+            # In float64, which a law computes in only here.
+            coupling=run.coupling,
+            hold=run.longest_step,
             tube=None if against else found.tube,
         )
 
@@ -81,7 +88,7 @@ class StoppingPromise(Promise):
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) that keeps the largest stopping point from growing."""
-        return self.run.longest_step
+        return self.hold
 
     def guarantee(self) -> str:
         """Return what T5 guarantees."""
@@ -95,9 +102,7 @@ class StoppingPromise(Promise):
     @property
     def agreement(self) -> AgreementModes:
         """How stopping points agree, zeta~' = -c lambda zeta~."""
-        run = self.run
-        coupling = float(run.law.strength(run.settings.dt))
-        return AgreementModes(coupling, agreement_modes(run.parts.graph, run.law))
+        return AgreementModes(self.coupling, agreement_modes(self.run.parts.graph, self.run.law))
 
     @property
     def paper_lines(self) -> tuple[Statement, ...]:
