@@ -1,4 +1,4 @@
-"""Settings of every test: no silent broadcasting, checked shapes, repeatable draws, a time limit."""
+"""Settings of every test: no silent broadcasting, checked shapes, repeatable draws, time limits."""
 
 import gc
 import os
