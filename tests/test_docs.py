@@ -204,7 +204,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     assert (rows["decay"]["coupling"], rows["decay"]["edge"]) == (1.0, 0.0)
     assert rows["decay"]["slowest_mode"] < 0.0
     assert rows["contraction"]["reason"] == (
-        "give `follower.gain={method: contraction, domain: {angle: HALF_WIDTH, ...}}` to try it"
+        "set `follower.gain={method: contraction, domain: {angle: HALF_WIDTH, ...}}` to try it"
     )
     refused = call("--set", "follower.gain.Q=[1, 1]")
     assert refused.returncode == 2

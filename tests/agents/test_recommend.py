@@ -134,9 +134,9 @@ def test_what_is_told_is_what_the_changed_graph_has():
         assert told == pytest.approx(-1.0 / again, rel=1e-9) and told < 0.5 * found.now
     (i, j), (k, m) = found.edges
     assert found.sentence() == (
-        f"The slowest disagreement lives {found.now:.3g} s (1/lambda_min: N^2 on a line of N); "
-        f"{found.with_leaders:.3g} s with agent {found.leaders[0]} as a leader too, "
-        f"{found.with_edges:.3g} s with the edges {i}-{j}, {k}-{m} more."
+        f"The slowest disagreement decays with a time constant of {found.now:.3g} s; "
+        f"{found.with_leaders:.3g} s with the further leader {found.leaders[0]}; "
+        f"{found.with_edges:.3g} s with the further edges {i}-{j}, {k}-{m}."
     )
 
 

@@ -63,7 +63,7 @@ def test_what_is_said_to_be_missing_is_accepted_where_it_is_said_to_go():
     rows = {row.method: row for row in ech.design(ech.load_scenario("van-der-pol")).designs}
     reason = rows["robust-lqr"].reason
     assert reason == (
-        "give `follower.gain={method: robust-lqr, domain: {position: HALF_WIDTH, ...}}` to try it"
+        "set `follower.gain={method: robust-lqr, domain: {position: HALF_WIDTH, ...}}` to try it"
     )
     advice = reason.split("`")[1].replace("HALF_WIDTH, ...", "0.5")
     gain = ech.load_scenario("van-der-pol", [advice]).follower.gain
@@ -112,7 +112,7 @@ def test_every_method_has_its_row_and_the_numbers_are_those_of_its_gain(echelon)
         ("proof", "vertices", "samples", None).index(row.get("kind"))
         for row in rows.values() if row["method"] == told["recommended"]
     )  # fmt: skip
-    assert strongest <= 1 and told["because"].startswith(f"Recommended: {told['recommended']}, ")
+    assert strongest <= 1 and told["because"].startswith(f"Recommended: {told['recommended']}. ")
 
 
 def test_the_step_that_is_told_is_the_longest(echelon):
@@ -138,7 +138,7 @@ def test_the_table_and_its_sentence_are_whole(echelon):
     assert code == 0 and "dt up to" in out and "certified" in out and "delay" in out
     assert "- inner-loop: `Pendulum` has no state that its dynamics ignore" in out
     sentence = out.splitlines()[-1]
-    assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough for it.")
+    assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough.")
 
 
 def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelon):
@@ -149,7 +149,7 @@ def test_a_gain_that_needs_a_shorter_step_is_not_preferred_and_is_said_to(echelo
     assert recommended(tried, 0.005).method == "riccati"
     best = recommended(tried, between)
     assert best.method == "inner-loop"
-    assert "because of 2 stable loops it alone holds the scenario's step" in (
+    assert "Of 2 stable designs only this one is stable at the scenario's step." in (
         because(best, tried, between)
     )
     # The table has a faster one, and the sentence does not say otherwise.

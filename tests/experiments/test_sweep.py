@@ -71,7 +71,15 @@ def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "planar-quadrotor", "paper-literal", "paper-line"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "paper",
+        pytest.param("planar-quadrotor", marks=pytest.mark.study),
+        "paper-literal",
+        pytest.param("paper-line", marks=pytest.mark.study),
+    ],
+)
 def test_every_run_among_many_has_the_bits_that_it_has_alone(name):
     runs = seeds(built(name), 20, engine="native", store_every=200)
     found = list(Batch().fly(runs))
@@ -239,7 +247,9 @@ def test_a_start_that_a_law_refuses_is_refused_among_many():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [[], ["simulation.dt=0.4"]])
+@pytest.mark.parametrize(
+    "changes", [pytest.param([], marks=pytest.mark.study), ["simulation.dt=0.4"]]
+)
 def test_promises_of_many_seeds_are_those_of_each(changes):
     experiment = built("van-der-pol", "simulation.horizon=4", "report.steady_window=1", *changes)
     parts, chosen = experiment
@@ -388,8 +398,8 @@ def test_values_are_read_and_written_as_on_the_command_line(text, values):
 FAULTS = {
     "seed": "got no `key=values`, allowed is as in `seed=0..9`.",
     "seed=": "got no values, allowed are one or more.",
-    "seed=9..0": "got `9..0`, and a range must not fall.",
-    "seed=1,1": "got `1` twice, and once is enough.",
+    "seed=9..0": "got `9..0`, a range must ascend.",
+    "seed=1,1": "got `1` twice, give each value once.",
     "seed=0..999999999999": "1e+12 runs are asked for, and 10000000 fit.",
     "follower.gain.couplng=1": "got an unknown key",
     "follower.gain.coupling=1,-2": "got `-2`",
@@ -417,7 +427,9 @@ def test_too_many_runs_of_several_axes_and_of_many_agents_are_refused():
     big = ech.load_scenario("van-der-pol", ["graph.agents=2000"])
     with pytest.raises(ech.errors.ScenarioError, match="need .* of memory, and .* fit: .* runs"):
         ech.sweep(big, {"seed": range(10**6)})
-    with pytest.raises(ech.errors.ScenarioError, match="`initial` too, of which it is a part"):
+    with pytest.raises(
+        ech.errors.ScenarioError, match="this key is inside `initial`, which varies too"
+    ):
         axes_of({"initial": [{}], "initial.spread": [{}]})
 
 

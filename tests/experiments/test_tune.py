@@ -55,13 +55,13 @@ def test_slopes_through_the_riccati_equation_are_those_of_differences(seed):
 def test_the_slopes_of_a_search_are_those_of_differences_and_a_weight_of_zero_stays():
     search = _Search(carts(), (*BOTH, "follower.gain.coupling"), cost_named("formation"), None)
     assert len(search.start) == 3 and search.start == pytest.approx(np.log([1.0, 1.0, 2.618]), 1e-3)
-    value, slopes = search.try_at(search.start)
-    assert search.tried[0].values["follower.gain.Q"][1] == 0.0
+    value, slopes = search.evaluate(search.start)
+    assert search.trials[0].values["follower.gain.Q"][1] == 0.0
     for k, slope in enumerate(slopes):
         h = 1e-4 * np.eye(3)[k]
-        ends = [search.try_at(search.start + sign * h)[0] for sign in (1.0, -1.0)]
+        ends = [search.evaluate(search.start + sign * h)[0] for sign in (1.0, -1.0)]
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-5)
-    assert value == pytest.approx(np.log(search.tried[0].cost))
+    assert value == pytest.approx(np.log(search.trials[0].cost))
 
 
 def test_tuning_lowers_the_cost_that_a_run_then_has(tmp_path):
@@ -88,18 +88,21 @@ REFUSED = {
         lambda: ech.tune(carts(), ["follower.gain.r"]),
         r"`params` names `follower.gain.r`, allowed are .* \(did you mean `follower.gain.R`\?\)",
     ),
-    "no parameter": (lambda: ech.tune(carts(), []), "`params` names nothing"),
+    "no parameter": (lambda: ech.tune(carts(), []), "`params` is empty"),
     "another method": (
         lambda: ech.tune(ech.scenario_from_mapping(CARTS | {"follower": GIVEN})),
-        "the followers have the method `given`, and what is tuned are the weights of `riccati`",
+        "the followers have the method `given`, but only weights of `riccati` can be tuned",
     ),
     "a full weight": (
         lambda: ech.tune(carts(Q=[[1.0, 0.1], [0.1, 1.0]])),
         "`follower.gain.Q` has entries off its diagonal",
     ),
     "another cost": (lambda: cost_named("formatio"), "`cost` names `formatio`, .* \\(did you mean"),
-    "no number": (lambda: cost_named("x*effort"), "`cost` weighs `effort` by `x`"),
-    "a negative weight": (lambda: cost_named("-1*effort"), "`cost` weighs `effort` by `-1`"),
+    "no number": (lambda: cost_named("x*effort"), "`cost` has the weight `x` for `effort`"),
+    "a negative weight": (
+        lambda: cost_named("-1*effort"),
+        "`cost` has the weight `-1` for `effort`",
+    ),
 }
 
 

@@ -46,9 +46,9 @@ RUNS = {
 }
 
 
-# A run in space, one without positions, one on a line; the others are drawn by the slow tests.
+# A run in space, one without positions, one on a line; the others are a study.
 QUICK = {"quadrotor", "van-der-pol", "one-axis"}
-FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in RUNS]
+FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.study) for n in RUNS]
 
 
 def close(model, graph, method, reference, spread):

@@ -90,7 +90,7 @@ _COLUMNS = {
     "seconds": "seconds",
 }
 _FOOTNOTES = (
-    "(1) the longest step with inputs held over it with which every mode looked at still decays.",
+    "(1) longest sampling period for which all checked modes remain stable.",
     "(2) r of sum_i delta_i'P delta_i <= r^2, less the leader's excursion over the horizon.",
 )
 

@@ -41,6 +41,6 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
             *drift_lines(parts, settings, guarantee),
             *guarantee.hypotheses.values(),
             killing_line(parts, guarantee),
-            *margin_lines(parts, settings, guarantee),
+            *margin_lines(parts, guarantee),
         )
     return CheckResult(lines, guarantee)

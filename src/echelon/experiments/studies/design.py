@@ -24,8 +24,7 @@ from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import Fault
 from echelon.experiments.studies.speedup import speedup
-from echelon.experiments.studies.stopping_design import StoppingDesign, design_stopping
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -93,15 +92,15 @@ _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
 class Designs(NamedTuple):
     """The designs of all methods, the recommended one if any, and the reason.
 
-    `settings` are those of all designs. For the law `stopping-point`, `stopping` is a design that is
-    certified with motors, if there is one.
+    `settings` are those of all designs. `law_design` is a guaranteed design of the scenario's law,
+    if that law computes one.
     """
 
     designs: tuple[Design, ...]
     recommended: Design | None
     because: str
     settings: Settings
-    stopping: StoppingDesign | None = None
+    law_design: LawDesign | None = None
 
 
 def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
@@ -133,8 +132,8 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     )
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
     reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
-    stopping = design_stopping(*built) if method is None else None
-    return Designs(designs, best, reason, built.settings, stopping)
+    law_design = prover_of(built.parts.drive).design(*built) if method is None else None
+    return Designs(designs, best, reason, built.settings, law_design)
 
 
 _SIMPLE_GAIN = GainSpec(method=FixedGain.name, P="identity")

@@ -18,13 +18,10 @@ from echelon.core.statement import (
     vacuous,
 )
 from echelon.core.types import Array
-from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.promise import Promise
-from echelon.guarantees.stopping.stopping_run import agreement_modes
-from echelon.laws.stopping_point import StoppingPoint
+from echelon.guarantees.promises.promise import AgreementModes, Promise
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
 from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
 
@@ -35,16 +32,16 @@ _STIFF = 1e10
 """Ratio of modes above which the slowest one has fewer than six digits."""
 
 
-def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
+def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a stable loop."""
     loop = promise.loop
     if parts.graph.schedule is not None:
         yield from _switching_lines(promise)
         return
-    if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
+    if promise.agreement is not None:
         text = "any coupling; the delay margin depends only on c and the graph"
         yield unneeded(Topic.MARGINS, _KIND, text)
-        yield from _stopping_lines(parts, settings)
+        yield from _agreement_lines(promise.agreement)
         return
     if not promise.linear:
         text = "the model is not smooth at the trim, and has no modes there"
@@ -76,7 +73,7 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
 def _switching_lines(promise: Promise) -> Iterator[Statement]:
     """Yield the margins for switching graphs: the smallest factor on the coupling (T8)."""
     edge, lines = promise.edge, promise.hypotheses
-    anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
+    anywhere = promise.agreement is not None
     if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling for which one P serves all graphs, however they switch"
@@ -102,15 +99,13 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
 
 
-def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
+def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
     """Yield the delay margin of zeta' = -c L zeta: (pi/2 - |arg lambda|) / (c |lambda|).
 
     A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and first reaches the axis at that
     delay.
     """
-    law, dt = getattr(parts.drive, "follower", None), settings.dt
-    assert isinstance(law, StoppingPoint)
-    c, values = float(law.strength(dt)), agreement_modes(parts.graph, law)
+    c, values = agreement
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
     text = f"uniform delay of z, critical mode lambda = {values[at]:.3g}"

@@ -9,7 +9,7 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.guarantees.promises.promise import Promise, promises
-from echelon.simulation.engine.batch import Batch, Told
+from echelon.simulation.engine.batch import Batch, StepCount
 from echelon.simulation.engine.result import Result
 from echelon.simulation.native import is_installed
 
@@ -52,7 +52,7 @@ class Workers:
         most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
         self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
 
-    def batch(self, first: int, count: int, progress: Told) -> SweepBatch:
+    def batch(self, first: int, count: int, progress: StepCount) -> SweepBatch:
         """Return the numbers of some runs; `progress` is called several times a second.
 
         Raises:
@@ -94,4 +94,4 @@ def _promises(experiments: Sequence[Experiment]) -> Iterator[Promise | EchelonEr
     """Yield the promises of runs; consecutive runs often differ only in the seed."""
     for _, same_parts in groupby(experiments, key=lambda experiment: id(experiment.parts)):
         runs = list(same_parts)
-        yield from promises(runs[0].parts, [run.settings for run in runs], briefly=True)
+        yield from promises(runs[0].parts, [run.settings for run in runs], brief=True)
