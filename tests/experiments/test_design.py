@@ -220,7 +220,7 @@ def test_the_ellipse_has_the_radius_that_it_says(cubic):
 def test_a_slice_stays_inside_the_chart():
     agent = ech.models.Quadrotor()
     plane = slice_of(resting(agent, ech.gains.Riccati()), (0, agent.state_names.index("pitch")))
-    assert plane.reach[1] < np.pi / 2 and plane.reach[0] == 30.0
+    assert plane.limits[1] < np.pi / 2 and plane.limits[0] == 30.0
 
 
 def test_a_slice_runs_the_loop_that_simulate_runs():
@@ -246,7 +246,7 @@ def test_a_slice_runs_the_loop_that_simulate_runs():
         y = result.states[[0, -1]][:, list(parts.graph.followers)] - np.array(model.trim[0])
         first, last = np.sqrt(np.einsum("tfi,ij,tfj->t", y, gain.P, y))
         plane = slice_of(parts, pair)
-        assert converged(run, plane, np.array([start]))[0] == (last <= run.fallen * first)
+        assert converged(run, plane, np.array([start]))[0] == (last <= run.decay * first)
 
 
 def test_the_pair_is_the_one_asked_for_or_a_telling_one():

@@ -1,7 +1,4 @@
-"""The dataset of a run, labelled, with units and provenance, and its summary.
-
-The dataset is one netCDF file, the summary is JSON.
-"""
+"""The dataset of a run with units and provenance (netCDF), and its summary (JSON)."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -31,7 +28,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _LISTED = 5_000
-"""Rows of a list in the summary. The dataset has what all of them are made of."""
+"""Most rows of a list in the summary; the dataset contains the numbers of all agents."""
 _Row = TypeVar("_Row")
 
 
@@ -41,19 +38,19 @@ def dataset(result: Result) -> "xr.Dataset":
     Variables: `states`, `inputs`, `error` (deviation from the goal relative to the leader),
     `offset`, `nearest_leader`, `reference`, `tracking_error` (the leaders' outputs minus their
     references'), `lyapunov`, `lyapunov_rate`, `lyapunov_drift`, `saturated`, `edge_agents`,
-    `edge_weight`, `edge_heard` (whether each end of an edge hears the other), of a graph that
-    switches `edge_weight_then` from each `stretch_start` on with its `graph_period` (infinite
-    where nothing is repeated), the gain's `P`, `R` and `coupling`, the poles of the modes looked
-    at (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, of which a directed graph may have
-    an imaginary part in `mode_eigenvalue_imaginary`), and where inputs u are limited
-    `limit_low` <= `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format`
-    the number of this list.
+    `edge_weight`, `edge_heard` (whether each end of an edge receives from the other), of a
+    switching graph `edge_weight_then` from each `stretch_start` on with its `graph_period`
+    (infinite without repetition), the gain's `P`, `R` and `coupling`, the poles of the checked
+    modes (`pole_real`, `pole_imaginary`, by `mode_eigenvalue`, for directed graphs with the
+    imaginary part `mode_eigenvalue_imaginary`), and the limits of the inputs u, `limit_low` <=
+    `limit_matrix` u <= `limit_high`. The attribute `promise` is JSON, and `format` the version of
+    this list.
     """
     return labelled(result).dataset()
 
 
 def labelled(result: Result) -> Labelled:
-    """Return what `dataset` is made of."""
+    """Return the labelled arrays of `dataset`."""
     model, per_agent = result.model, ("time", "agent", "state")
     variables: dict[str, Any] = {
         "states": (per_agent, result.states),
@@ -93,46 +90,46 @@ def recording_of(result: Result) -> Recording:
 
 
 def _edges(result: Result) -> dict[str, Any]:
-    """Return the graph: its edges, who hears along them, and when they are there."""
+    """Return the edges of the graph, who receives along them, and their weights over time."""
     graph, schedule = result.graph, result.graph.schedule
-    told: dict[str, Any] = {
+    variables: dict[str, Any] = {
         "edge_agents": (("edge", "end"), graph.edges),
         "edge_weight": ("edge", graph.weights),
         "edge_heard": (("edge", "end"), heard_in(result.parts).astype(np.int8)),
     }
     if schedule is not None:
-        told["stretch_start"] = ("stretch", schedule.starts, {"units": "s"})
-        told["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
+        variables["stretch_start"] = ("stretch", schedule.starts, {"units": "s"})
+        variables["edge_weight_then"] = (("stretch", "edge"), schedule.weights)
         period = np.inf if schedule.period is None else schedule.period
-        told["graph_period"] = ((), period, {"units": "s"})
-    return told
+        variables["graph_period"] = ((), period, {"units": "s"})
+    return variables
 
 
 def _output_units(model: ControlAffine) -> list[str]:
-    """Return the units of the outputs, known of those that are states."""
+    """Return the units of the outputs, known for those that are states."""
     units = dict(zip(model.state_names, model.state_units, strict=True))
     return [units.get(name, "") for name in model.output_names]
 
 
 def _followed(result: Result) -> dict[str, Any]:
-    """Return what the leaders follow and how far they are from it; nothing without a reference."""
+    """Return the reference and the leaders' tracking errors; nothing without a reference."""
     if result.reference is None:
         return {}
-    found: dict[str, Any] = {"reference": (("time", "state"), result.reference)}
+    variables: dict[str, Any] = {"reference": (("time", "state"), result.reference)}
     errors = [output_errors(result, leader) for leader in result.graph.leaders]
-    known = [error for error in errors if error is not None]
-    if known:
-        found["tracking_error"] = (("time", "leader", "output"), np.stack(known, axis=1))
-    return found
+    errors = [error for error in errors if error is not None]
+    if errors:
+        variables["tracking_error"] = (("time", "leader", "output"), np.stack(errors, axis=1))
+    return variables
 
 
 def _gain(result: Result) -> dict[str, Any]:
-    """Return what the gain is; nothing without one."""
+    """Return the gain; nothing without one."""
     gain = result.drive.gain
     if gain is None:
         return {}
     return {
-        # A dimension stands in a variable once, so that columns have one of their own.
+        # A variable cannot have the same dimension twice, so columns have another one.
         "P": (("state", "state_column"), gain.P),
         "R": (("input", "input_column"), gain.R),
         "coupling": ((), gain.coupling),
@@ -140,7 +137,7 @@ def _gain(result: Result) -> dict[str, Any]:
 
 
 def _limits(result: Result) -> dict[str, Any]:
-    """Return what limits the inputs that were delivered; nothing where they are not."""
+    """Return the limits of the inputs; nothing without limits."""
     limits = result.model.input_limits if result.settings.limits else None
     if limits is None:
         return {}
@@ -150,18 +147,18 @@ def _limits(result: Result) -> dict[str, Any]:
 
 
 def _poles(result: Result) -> dict[str, Any]:
-    """Return the poles near the trim; nothing where laws have none."""
-    found = promise(result.parts, result.settings)
-    if not found.linear:
+    """Return the poles of the linearized loop; nothing where laws have none."""
+    guarantee = promise(result.parts, result.settings)
+    if not guarantee.linear:
         return {}
-    poles, values = found.loop.poles, found.loop.eigenvalues
-    turning = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
-    turning = turning if np.iscomplexobj(values) else {}
+    poles, values = guarantee.loop.poles, guarantee.loop.eigenvalues
+    imaginary = {"mode_eigenvalue_imaginary": ("mode", np.imag(values))}
+    imaginary = imaginary if np.iscomplexobj(values) else {}
     return {
         "pole_real": (("mode", "pole"), np.real(poles)),
         "pole_imaginary": (("mode", "pole"), np.imag(poles)),
         "mode_eigenvalue": ("mode", np.real(values)),
-        **turning,
+        **imaginary,
     }
 
 
@@ -173,17 +170,17 @@ def _attributes(result: Result) -> dict[str, Any]:
         f"{role}_needs": "; ".join(sent) or "nothing"
         for role, sent in result.drive.information._asdict().items()
     }
-    told = {
+    attributes = {
         key: text for key, text in result.world.describe(result.model).items() if text is not None
     }
-    told |= {"outcome": result.outcome.name.lower(), "message": result.message}
-    told |= {"warnings": "\n".join(result.warnings)}
-    told |= {"promise": json.dumps(promise(result.parts, result.settings).as_mapping())}
+    attributes |= {"outcome": result.outcome.name.lower(), "message": result.message}
+    attributes |= {"warnings": "\n".join(result.warnings)}
+    attributes |= {"promise": json.dumps(promise(result.parts, result.settings).as_mapping())}
     if result.work is not None:
-        told["solver"] = json.dumps(result.work._asdict())
+        attributes["solver"] = json.dumps(result.work._asdict())
     return {
         **result.provenance,
-        **told,
+        **attributes,
         **settings,
         **laws,
         "model": type(result.model).__name__,
@@ -194,12 +191,12 @@ def _attributes(result: Result) -> dict[str, Any]:
 
 
 def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
-    """Write the dataset of a run as netCDF, whole or not at all.
+    """Write the dataset of a run as netCDF, atomically.
 
     Raises:
         OSError: it cannot be written.
     """
-    # In memory first: on a disk that is full the library under it ends the whole process.
+    # In memory first: on a full disk the netCDF library ends the whole process.
     data = labelled(run) if isinstance(run, Result) else run
     if isinstance(data, Labelled):
         write_atomic(path, data.netcdf())
@@ -208,7 +205,7 @@ def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
 
 
 def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
-    """Return the run's summary, ready for JSON; what does not exist is None."""
+    """Return the run's summary as JSON data; numbers that do not exist are None."""
     numbers = metrics(result) if numbers is None else numbers
     gain = result.drive.gain
     spectrum = result.graph.spectrum()
@@ -255,7 +252,7 @@ def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
 
 
 def _listed(rows: Sequence[_Row], error: Callable[[_Row], float]) -> Sequence[_Row]:
-    """Return all rows; of more than a person's tools read, the best, the median and the worst."""
+    """Return all rows; if they are too many for JSON tools, the best, the median and the worst."""
     return rows if len(rows) <= _LISTED else representatives(rows, error)
 
 

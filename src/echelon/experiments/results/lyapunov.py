@@ -1,4 +1,4 @@
-"""The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and why it falls or rises."""
+"""The paper's Lyapunov function V = 1/2 z'(M kron P) z along a run, and the terms of V'."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias, final
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from jaxtyping import Float
 
 from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
@@ -20,39 +21,39 @@ from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.motion import Motion
 
-# Below this fraction of its largest value V is made of rounding and its rises mean nothing.
+# Below this fraction of its largest value V is rounding, and an increase means nothing.
 _ROUNDING = 1e-20
 _ULPS = 8.0 * np.finfo(float).eps
-"""Of the largest states and offsets: what the differences between neighbours are off by."""
+"""Relative rounding of differences between neighbours, of the largest states and offsets."""
 
 
 class Lyapunov(NamedTuple):
-    """V, its derivative, and the derivative's part that the drift makes, at each frame: (T,) each.
+    """V, its derivative, and the drift's part of the derivative, at each frame.
 
     `rate` is exact along the closed loop at the frame, leader's motion included. `drift` is the sum
-    over edges of A_ij (y_i - y_j)'P (f(x_i) - f(x_j)) about the trim: the paper's Assumption 5, as
-    met on this run, says that it is not positive. `after` and `drift_after` are V and that part one
-    step of the run later. Below `rounding` V is nothing but that.
+    over edges of A_ij (y_i - y_j)'P (f(x_i) - f(x_j)) about the trim: the paper's Assumption 5
+    means that it is not positive. `after` and `drift_after` are V and that part one step of the run
+    later. Below `rounding` V is rounding only.
     """
 
-    value: Array
-    rate: Array
-    drift: Array
-    after: Array
-    drift_after: Array
+    value: Float[Array, " T"]
+    rate: Float[Array, " T"]
+    drift: Float[Array, " T"]
+    after: Float[Array, " T"]
+    drift_after: Float[Array, " T"]
     rounding: float
 
     def rises(self) -> Array:
-        """Return (T - 1,) booleans: where V rises to the next frame by more than rounding."""
+        """Return (T - 1,) booleans: where V increases to the next frame by more than rounding."""
         return np.diff(self.value) > 1e-9 * self.value[:-1] + self.rounding
 
     def forbidden(self) -> Array:
-        """Return (T,) booleans: where V rises over a step although theory says that it may not.
+        """Return (T,) booleans: where V increases over a step although theory excludes it.
 
-        The law's own part of V' is a square with a minus. Where that and the drift's part push V
-        down as a step begins, the drift still does as it ends, and V is larger there, it is the
-        work of the held input, not of the law. Between frames that are stored less often, more may
-        happen than derivatives at both ends know.
+        The law's part of V' is minus a square. If that and the drift's part are negative at the
+        start of a step, the drift's part also at its end, and V is larger there, the cause is the
+        input held over the step, not the law. Between frames that are stored less often this cannot
+        be decided from derivatives at both ends.
         """
         slack = 1e-9 * np.maximum(np.abs(self.rate), np.abs(self.drift))
         falls = (self.drift <= slack) & (self.rate - self.drift <= slack)
@@ -61,15 +62,15 @@ class Lyapunov(NamedTuple):
 
 
 def goes_both_ways(graph: Graph) -> bool:
-    """Tell whether V is known of a graph: each edge is heard both ways, and all the time."""
+    """Return whether V is defined for a graph: undirected, and without switching."""
     return not graph.directed and graph.schedule is None
 
 
 def lyapunov(result: Result) -> Lyapunov | None:
     """Return V along a run, in float64.
 
-    None where the followers' law has no P or nothing was stored, and on graphs that are directed or
-    switch, where V is no sum over edges and need not fall (theory page, T7).
+    None where the followers' law has no P or no frame was stored, and on directed or switching
+    graphs, where V is not a sum over edges and need not decrease (theory page, T7).
     """
     P, graph, offsets = result.drive.metric(result.model), result.graph, result.formation.offsets
     if P is None or not len(result.times) or not goes_both_ways(graph):
@@ -79,7 +80,8 @@ def lyapunov(result: Result) -> Lyapunov | None:
         steps = np.rint(result.times / result.settings.dt).astype(np.int32)
         fields = _fields(result.drive, result.model, _motion(result), graph.leaders[0], x, u, steps)
         now, after = (
-            _seen(result.model, each, np.asarray(each.states) - offsets) for each in fields
+            _in_metric_axes(result.model, each, np.asarray(each.states) - offsets)
+            for each in fields
         )
         y, f, xdot = now
         later, f_after, _ = after
@@ -98,8 +100,10 @@ def lyapunov(result: Result) -> Lyapunov | None:
         )
 
 
-def _form(a: Array, P: Array, b: Array) -> Array:
-    """Return sum_i a_i'P b_i for each frame, (T,), of a, b (T, N_f, n)."""
+def _form(
+    a: Float[Array, "T F n"], P: Float[Array, "n n"], b: Float[Array, "T F n"]
+) -> Float[Array, " T"]:
+    """Return sum_i a_i'P b_i for each frame."""
     return np.einsum("tia,ab,tib->t", a, P, b)
 
 
@@ -107,7 +111,7 @@ _Difference: TypeAlias = Callable[[Array, Array], Array]
 
 
 def _difference(model: ControlAffine) -> _Difference:
-    """Return the difference of states (T, E, n) that the laws take: angles may wind."""
+    """Return the difference of states (T, E, n) that the laws use, with angles modulo 2 pi."""
     return lambda x, y: np.asarray(_differences(model, x, y))
 
 
@@ -117,14 +121,14 @@ def _differences(model: ControlAffine, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _drift(graph: Graph, P: Array, y: Array, f: Array, difference: _Difference) -> Array:
-    """Return the drift's part of V' at states less their offsets y with drifts f, (T, N, n)."""
+    """Return the drift's part of V' at states minus offsets y with drifts f, (T, N, n)."""
     i, j = graph.edges.T
-    apart = difference(y[:, i], y[:, j])
-    return np.einsum("e,tea,ab,teb->t", graph.weights, apart, P, f[:, i] - f[:, j])
+    differences = difference(y[:, i], y[:, j])
+    return np.einsum("e,tea,ab,teb->t", graph.weights, differences, P, f[:, i] - f[:, j])
 
 
 def _rounding(result: Result, P: Array, value: Array) -> float:
-    """Return below what V is made of rounding: of its own sum, or of the states'."""
+    """Return the value below which V is rounding, of its sum or of the states."""
     size = np.abs(result.states).max(axis=(0, 1)) + np.abs(result.formation.offsets).max(axis=0)
     ulp = _ULPS * size
     states = 0.5 * float(result.graph.weights.sum()) * float(ulp @ np.abs(P) @ ulp)
@@ -138,8 +142,8 @@ def _motion(result: Result) -> Motion:
 class _Fields(NamedTuple):
     """States (T, N, n), the drift under the drive and xdot there, and the headings (T,).
 
-    Beside the headings, in whose axes the metric stands, are their rates, rad/s; both are None
-    where it does not turn.
+    The metric is in axes that turn with the headings; `rates` are those of the headings, rad/s.
+    Both are None where the axes do not turn.
     """
 
     states: jax.Array
@@ -161,7 +165,7 @@ def _fields(
 ) -> tuple[_Fields, _Fields]:
     """Return the fields at states x (T, N, n) under inputs u (T, N, m) at steps (T,), and after it.
 
-    What moves is taken for the same a step later.
+    The velocity is taken to be the same one step later.
     """
 
     def velocity(x: jax.Array, u: jax.Array, agent: jax.Array, step: jax.Array) -> jax.Array:
@@ -170,16 +174,16 @@ def _fields(
     moving = jax.vmap(jax.vmap(velocity, in_axes=(0, 0, 0, None)), in_axes=(0, 0, None, 0))
     later, xdot = jax.vmap(motion.advance)(x, u, steps), moving(x, u, jnp.arange(x.shape[1]), steps)
 
-    def told(t: jax.Array, x: jax.Array) -> jax.Array | None:
+    def heading(t: jax.Array, x: jax.Array) -> jax.Array | None:
         return drive.heading(model, t, x)
 
     def fields(x: jax.Array, steps: jax.Array) -> _Fields:
         times, first = steps.astype(x.dtype) * motion.dt, x[:, leader]
-        if told(times[0], first[0]) is None:
+        if heading(times[0], first[0]) is None:
             drift = jax.vmap(jax.vmap(lambda x: drive.drift(motion.plant, x)))(x)
             return _Fields(x, drift, xdot, None, None)
         along = (jnp.ones_like(times), xdot[:, leader])
-        turn = jax.vmap(lambda *at: jax.jvp(told, at[:2], at[2:]))
+        turn = jax.vmap(lambda *at: jax.jvp(heading, at[:2], at[2:]))
         headings, rates = turn(times, first, *along)
         drift = jax.vmap(jax.vmap(lambda x, psi: drive.drift(motion.plant, x, psi), (0, None)))(
             x, headings
@@ -189,31 +193,33 @@ def _fields(
     return fields(x, steps), fields(later, steps + 1)
 
 
-def _seen(model: ControlAffine, fields: _Fields, y: Array) -> tuple[Array, Array, Array]:
-    """Return y, the drift and xdot, (T, N, n) each, in the axes in which the metric stands."""
+def _in_metric_axes(
+    model: ControlAffine, fields: _Fields, y: Float[Array, "T N n"]
+) -> tuple[Float[Array, "T N n"], Float[Array, "T N n"], Float[Array, "T N n"]]:
+    """Return y, the drift and xdot in the axes of the metric."""
     f, xdot = np.asarray(fields.drift), np.asarray(fields.xdot)
     if fields.headings is None or fields.rates is None:
         return y, f, xdot
     y, f, xdot = (
-        np.asarray(_turned_back(model, jnp.asarray(part), fields.headings)) for part in (y, f, xdot)
+        np.asarray(_rotate_back(model, jnp.asarray(part), fields.headings)) for part in (y, f, xdot)
     )
-    # What rests in the world turns the other way in axes that turn.
+    # A vector that is constant in the world turns backward in turning axes.
     turning = np.asarray(fields.rates)[:, None, None] * (y @ state_turn(model).slope.T)
     return y, f - turning, xdot - turning
 
 
 @cached_jit
-def _turned_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> jax.Array:
-    """Return values (T, N, n) in axes that are turned by angles (T,)."""
+def _rotate_back(model: ControlAffine, values: jax.Array, angles: jax.Array) -> jax.Array:
+    """Return values (T, N, n) in axes rotated by angles (T,)."""
     return jax.vmap(jax.vmap(state_turn(model), (0, None)))(values, -angles)
 
 
 @final
 class Deviations:
-    """z and delta of a graph, its Laplacian factored once.
+    """Computes z and delta for a graph, whose Laplacian is factored once.
 
     Args:
-        graph: who hears whom.
+        graph: the communication graph.
         difference: of states (T, E, n).
     """
 
@@ -227,28 +233,30 @@ class Deviations:
         self._graph, self._difference = graph, difference
         self._solve = spla.splu(sp.csc_array(graph.grounded_laplacian())).solve
 
-    def __call__(self, y: Array) -> tuple[Array, Array]:
-        """Return z and delta, (T, N_f, n) each, of states less their offsets y (T, N, n)."""
+    def __call__(
+        self, y: Float[Array, "T N n"]
+    ) -> tuple[Float[Array, "T F n"], Float[Array, "T F n"]]:
+        """Return z and delta of the followers for states minus offsets y."""
         z = self.disagreement(y)
         frames, followers, n = z.shape
         # delta with (L_g kron I) delta = z.
         columns = np.moveaxis(z, 1, 0).reshape(followers, -1)
-        solved = self._solve(columns)
-        return z, np.moveaxis(solved.reshape(followers, frames, n), 0, 1)
+        delta = self._solve(columns).reshape(followers, frames, n)
+        return z, np.moveaxis(delta, 0, 1)
 
-    def disagreement(self, values: Array) -> Array:
-        """Return the followers' z (T, N_f, n) of values (T, N, n)."""
+    def disagreement(self, values: Float[Array, "T N n"]) -> Float[Array, "T F n"]:
+        """Return the followers' z of values."""
         frames, agents, n = values.shape
         i, j = self._graph.edges.T
         # Differences first, as in the closed loop: at consensus they vanish exactly.
-        apart = self._difference(values[:, i], values[:, j])
-        differences = np.moveaxis(apart, 1, 0).reshape(len(i), -1)
+        differences = self._difference(values[:, i], values[:, j])
+        differences = np.moveaxis(differences, 1, 0).reshape(len(i), -1)
         z = np.moveaxis((self._gather @ differences).reshape(agents, frames, n), 0, 1)
         return z[:, list(self._graph.followers)]
 
 
 def potential(model: ControlAffine, graph: Graph, P: Array) -> Callable[[Array], Array]:
-    """Return V (T,) as a function of states less their offsets (T, N, n), in float64."""
+    """Return V (T,) as a function of states minus offsets (T, N, n), in float64."""
     deviations = Deviations(graph, _difference(model))
 
     def value(y: Array) -> Array:

@@ -1,6 +1,6 @@
-"""The paper's own statements on parts of one's own: its assumptions, lemmas, and conditions on P.
+"""The paper's assumptions, lemmas and conditions on P, checked for given parts.
 
-Those that are hypotheses of a promise stand with it and are not repeated here.
+Hypotheses of a promise are checked by the promise, not here.
 """
 
 from collections.abc import Iterator
@@ -30,25 +30,25 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.axis_modes import obstacle
 
-# Far above what rounding makes of an eigenvalue 0, and far below any rate of use: at 1e-9 1/s an
-# error takes 30 years to fall to 1/e.
+# Far above the rounding of an eigenvalue 0, and far below any useful rate: at 1e-9 1/s an error
+# takes 30 years to decay to 1/e.
 ZERO = 1e-9
 _PROOF, _LINEAR = Kind.PROOF, Kind.LINEARIZATION
-_BENT = "the model bends at the trim, and has no linearization there"
+_NOT_SMOOTH = "the model is not smooth at the trim, and has no linearization there"
 
 
 def graph_lines(parts: Parts) -> Iterator[Statement]:
-    """Yield what the paper asks of agents and graph: Assumptions 1, 2 and 6, Lemmas 1 to 3."""
+    """Yield the paper's conditions on agents and graph: Assumptions 1, 2 and 6, Lemmas 1 to 3."""
     graph = parts.graph
     low, high = graph.spectrum().low, graph.spectrum().high
-    # A model is asked for f and g without a time, so that none can break it.
+    # The interface of models has no time, so every model meets it.
     yield holds(Topic.AUTONOMOUS, _PROOF, "f and g depend on x alone")
     other, size = _other_graph(graph), f"{graph.agents} agents, {len(graph.edges)} edges"
-    remedy = "T7 and T8 of the theory page stand in its place"
+    remedy = "T7 and T8 of the theory page apply instead"
     if other:
         yield fails(Topic.GRAPH, _PROOF, other, len(graph.edges), size, remedy=remedy)
     else:
-        # The paper has unit weights; its lemmas need only that they are positive.
+        # The paper has unit weights, but its lemmas only need positive ones.
         unit = bool((graph.weights == 1.0).all())
         text = "connected and static" + ("" if unit else "; weights need not be 1")
         yield holds(Topic.GRAPH, _PROOF, text, len(graph.edges), size)
@@ -63,30 +63,30 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     else:
         yield holds(Topic.POSITIVE, _PROOF, "grounded Laplacian", low, f"{low:.6g}")
     yield unneeded(Topic.SCHUR, _PROOF, "the LMI is not used")
-    # A follower beside a leader keeps the weight of that edge on its diagonal and loses the
-    # leader's column, so its row sums to that weight.
+    # A follower linked to a leader has the weight of that edge on its diagonal but not the leader's
+    # column, so its row sums to that weight.
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
-    remedy = "nothing here rests on it: Lemma 1 serves instead"
+    remedy = "nothing here uses it: Lemma 1 suffices"
     yield fails(Topic.EDGES, _PROOF, text, rows, f"row sum {rows:.3g}", remedy=remedy)
 
 
 def _other_graph(graph: Graph) -> str:
-    """Return in what a graph is not the paper's undirected and static one; empty where it is."""
-    found = ["heard one way, along arrows by which a leader reaches everybody"] * graph.directed
+    """Return how a graph differs from the paper's undirected, static one; empty if it does not."""
+    texts = ["directed, with a path from a leader to every agent"] * graph.directed
     if graph.schedule is not None:
         times = ", ".join(f"{at:g}" for at in graph.schedule.starts[1:8])
-        found.append(f"switches at {times} s")
-    return "; ".join(found)
+        texts.append(f"switches at {times} s")
+    return "; ".join(texts)
 
 
 def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
-    """Yield what the paper asks of leader and drift: Assumptions 4, 5, Lemma 4, conditions on P."""
+    """Yield the conditions on leader and drift: Assumptions 4 and 5, Lemma 4, conditions on P."""
     yield _leader_line(promise)
     reference = reference_of(getattr(parts.drive, "leader", parts.drive))
     if reference is not None:
-        found = asked(parts.model, reference, settings.horizon)
-        yield _reference_line(parts.model, found, settings)
+        demand = asked(parts.model, reference, settings.horizon)
+        yield _reference_line(parts.model, demand, settings)
     if promise.paper_lines:
         yield from promise.paper_lines
         return
@@ -108,9 +108,9 @@ def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
     name, slow = Topic.LEADER_TRACKING, promise.leader_mode
     if slow is None:
-        return unneeded(name, _PROOF, "it follows nothing")
+        return unneeded(name, _PROOF, "there is no reference")
     if not promise.linear:
-        return vacuous(name, _LINEAR, _BENT)
+        return vacuous(name, _LINEAR, _NOT_SMOOTH)
     # NaN counts as not damped.
     if slow < -ZERO:
         return holds(name, _LINEAR, "at the trim", slow, f"{slow:.3g} 1/s")
@@ -119,21 +119,21 @@ def _leader_line(promise: Promise) -> Statement:
     return fails(name, _LINEAR, text, slow, f"{slow:.3g} 1/s", remedy=remedy)
 
 
-def _reference_line(model: ControlAffine, found: ReferenceDemand, settings: Settings) -> Statement:
-    """Say what a leader must do to follow; no model here limits a speed but by its inputs."""
+def _reference_line(model: ControlAffine, demand: ReferenceDemand, settings: Settings) -> Statement:
+    """Return the reference's speed and acceleration, and whether the input limits suffice."""
     limited = settings.limits and model.input_limits is not None
-    sizes = ((found.speed, "m/s"), (found.acceleration, "m/s^2"))
-    # Below a micrometre and the like are the differences' rounding.
+    sizes = ((demand.speed, "m/s"), (demand.acceleration, "m/s^2"))
+    # Smaller numbers are rounding of differences.
     numbers = [f"{round(x, 5):.3g} {unit}" for x, unit in sizes if x is not None]
-    numbers += [f"{100.0 * found.share:.3g} % of the limits' room"] if limited else []
-    number = found.share, ", ".join(numbers)
-    if not found.feasible:
-        text, remedy = infeasible(model, found), "give knots that the model can move along"
+    numbers += [f"{100.0 * demand.share:.3g} % of the input range"] if limited else []
+    number = demand.share, ", ".join(numbers)
+    if not demand.feasible:
+        text, remedy = infeasible(model, demand), "give knots that the model can follow"
         return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
-    if limited and found.share > 1.0:
-        text, remedy = too_fast(model, found), "make it slower or smaller"
+    if limited and demand.share > 1.0:
+        text, remedy = too_fast(model, demand), "make it slower or smaller"
         return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
-    bound = "the limits alone bound what it may ask" if limited else "nothing here bounds it"
+    bound = "only the input limits bound it" if limited else "there is no bound"
     text = f"at most, over {settings.horizon:g} s; {bound}"
     return holds(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number)
 
@@ -142,33 +142,33 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
     name = Topic.MONOTONE
     if not promise.linear:
-        return vacuous(name, _LINEAR, _BENT)
+        return vacuous(name, _LINEAR, _NOT_SMOOTH)
     A, P = promise.loop.linear.A, promise.loop.closed.P
     slope = P @ A + A.T @ P
     worst = float(np.linalg.eigvalsh(slope)[-1])
-    # Where a position does not enter the drift, A e = 0 and e'(P A + A'P) e = 0: the largest
-    # eigenvalue is then 0 at best, and rounding must not make it fail.
+    # If the drift does not depend on a position, A e = 0 and e'(P A + A'P) e = 0: the largest
+    # eigenvalue is then at least 0, which must pass despite rounding.
     number = worst, f"{worst:.3g}"
     if worst <= ZERO * max(1.0, float(np.abs(slope).max())):
         return holds(name, _LINEAR, "the drift does not expand P", *number)
-    found = obstacle(A[None])
-    if found is None:
-        remedy = "`monotone` or `inner-loop` find one, `riccati` does without"
-        return fails(name, _LINEAR, "this P does not", *number, remedy=remedy)
-    names = ", ".join(f"`{parts.model.state_names[k]}`" for k in found.states)
-    text = f"no P > 0 can: mode at {eigenvalue_text(found.eigenvalue)} 1/s along {names}"
-    remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
+    mode = obstacle(A[None])
+    if mode is None:
+        remedy = "`monotone` or `inner-loop` compute such a P, `riccati` does not need it"
+        return fails(name, _LINEAR, "not for this P", *number, remedy=remedy)
+    names = ", ".join(f"`{parts.model.state_names[k]}`" for k in mode.states)
+    text = f"for no P > 0: mode at {eigenvalue_text(mode.eigenvalue)} 1/s along {names}"
+    remedy = "an `inner-loop` gain makes it hold, `riccati` does not need it"
     return fails(name, _LINEAR, text, *number, remedy=remedy)
 
 
 def _printed_line(parts: Parts, promise: Promise) -> Statement:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
-    # It fails at any size for one reason: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
-    # 2 s |X v|^2 + O(s^2) > 0. Four followers show it, and eigenvalues cost the cube of their
-    # number.
-    few = list(parts.graph.followers[:4])
-    goals = np.asarray(parts.model.trim[0]) + parts.formation.offsets[few]
-    drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[few]
+    # It fails at any size: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
+    # 2 s |X v|^2 + O(s^2) > 0. Four followers suffice to show it, and the cost of eigenvalues grows
+    # with the cube of their number.
+    some = list(parts.graph.followers[:4])
+    goals = np.asarray(parts.model.trim[0]) + parts.formation.offsets[some]
+    drifts = goal_drifts(parts.model, parts.formation.offsets, parts.drive)[some]
     count, n = goals.shape
     values, vectors = np.linalg.eigh(promise.loop.closed.P)
     X = np.kron(np.eye(count), vectors @ np.diag(values**-0.5) @ vectors.T)
@@ -187,16 +187,17 @@ def _printed_line(parts: Parts, promise: Promise) -> Statement:
 def _finite_line(parts: Parts, promise: Promise) -> Statement:
     """Return the condition (xi_i - xi_j)'P (f(xi_i) - f(xi_j)) <= 0 on pairs of goals."""
     P, name = promise.loop.closed.P, Topic.FINITE
-    # Any multiple of P serves the law as well, with the coupling divided by it.
+    # The law is the same with a multiple of P and the coupling divided by it.
     P = P / float(np.linalg.eigvalsh(P)[0])
-    found = finite_condition(P, parts.model, parts.formation, parts.drive)
-    if found.verdict is Verdict.VACUOUS:
-        text = "f is the same at all goals, so that every P passes: it says nothing"
+    condition = finite_condition(P, parts.model, parts.formation, parts.drive)
+    if condition.verdict is Verdict.VACUOUS:
+        text = "f is the same at all goals, so every P passes"
         return vacuous(name, _PROOF, text, 0.0, "0 <= 0")
-    every = found.agents == parts.graph.agents
-    kind, number = _PROOF if every else Kind.SAMPLES, (found.largest, f"{found.largest:.3g}")
-    if found.verdict is Verdict.FAILS:
-        text = "goals of agents {} and {} drift apart in this P".format(*found.pair)
+    every = condition.agents == parts.graph.agents
+    kind, largest = _PROOF if every else Kind.SAMPLES, condition.largest
+    number = largest, f"{largest:.3g}"
+    if condition.verdict is Verdict.FAILS:
+        text = "goals of agents {} and {} drift apart in this P".format(*condition.pair)
         return fails(name, kind, text, *number, remedy="choose other offsets or P")
-    among = "" if every else f", for {found.agents} of {parts.graph.agents} agents"
-    return holds(name, kind, f"at the goals only{among}; it says nothing of other states", *number)
+    among = "" if every else f", for {condition.agents} of {parts.graph.agents} agents"
+    return holds(name, kind, f"only at the goals{among}, not in other states", *number)

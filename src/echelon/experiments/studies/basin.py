@@ -1,12 +1,13 @@
-"""Where a gain is seen to work: many starts in a slice of two states, run until they settle.
+"""Observed region of attraction: many starts in a slice of two states, simulated until they settle.
 
-Nothing here is proved. It stands beside the certified set to show how far that falls short.
+It is not a proof; compared with the certified set, it shows how conservative that set is.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from echelon.agents.models.linearization import linearize
 from echelon.agents.models.model import ControlAffine
@@ -23,83 +24,83 @@ from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.sequence import final_states
 from echelon.simulation.step.settings import Settings
 
-# Odd, so that the middle of a grid is the goal; two starts lie 1/20 of its half-width apart.
+# Odd, so that the centre of a grid is the goal; starts are 1/20 of the half-width apart.
 SIDE = 41
-_AGENTS = 6000  # followers of all starts together; a slice of larger graphs is coarser
-# Slower loops are not run for longer: what a start must fall to grows with the time that it has.
+_AGENTS = 6000  # followers of all starts together; the grid is coarser for larger graphs
+# Slower loops are not simulated for longer: the required decay is smaller for a shorter time.
 _STEPS = 3000
 _FARTHEST = 30.0  # in the states' units, and a half turn for angles
 
 
 class StateSlice(NamedTuple):
-    """Starts in which all followers deviate alike from their goals, in two states, and no other.
+    """Starts in which all followers have the same deviation from their goals, in two states only.
 
     Attributes:
         states: the indices of the two states.
-        form: (2, 2), with sum_i delta_i'P delta_i = s'form s for the deviation s.
-        reach: (2,) the largest deviations that are tried.
+        form: with sum_i delta_i'P delta_i = s'form s for the deviation s.
+        limits: the largest deviations that are tried.
     """
 
     states: tuple[int, int]
-    form: Array
-    reach: Array
+    form: Float[Array, "2 2"]
+    limits: Float[Array, "2"]
 
-    def extents(self, radius: float) -> Array:
-        """Return how far the ellipse s'form s = radius^2 reaches along both axes."""
+    def extents(self, radius: float) -> Float[Array, "2"]:
+        """Return the half-widths of the ellipse s'form s = radius^2 along both axes."""
         # The largest s_k on s'form s = r^2 is r sqrt((form^-1)_kk), by Lagrange's multipliers.
         return radius * np.sqrt(np.diag(np.linalg.inv(self.form)))
 
     @property
     def largest(self) -> float:
-        """The radius of the largest ellipse that is tried, where it lies within reach."""
-        return float((self.reach / self.extents(1.0)).max())
+        """The radius of the largest ellipse that is tried."""
+        return float((self.limits / self.extents(1.0)).max())
 
-    def ellipse(self, radius: float, points: int) -> Array:
-        """Return points (points, 2) of the ellipse of a radius."""
-        # With form = L L', s = L'^-1 y takes the circle |y| = r to s'form s = r^2.
+    def ellipse(self, radius: float, points: int) -> Float[Array, "points 2"]:
+        """Return points of the ellipse with a radius."""
+        # With form = L L', s = L'^-1 y maps the circle |y| = r to s'form s = r^2.
         angles = 2.0 * np.pi * np.arange(points) / points
-        round_ = np.column_stack([np.cos(angles), np.sin(angles)])
-        return radius * np.linalg.solve(np.linalg.cholesky(self.form).T, round_.T).T
+        circle = np.column_stack([np.cos(angles), np.sin(angles)])
+        return radius * np.linalg.solve(np.linalg.cholesky(self.form).T, circle.T).T
 
 
 class Trial(NamedTuple):
-    """The closed loop that the starts are run in: the leader rests at the trim.
+    """The closed loop in which starts are simulated, with the leader at rest at the trim.
 
-    A start counts as converged when after `horizon` its errors, in the metric of P, have fallen to
-    `fallen` of what they were: half as fast, in the logarithm, as the slowest mode falls.
+    A start has converged if after `horizon` its errors, in the metric of P, are at most `decay`
+    times the initial ones; the logarithm of `decay` is half that of the slowest mode.
     """
 
     parts: Parts
     loop: Loop
     dt: float
     steps: int
-    fallen: float
+    decay: float
 
     @property
     def horizon(self) -> float:
-        """How long each start is run, s."""
+        """The simulated time of each start, s."""
         return self.steps * self.dt
 
     @property
     def followers(self) -> int:
-        """How many followers start off their goals."""
+        """The number of followers, which start off their goals."""
         return len(self.parts.graph.followers)
 
 
 def trial(parts: Parts, settings: Settings) -> Trial:
-    """Return the closed loop of a stable gain, run for six times its slowest time constant."""
+    """Return the closed loop of a stable gain, simulated for six slowest time constants."""
     model, graph, dt = parts.model, parts.graph, settings.dt
     assert isinstance(parts.drive, Laws)
     rest = np.tile(np.asarray(model.trim[0], float), (graph.agents, 1))
     laws = Laws(TrimInput(), parts.drive.follower)
-    # Offsets that are symmetries move errors as none do, and a leader that rests excites nobody:
-    # what is left to see is the loop.
+    # Offsets that are symmetries do not change errors, and a leader at rest excites nobody: only
+    # the loop remains.
     alone = Parts(model, graph, Formation(np.zeros_like(rest)), laws, initial=rest)
     prepared = prepare(alone, settings)
     loop = assemble(prepared.problem, laws.leader, laws.follower)
     slow = -promise(parts, settings).loop.slowest
-    # After six time constants the slowest mode is at e^-6 = 1/400, and e^-3 = 1/20 is asked for:
-    # the transient before it may cost the rest.
+    # After six time constants the slowest mode has decayed to e^-6 = 1/400; e^-3 = 1/20 is
+    # required, which allows for a transient.
     steps = int(np.clip(np.ceil(6.0 / (slow * dt)), 1, _STEPS))
     return Trial(prepared.parts, loop, dt, steps, float(np.exp(-0.5 * slow * steps * dt)))
 
@@ -108,20 +109,20 @@ def slice_of(parts: Parts, states: tuple[int, int]) -> StateSlice:
     """Return the slice through the goals in two states, in the metric of the gain."""
     model, gain, followers = parts.model, parts.drive.gain, len(parts.graph.followers)
     assert gain is not None
-    trim, reach = np.asarray(model.trim[0], float), []
+    trim, limits = np.asarray(model.trim[0], float), []
     for k in states:
         angle = model.state_units[k] == "rad"
         low, high = model.chart.get(model.state_names[k], (-np.inf, np.inf))
-        # On the border of a chart f need not be finite, as at a pitch of 90 degrees.
-        room = 0.98 * min(high - trim[k], trim[k] - low)
-        reach.append(min(room, np.pi if angle else _FARTHEST))
-    # All deviate alike, so the sum over followers is one's form times their number.
-    return StateSlice(states, followers * gain.P[np.ix_(states, states)], np.array(reach))
+        # At the boundary of a chart f may be infinite, as at a pitch of 90 degrees.
+        inside = 0.98 * min(high - trim[k], trim[k] - low)
+        limits.append(min(inside, np.pi if angle else _FARTHEST))
+    # All deviations are equal, so the sum over followers is their number times one form.
+    return StateSlice(states, followers * gain.P[np.ix_(states, states)], np.array(limits))
 
 
 def side_of(followers: int) -> int:
-    """Return how many starts a side of the grid has, an odd number."""
-    # All starts run as one batch: side^2 times the followers is what memory and time depend on.
+    """Return the number of starts along a side of the grid, an odd number."""
+    # All starts are one batch: memory and time depend on side^2 times the followers.
     return int(np.clip(np.sqrt(_AGENTS / followers), 11, SIDE)) // 2 * 2 + 1
 
 
@@ -134,7 +135,7 @@ def observed_radius(run: Trial, plane: StateSlice) -> float:
     side = side_of(run.followers)
     radii = np.geomspace(1e-3 * plane.largest, plane.largest, side)
     rings = np.stack([plane.ellipse(r, side) for r in radii])
-    tried = np.all(np.abs(rings) <= plane.reach, axis=2)
+    tried = np.all(np.abs(rings) <= plane.limits, axis=2)
     # A start beyond reach becomes the goal, which converges: rings keep their shape, and what was
     # not tried counts against none.
     starts = np.where(tried[..., None], rings, 0.0).reshape(-1, 2)
@@ -144,35 +145,35 @@ def observed_radius(run: Trial, plane: StateSlice) -> float:
 
 
 def grid(plane: StateSlice, half: Array, side: int) -> tuple[Array, Array]:
-    """Return the two axes of a grid of starts, each symmetric about the goal."""
+    """Return the two axes of a grid of starts, symmetric about the goal."""
     return np.linspace(-half[0], half[0], side), np.linspace(-half[1], half[1], side)
 
 
-def converged(run: Trial, plane: StateSlice, starts: Array) -> Array:
-    """Return for deviations (S, 2) in a slice whether the followers converge, (S,) of bool."""
+def converged(run: Trial, plane: StateSlice, starts: Float[Array, "S 2"]) -> Bool[Array, " S"]:
+    """Return whether the followers converge from each deviation in a slice."""
     model, graph, gain = run.parts.model, run.parts.graph, run.parts.drive.gain
     assert gain is not None
     trim, shape = np.asarray(model.trim[0], float), (len(starts), graph.agents)
     deviations = np.zeros((*shape, len(trim)))
-    # Two advanced indices and a slice between would put the slice last.
+    # Two index arrays with a slice between them would move the slice to the end.
     for place, k in enumerate(plane.states):
         deviations[:, list(graph.followers), k] = starts[:, place, None]
 
-    def size(y: Array) -> Array:
+    def size(y: Float[Array, "S F n"]) -> Float[Array, " S"]:
         return np.sqrt(np.einsum("sfi,ij,sfj->s", y, gain.P, y))
 
     with precision("float64"), np.errstate(invalid="ignore", over="ignore"):
         ends = np.asarray(final_states(run.loop, jnp.asarray(trim + deviations), run.steps))
-        # A start on the goal stays there, and what is not finite has not converged.
-        fallen = size(ends - trim) <= run.fallen * size(deviations)
-        return fallen | ~starts.any(axis=1)
+        # A start at the goal stays there, and a run that is not finite has not converged.
+        decayed = size(ends - trim) <= run.decay * size(deviations)
+        return decayed | ~starts.any(axis=1)
 
 
 class Radii(NamedTuple):
-    """Both radii of sum_i delta_i'P delta_i, for a leader at rest at the trim, and the slice.
+    """The certified and the observed radius of sum_i delta_i'P delta_i, leader at rest at the trim.
 
-    `certified` is None where no set is; `observed` counts only starts of the slice, and `largest`
-    is where the trying ended.
+    `certified` is None without a certified set; `observed` concerns only starts in the slice, and
+    `largest` is the largest radius that was tried.
     """
 
     states: tuple[str, str]
@@ -182,54 +183,56 @@ class Radii(NamedTuple):
     horizon: float
 
     def sentence(self) -> str:
-        """Say both, side by side."""
-        proved = "none, since no set is certified"
+        """Return both radii in a sentence."""
+        certified = "none, since no set is certified"
         if self.certified is not None:
-            proved = "everywhere" if self.certified == np.inf else f"{self.certified:.3g}"
-        seen = f"{self.observed:.3g}" if self.observed < self.largest else "all that was tried,"
-        seen += "" if self.observed < self.largest else f" up to {self.largest:.3g}"
+            certified = "everywhere" if self.certified == np.inf else f"{self.certified:.3g}"
+        observed = f"{self.observed:.3g}"
+        if self.observed >= self.largest:
+            observed = f"all that was tried, up to {self.largest:.3g}"
         return (
-            f"Radius r of sum_i delta_i'P delta_i <= r^2, leader at rest: certified {proved}; "
-            f"observed {seen}, for starts in `{self.states[0]}` and `{self.states[1]}` alone, "
+            f"Radius r of sum_i delta_i'P delta_i <= r^2, leader at rest: certified {certified}; "
+            f"observed {observed}, for starts in `{self.states[0]}` and `{self.states[1]}` alone, "
             f"run for {self.horizon:.3g} s."
         )
 
 
-def chosen_slice(model: ControlAffine, asked: str | None) -> tuple[int, int]:
-    """Return the two states of a slice: those asked for, as `y,roll`, or a telling pair.
+def chosen_slice(model: ControlAffine, names: str | None) -> tuple[int, int]:
+    """Return the two states of a slice, from a text such as `y,roll`.
 
-    That is a velocity with the angle that drives it; where there is none, the first two coordinates
-    of the position, or the first two states.
+    The default is a velocity with the angle that drives it; without such a pair, the first two
+    coordinates of the position, or the first two states.
 
     Raises:
-        GainError: those asked for are not two different states of the model.
+        GainError: the text does not name two different states of the model.
     """
-    names = model.state_names
-    if asked is not None:
-        parts = [part.strip() for part in asked.split(",")]
+    states = model.state_names
+    if names is not None:
+        parts = [part.strip() for part in names.split(",")]
         for name in parts:
-            if name not in names:
+            if name not in states:
                 raise GainError(
-                    f"`--slice` names `{name}`, and the states are {listing(names)}"
-                    f"{did_you_mean(name, names)}."
+                    f"`--slice` names `{name}`, allowed are the states {listing(states)}"
+                    f"{did_you_mean(name, states)}."
                 )
         if len(set(parts)) != 2 or len(parts) != 2:
-            raise GainError(f"`--slice` is `{asked}`, and must be two states such as `y,roll`.")
-        return names.index(parts[0]), names.index(parts[1])
-    if len(names) < 2:
-        raise GainError(f"a slice needs two states, and `{type(model).__name__}` has one.")
-    return _telling(model)
+            raise GainError(
+                f"`--slice` is `{names}`, allowed are two different states such as `y,roll`."
+            )
+        return states.index(parts[0]), states.index(parts[1])
+    if len(states) < 2:
+        raise GainError(f"a slice needs two states, but `{type(model).__name__}` has one.")
+    return _default_slice(model)
 
 
-def _telling(model: ControlAffine) -> tuple[int, int]:
-    """Return a pair of states in which the loop is seen to work."""
+def _default_slice(model: ControlAffine) -> tuple[int, int]:
+    """Return a pair of states that are coupled by the dynamics."""
     groups = model.state_groups
     if "velocity" in groups and "attitude" in groups:
-        moved, turned = model.states_called("velocity"), model.states_called("attitude")
-        # A tilt turns the thrust aside: the angle with the largest entry of A is the one that
-        # drives a velocity.
-        push = np.abs(linearize(model).A[np.ix_(moved, turned)])
-        row, column = np.unravel_index(int(push.argmax()), push.shape)
-        return moved[row], turned[column]
-    places = model.position_indices()
-    return (places[0], places[1]) if len(places) > 1 else (0, 1)
+        velocities, angles = model.states_called("velocity"), model.states_called("attitude")
+        # A tilt deflects the thrust: the largest entry of A has the angle that drives a velocity.
+        entries = np.abs(linearize(model).A[np.ix_(velocities, angles)])
+        row, column = np.unravel_index(int(entries.argmax()), entries.shape)
+        return velocities[row], angles[column]
+    position = model.position_indices()
+    return (position[0], position[1]) if len(position) > 1 else (0, 1)

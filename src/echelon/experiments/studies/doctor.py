@@ -1,4 +1,4 @@
-"""Self-checks of an installation: versions, devices, and whether the physics holds here."""
+"""Self-checks of an installation: versions, devices, and known results of the simulation."""
 
 import importlib
 from collections.abc import Callable, Iterator
@@ -33,7 +33,7 @@ from echelon.synthesis.gains.riccati import Riccati
 
 
 class Check(NamedTuple):
-    """One self-check: what is claimed, whether it holds, and the number behind it."""
+    """One self-check: a claim, whether it holds, and the measured number."""
 
     claim: str
     holds: bool
@@ -62,17 +62,17 @@ def checks() -> Iterator[Check]:
         _closed_loop,
     )
     for test in tests:
-        # What an earlier command found says nothing of this machine as it is now.
+        # Results on disk may come from another machine or an earlier state of this one.
         with numerics.precision("float64"), disk_cache.use_folder(None):
             check = test()
         yield check
 
 
 def _double_precision() -> Check:
-    # In float32 it would be off by 1e-8.
+    # In float32 the error would be 1e-8.
     third = float(jnp.asarray(1.0) / 3.0)
     return Check(
-        "computing is in float64 without a flag",
+        "arithmetic is in float64 without a flag",
         third == 1.0 / 3.0,
         f"1/3 is off by {abs(third - 1 / 3):.1g}",
     )
@@ -80,28 +80,28 @@ def _double_precision() -> Check:
 
 def _precision_kept() -> Check:
     """Linearize in a float32 program."""
-    # Nobody else asks for this damping, so that no answer from before is handed out.
+    # No other code uses this damping, so the result is not cached.
     damping = 0.1234567890123
     with numerics.precision("float32"):
-        found = linearize(Pendulum(damping=damping)).A
+        A = linearize(Pendulum(damping=damping)).A
         after = jnp.asarray(1.0).dtype
-    off = abs(float(found[1, 1]) + damping)
+    off = abs(float(A[1, 1]) + damping)
     return Check(
-        "a float32 program gets float64 answers, and stays what it is",
+        "a float32 program gets float64 results, and stays in float32",
         off < 1e-15 and after == jnp.float32,
         f"A is off by {off:.1g}, and JAX is in {after} after it",
     )
 
 
 def _models() -> Check:
-    """Check every model of the list, by its own defaults where it has some."""
-    given = {"linear": {"A": ((0.0, 1.0), (0.0, 0.0)), "B": ((0.0,), (1.0,))}}
+    """Check every bundled model, with its default parameters if it has them."""
+    parameters = {"linear": {"A": ((0.0, 1.0), (0.0, 0.0)), "B": ((0.0,), (1.0,))}}
     faults = []
     for name, entry in registry.MODELS.items():
         module, _, cls = entry.target.partition(":")
         make: Callable[..., ControlAffine] = getattr(importlib.import_module(module), cls)
         try:
-            check_model(make(**given.get(name, {})))
+            check_model(make(**parameters.get(name, {})))
         except ModelError as error:
             faults.append(str(error))
     return Check(
@@ -131,8 +131,8 @@ def _order() -> Check:
         return jax.lax.fori_loop(0, steps, step, x)
 
     coarse, fine, finest = (end(steps) for steps in (20, 40, 80))
-    # Halving a step divides the error by 2^4, but for its next order: 3.8 leaves room for that and
-    # none for order 3.
+    # Halving a step divides the error by 2^4, up to the next order: 3.8 allows for that, but not
+    # for order 3.
     order = float(np.log2(jnp.linalg.norm(coarse - fine) / jnp.linalg.norm(fine - finest)))
     return Check("the Runge-Kutta step has order 4", order > 3.8, f"measured {order:.2f}")
 
@@ -143,7 +143,7 @@ def _flatness() -> Check:
 
     t = jnp.asarray(1.3)
     (x, u), (rate, _) = jax.jvp(partial(reference.follow, model), (t,), (jnp.ones_like(t),))
-    # An identity of the exact map, so that nothing but rounding may be left.
+    # An identity of the exact map, so the residual is rounding only.
     off = float(jnp.abs(rate - model.velocity(x, u)).max())
     return Check(
         "the quadrotor's flatness map solves its equations", off < 1e-9, f"residual {off:.1g}"
@@ -164,5 +164,5 @@ def _closed_loop() -> Check:
     settings = Settings(horizon=30.0, dt=0.01, store_every=10, steady_window=2.0)
     worst = metrics(simulate(parts, settings)).worst_steady or float("inf")
     return Check(
-        "two followers join a flying leader", worst < 1e-6, f"{worst:.1g} m off after 30 s"
+        "two followers join a flying leader", worst < 1e-6, f"error {worst:.1g} m after 30 s"
     )

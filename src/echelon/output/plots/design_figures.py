@@ -74,7 +74,7 @@ def _certified_set(
     certified, observed = None if found is None else found.radius, observed_radius(run, plane)
     named = (parts.model.state_names[states[0]], parts.model.state_names[states[1]])
     radii = Radii(named, certified, observed, plane.largest, run.horizon)
-    wide = np.minimum(plane.reach, plane.extents(1.8 * max(observed, 1e-2 * plane.largest)))
+    wide = np.minimum(plane.limits, plane.extents(1.8 * max(observed, 1e-2 * plane.largest)))
     panels = [wide]
     if certified and certified < np.inf and (plane.extents(certified) < 0.3 * wide).all():
         panels.append(plane.extents(1.5 * certified))
@@ -135,7 +135,7 @@ def _legend(figure: "Figure", ax: Any, radii: Radii, run: Trial) -> None:
         proved = "certified" + (" empty" if not radii.certified else f", r = {radii.certified:.3g}")
         proved = "certified everywhere" if radii.certified == np.inf else proved
     seen = f"all starts tried converge, r = {radii.observed:.3g}"
-    lost = f"error not below {100.0 * run.fallen:.2g} % after {run.horizon:.3g} s"
+    lost = f"error not below {100.0 * run.decay:.2g} % after {run.horizon:.3g} s"
     ink = _CERTIFIED if radii.certified else "none"
     handles: list[Any] = [
         Line2D([], [], color=ink, linewidth=1.5, label=proved),
