@@ -264,9 +264,9 @@ def test_the_pair_is_the_one_asked_for_or_a_telling_one():
     ("asked", "sentence"),
     [
         ("y,rol", "did you mean `roll`?"),
-        ("y", "must be two states such as `y,roll`."),
-        ("y,y", "must be two states such as `y,roll`."),
-        ("y,z,roll", "must be two states such as `y,roll`."),
+        ("y", "allowed are two different states such as `y,roll`."),
+        ("y,y", "allowed are two different states such as `y,roll`."),
+        ("y,z,roll", "allowed are two different states such as `y,roll`."),
     ],
 )
 def test_a_slice_that_is_none_is_one_sentence(asked, sentence):

@@ -95,7 +95,7 @@ REFUSED = {
     ),
     "a full weight": (
         lambda: ech.tune(carts(Q=[[1.0, 0.1], [0.1, 1.0]])),
-        "`follower.gain.Q` has entries off its diagonal",
+        "`follower.gain.Q` has off-diagonal entries",
     ),
     "another cost": (lambda: cost_named("formatio"), "`cost` names `formatio`, .* \\(did you mean"),
     "no number": (lambda: cost_named("x*effort"), "`cost` has the weight `x` for `effort`"),
