@@ -153,7 +153,7 @@ def test_a_swarm_is_compared_by_a_thousand_of_its_agents():
 
 
 def test_a_p_of_another_size_or_sign_is_refused():
-    with pytest.raises(ech.EchelonError, match=r"^`P` has shape \(2, 2\), and `Line1` needs"):
+    with pytest.raises(ech.EchelonError, match=r"^`P` has shape \(2, 2\), but `Line1` needs"):
         ech.finite_condition(np.eye(2), Line1(), goals(0.0, 1.0))
     with pytest.raises(ech.EchelonError, match="not positive definite"):
         ech.finite_condition(-np.eye(1), Line1(), goals(0.0, 1.0))

@@ -396,7 +396,7 @@ def test_values_are_read_and_written_as_on_the_command_line(text, values):
 
 
 FAULTS = {
-    "seed": "got no `key=values`, allowed is as in `seed=0..9`.",
+    "seed": "got no `key=values`, give them as in `seed=0..9`.",
     "seed=": "got no values, allowed are one or more.",
     "seed=9..0": "got `9..0`, a range must ascend.",
     "seed=1,1": "got `1` twice, give each value once.",
