@@ -28,7 +28,7 @@ def killing_line(parts: Parts, promise: Promise) -> Statement:
     residual, kind = killing_residual(parts.model, promise.loop.closed.P, domain)
     number = residual, f"{residual:.3g} 1/s"
     if kind is Kind.PROOF:
-        text = f"g is constant {where}: guarantees on a region hold for large errors too (T1)"
+        text = f"g is constant {where}: guarantees on a region are not local (T1)"
         return holds(Topic.KILLING, kind, text, *number)
     text = f"per unit of input, {where}: g varies, so guarantees are local (T2)"
     remedy = "use a model with its inputs as states, which has constant g"
