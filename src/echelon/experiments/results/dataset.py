@@ -3,14 +3,15 @@
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.files import write_atomic
+from echelon.core.types import JsonObject
 from echelon.experiments.results.foreseen import heard_in
-from echelon.experiments.results.labelled import Labelled
+from echelon.experiments.results.labelled import Labelled, Variables
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.results.metrics import (
     EdgeMetrics,
@@ -52,7 +53,7 @@ def dataset(result: Result) -> "xr.Dataset":
 def labelled(result: Result) -> Labelled:
     """Return the labelled arrays of `dataset`."""
     model, per_agent = result.model, ("time", "agent", "state")
-    variables: dict[str, Any] = {
+    variables: Variables = {
         "states": (per_agent, result.states),
         "error": (per_agent, result.errors),
         "inputs": (("time", "agent", "input"), result.inputs),
@@ -89,10 +90,10 @@ def recording_of(result: Result) -> Recording:
     return recording(data.arrays(), data.attributes)
 
 
-def _edges(result: Result) -> dict[str, Any]:
+def _edges(result: Result) -> Variables:
     """Return the edges of the graph, who receives along them, and their weights over time."""
     graph, schedule = result.graph, result.graph.schedule
-    variables: dict[str, Any] = {
+    variables: Variables = {
         "edge_agents": (("edge", "end"), graph.edges),
         "edge_weight": ("edge", graph.weights),
         "edge_heard": (("edge", "end"), heard_in(result.parts).astype(np.int8)),
@@ -111,11 +112,11 @@ def _output_units(model: ControlAffine) -> list[str]:
     return [units.get(name, "") for name in model.output_names]
 
 
-def _followed(result: Result) -> dict[str, Any]:
+def _followed(result: Result) -> Variables:
     """Return the reference and the leaders' tracking errors; nothing without a reference."""
     if result.reference is None:
         return {}
-    variables: dict[str, Any] = {"reference": (("time", "state"), result.reference)}
+    variables: Variables = {"reference": (("time", "state"), result.reference)}
     errors = [output_errors(result, leader) for leader in result.graph.leaders]
     errors = [error for error in errors if error is not None]
     if errors:
@@ -123,7 +124,7 @@ def _followed(result: Result) -> dict[str, Any]:
     return variables
 
 
-def _gain(result: Result) -> dict[str, Any]:
+def _gain(result: Result) -> Variables:
     """Return the gain; nothing without one."""
     gain = result.drive.gain
     if gain is None:
@@ -136,7 +137,7 @@ def _gain(result: Result) -> dict[str, Any]:
     }
 
 
-def _limits(result: Result) -> dict[str, Any]:
+def _limits(result: Result) -> Variables:
     """Return the limits of the inputs; nothing without limits."""
     limits = result.model.input_limits if result.settings.limits else None
     if limits is None:
@@ -146,7 +147,7 @@ def _limits(result: Result) -> dict[str, Any]:
     return {"limit_matrix": (("limit", "input"), matrix), **rows}
 
 
-def _poles(result: Result) -> dict[str, Any]:
+def _poles(result: Result) -> Variables:
     """Return the poles of the linearized loop; nothing where laws have none."""
     guarantee = promise(result.parts, result.settings)
     if not guarantee.linear:
@@ -162,7 +163,7 @@ def _poles(result: Result) -> dict[str, Any]:
     }
 
 
-def _attributes(result: Result) -> dict[str, Any]:
+def _attributes(result: Result) -> JsonObject:
     """Return provenance and settings as attributes that netCDF can hold."""
     settings = {**result.settings._asdict(), "steady_window": result.settings.window}
     settings = {key: int(v) if isinstance(v, bool) else v for key, v in settings.items()}
@@ -204,7 +205,7 @@ def save_dataset(run: "Result | Labelled | xr.Dataset", path: Path) -> None:
         write_atomic(path, bytes(data.to_netcdf(None, engine="h5netcdf")))
 
 
-def summary(result: Result, numbers: Metrics | None = None) -> dict[str, Any]:
+def summary(result: Result, numbers: Metrics | None = None) -> JsonObject:
     """Return the run's summary as JSON data; numbers that do not exist are None."""
     numbers = metrics(result) if numbers is None else numbers
     gain = result.drive.gain
@@ -260,7 +261,7 @@ def _distance_error(edge: EdgeMetrics) -> float:
     return np.inf if edge.distance_rmse is None else edge.distance_rmse
 
 
-def _follower(entry: dict[str, Any]) -> dict[str, Any]:
+def _follower(entry: JsonObject) -> JsonObject:
     return {
         "settling_time_s" if key == "settling_time" else key: value for key, value in entry.items()
     }

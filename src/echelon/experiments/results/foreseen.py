@@ -1,8 +1,7 @@
 """Recordings of a run before it is computed, and of each part while it is computed."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from echelon.agents.network.hearing import heard_along
 from echelon.core.numerics import precision
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.recording import InputBounds, Recording
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.record import Stretch
@@ -27,7 +26,7 @@ def foreseen(
     settings: Settings,
     states: Float[Array, "N n"],
     name: str,
-    promise: Mapping[str, Any],
+    promise: JsonObject,
 ) -> Recording:
     """Return a recording of agents that stay at their goals, by which the scene is sized.
 

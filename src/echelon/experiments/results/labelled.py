@@ -1,16 +1,19 @@
 """Labelled arrays: as plain arrays, as netCDF, or as an `xarray.Dataset`, which is slow to load."""
 
 import io
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 
 if TYPE_CHECKING:
     import h5netcdf
     import xarray as xr
+
+
+Variables: TypeAlias = dict[str, Any]
+"""Arrays with the names of their dimensions, by name."""
 
 
 class Labelled(NamedTuple):
@@ -22,9 +25,9 @@ class Labelled(NamedTuple):
         attributes: of the dataset.
     """
 
-    variables: Mapping[str, Any]
-    coordinates: Mapping[str, Any]
-    attributes: Mapping[str, Any]
+    variables: Variables
+    coordinates: Variables
+    attributes: JsonObject
 
     def dataset(self) -> "xr.Dataset":
         """Return the dataset."""
@@ -66,7 +69,7 @@ class Labelled(NamedTuple):
         ]
 
 
-def _whole(name: str, part: Any) -> tuple[tuple[str, ...], Array, dict[str, Any]]:
+def _whole(name: str, part: Any) -> tuple[tuple[str, ...], Array, JsonObject]:
     dimensions, values, *attributes = part if isinstance(part, tuple) else (name, part)
     names = (dimensions,) if isinstance(dimensions, str) else tuple(dimensions)
     return names, np.asarray(values), dict(*attributes)
@@ -77,7 +80,7 @@ def _write(
     name: str,
     dimensions: tuple[str, ...],
     values: Array,
-    attributes: Mapping[str, Any],
+    attributes: JsonObject,
 ) -> None:
     """Write one variable."""
     for dimension, size in zip(dimensions, values.shape, strict=True):

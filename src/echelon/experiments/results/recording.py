@@ -8,13 +8,14 @@ import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
+from echelon.core.types import JsonObject
 
 FORMAT = 3
 """Version of the format of `run.nc`; files of other versions are refused."""
@@ -102,10 +103,10 @@ class Recording:
     saturated: Float[np.ndarray, " N"]
     tracking: TrackingErrors | None
     modes: LoopPoles | None
-    promise: Mapping[str, Any]
+    promise: JsonObject
     horizon: float
     dt: float
-    attributes: Mapping[str, Any]
+    attributes: JsonObject
 
     @property
     def agents(self) -> int:
@@ -204,7 +205,7 @@ def read_recording(file: Path) -> Recording:
         ) from error
 
 
-def recording(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> Recording:
+def recording(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> Recording:
     """Return a run from the arrays and the attributes of its dataset.
 
     Raises:
@@ -248,7 +249,7 @@ def recording(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -
     )
 
 
-def _check_format(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
+def _check_format(arrays: Mapping[str, np.ndarray], attributes: JsonObject) -> None:
     if "states" not in arrays or "model" not in attributes:
         raise KeyError("it has no states of agents")
     version = int(attributes.get("format", 1))

@@ -139,7 +139,7 @@ def _check_scenario(scenario: object) -> None:
 
 
 def _with_laws(
-    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Any
+    scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Guide | None
 ) -> Experiment:
     """Return all parts, from the model, the graph and the reference."""
     formation = leader = follower = plant = None
@@ -336,7 +336,7 @@ def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass
                 )
 
 
-def _law(part: NamedClass, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
+def _law(part: NamedClass, offers: Mapping[str, object], model: ControlAffine, graph: Graph) -> Law:
     """Return the law of a scenario, completed and checked."""
     law = part.create(offers)
     with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
@@ -348,7 +348,7 @@ def _leader(
     faults: _Faults,
     model: ControlAffine,
     graph: Graph,
-    reference: Any,
+    reference: Guide | None,
     reaction: Gain | None,
 ) -> Law | None:
     spec = scenario.leader

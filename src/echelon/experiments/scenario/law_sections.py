@@ -111,7 +111,7 @@ _Rate = Annotated[Positive | None, Unit("1/s"), _STOPPING]
 _Speed = Annotated[Speed | None, Unit("the outputs' per s"), _STOPPING]
 
 
-def law_arguments(section: BaseModel) -> dict[str, Any]:
+def law_arguments(section: BaseModel) -> dict[str, object]:
     """Return the keys of a role that are arguments of its law, the gain excepted."""
     arguments = {key: getattr(section, key) for key in marked_keys(type(section)) if key != "gain"}
     return {key: value for key, value in arguments.items() if value is not None}
@@ -150,7 +150,7 @@ class LeaderSpec(BaseModel, **STRICT):
     """Gain of the leader's tracking, under `tracking` and `optimal-tracking`; default the model's
     Riccati gain."""
 
-    def inner_loop(self, follower: "FollowerSpec") -> dict[str, Any]:
+    def inner_loop(self, follower: "FollowerSpec") -> dict[str, object]:
         """Return the leader's roots or rate of the inner loop; without any, the followers'."""
         for arguments in (law_arguments(self), law_arguments(follower)):
             if arguments.keys() & {"roots", "rate"}:

@@ -42,12 +42,12 @@ def _rivals(path: KeyPath, part: Any) -> list[Any]:
     return [key for key in excluded if key in part and key != path[-1]]
 
 
-def _make_absolute(data: Any, path: KeyPath) -> None:
+def _make_absolute(data: object, path: KeyPath) -> None:
     for place, name, rest in named_files(_at(data, path), path):
         _at(data, place[:-1])[place[-1]] = f"{Path(name).resolve()}{rest}"
 
 
-def named_files(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, str, str]]:
+def named_files(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str, str]]:
     """Yield the path of every file name in plain data, the name, and the text after it."""
     if isinstance(value, dict | list):
         for key, item in value.items() if isinstance(value, dict) else enumerate(value):

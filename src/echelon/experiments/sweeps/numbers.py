@@ -4,13 +4,13 @@ A further number is one more entry of `NUMBERS`, or of `FollowerMetrics` for one
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import (
     ERROR,
     FollowerMetrics,
@@ -120,7 +120,7 @@ Columns = Mapping[str, Array]
 """Of some runs: an array (runs,) for each number, and (runs, agents) for those of an agent."""
 
 
-def numbers_of(result: Result, promise: Promise) -> dict[str, Any]:
+def numbers_of(result: Result, promise: Promise) -> JsonObject:
     """Return the numbers of a run; what does not exist is NaN."""
     numbers = metrics(result)
     agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_NUMBERS}
@@ -148,7 +148,7 @@ def numbers_of(result: Result, promise: Promise) -> dict[str, Any]:
     }
 
 
-def refused(why: str) -> dict[str, Any]:
+def refused(why: str) -> JsonObject:
     """Return the columns of a run whose parts cannot be built."""
     return {"outcome": REFUSED, "message": why}
 
@@ -157,7 +157,7 @@ def _number(value: float | None) -> float:
     return np.nan if value is None else float(value)
 
 
-def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
+def columns_of(rows: Sequence[JsonObject]) -> dict[str, Array]:
     """Return the columns of some runs, each with all names."""
     agents = max([0, *(len(row["saturated"]) for row in rows if "saturated" in row)])
     columns: dict[str, Array] = {

@@ -7,7 +7,8 @@ import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.provenance import versions
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
+from echelon.experiments.results.labelled import Variables
 from echelon.experiments.results.metrics import ERROR, Quantity
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis
@@ -48,7 +49,7 @@ def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
 
     agents = max([0, *(batch.columns["saturated"].shape[1] for batch in batches)])
     keys = [axis.key for axis in plan.axes]
-    variables: dict[str, Any] = {}
+    variables: Variables = {}
     for name, fill in (*_FILLS.items(), *((name, np.nan) for name in AGENT_NUMBERS)):
         inner = name in AGENT_NUMBERS
         whole = np.full((plan.count, agents) if inner else plan.count, fill)
@@ -66,7 +67,7 @@ def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
     return xr.Dataset(variables, coordinates, attributes)
 
 
-def _measure(variables: dict[str, Any]) -> None:
+def _measure(variables: Variables) -> None:
     """Replace the column of the errors' unit by an attribute of errors, if all runs have m."""
     units = {str(unit) for unit in variables.pop(UNIT)[1].ravel() if unit}
     for name, quantity in _QUANTITIES.items():
@@ -75,7 +76,7 @@ def _measure(variables: dict[str, Any]) -> None:
 
 
 _CODES = ("outcome", "promised")
-_FILLS: dict[str, Any] = {"outcome": MISSING, "promised": 0}
+_FILLS: Variables = {"outcome": MISSING, "promised": 0}
 _FILLS |= dict.fromkeys(NUMBERS, np.nan) | dict.fromkeys(WORDS, "")
 
 
@@ -98,9 +99,9 @@ def _values(axis: Axis) -> Array:
     return np.array(values, object)
 
 
-def _attributes(name: str) -> dict[str, Any]:
+def _attributes(name: str) -> JsonObject:
     quantity = _QUANTITIES.get(name, Quantity(_MEANINGS.get(name, "")))
-    attributes: dict[str, Any] = {"long_name": quantity.meaning} if quantity.meaning else {}
+    attributes: JsonObject = {"long_name": quantity.meaning} if quantity.meaning else {}
     if quantity.unit not in ("", ERROR):
         attributes["units"] = quantity.unit
     if name == "outcome":

@@ -2,9 +2,10 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 from echelon.core.errors import EchelonError, Outcome
+from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
@@ -61,7 +62,7 @@ class Workers:
         runs = [self._build(run) for run in self.plan.runs(first, count)]
         valid = [run for run in runs if not isinstance(run, str)]
         results, guarantees = self.runs.fly(valid, progress), _promises(valid)
-        rows = list[dict[str, Any]]()
+        rows = list[JsonObject]()
         for run in runs:
             result = run if isinstance(run, str) else next(results)
             guarantee = None if isinstance(run, str) else next(guarantees)
