@@ -1,4 +1,4 @@
-"""What is checked and made ready before a run, whatever drives it."""
+"""Checks and completes the parts of a run before it starts, whatever drives the agents."""
 
 from typing import NamedTuple
 
@@ -95,10 +95,10 @@ def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
 
 
 def check_given(parts: Parts, settings: Settings) -> None:
-    """Check what a run is asked for.
+    """Check the arguments of a run.
 
     Raises:
-        EchelonError: it is something else, or a number of the settings is out of range.
+        EchelonError: they are of another kind, or a number of the settings is out of range.
     """
     check_kind("parts", parts, Parts)
     check_kind("settings", settings, Settings)
@@ -106,10 +106,10 @@ def check_given(parts: Parts, settings: Settings) -> None:
 
 
 def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
-    """Check that what a run of so many agents stores has room, before anything is made for it.
+    """Check that memory suffices for what a run of so many agents stores.
 
     Raises:
-        SimulationError: it has not, and what would.
+        SimulationError: it does not; the text says how many frames would fit.
     """
     n, m = len(model.state_names), len(model.input_names)
     every = settings.store_every
@@ -130,7 +130,7 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
 
 
 def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
-    """Tell of offsets that the dynamics do not respect, and of goals that coincide."""
+    """Return warnings of offsets that break a symmetry of the model, and of equal goals."""
     broken = formation.broken_symmetries(model)
     sentences = [
         f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "
