@@ -47,7 +47,7 @@ extern "C" void run({T} *rows, long blocks, long steps) {{
 for (long step = 0; step < steps; step++) for (long b = 0; b < blocks; b++) {{
 {T} *at = rows + b * {size};
 """
-_INFIX = {"add": "+", "sub": "-", "apart": "-", "mul": "*", "div": "/", "over": "/"}
+_INFIX = {"add": "+", "sub": "-", "unfused_sub": "-", "mul": "*", "div": "/", "exact_div": "/"}
 _INFIX |= {"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
 _CALLS = {
     "fma": "{0} * {1} + {2}",

@@ -1,6 +1,6 @@
-"""What differs between formations that are stepped together, beside their states and offsets.
+"""Numbers that differ between formations stepped in one batch, besides states and offsets.
 
-Or between one formation now and later, where somebody turns its knobs.
+Or between one formation now and later, if its parameters are changed during a run.
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from typing import Any, final
 import equinox as eqx
 import jax
 import numpy as np
+from jax.tree_util import PyTreeDef
 
 from echelon.core.disk_cache import is_ours
 from echelon.core.memoize import bits_of
@@ -18,21 +19,21 @@ from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop
 
 
-def _apart(loop: Loop) -> list[Any]:
-    """Return the parts of a loop that have rows or draws of their own."""
+def _separate_parts(loop: Loop) -> list[Any]:
+    """Return the parts of a loop that have their own rows or draws."""
     return [loop.offsets, loop.meter.offsets, loop.meter.spacings, loop.motion.wind]
 
 
 def bare(loop: Loop) -> Loop:
-    """Return a loop without what has rows or draws of its own."""
-    # By hand, since `tree_at` walks the whole loop several times.
+    """Return a loop without the parts that have their own rows or draws."""
+    # Not by `tree_at`, which walks the whole loop several times.
     meter = dataclasses.replace(loop.meter, offsets=None, spacings=None)
     motion = dataclasses.replace(loop.motion, wind=None)
     return dataclasses.replace(loop, offsets=None, meter=meter, motion=motion)
 
 
 def is_number(leaf: Any) -> bool:
-    """Tell whether a leaf of a loop is made of real numbers."""
+    """Tell whether a leaf of a loop has real numbers."""
     return isinstance(leaf, float) or (
         isinstance(leaf, np.ndarray | jax.Array) and np.issubdtype(leaf.dtype, np.floating)
     )
@@ -40,27 +41,27 @@ def is_number(leaf: Any) -> bool:
 
 @final
 class VaryingNumbers:
-    """Numbers of loops that are alike but for them.
+    """Numbers of loops that differ only in them.
 
     Args:
-        loops: of the formations, alike in their trees and in all that is no number.
-        unlike: another such loop, which none of them is: where it differs others may yet come.
+        loops: of the formations, equal in their trees and in all leaves that are not numbers.
+        variant: another such loop: where it differs from the first, numbers may change later.
 
     Attributes:
         loop: the first.
         values: (loops, k) the numbers that differ, in the order of the tree.
     """
 
-    def __init__(self, loops: Sequence[Loop], unlike: Loop | None = None) -> None:
+    def __init__(self, loops: Sequence[Loop], variant: Loop | None = None) -> None:
         """Find the numbers that differ."""
         self._take(loops[0])
-        # By identity: runs that differ in their starts alone share one loop.
+        # By identity: runs that differ only in their initial states share one loop.
         distinct = list({id(loop): loop for loop in loops}.values())
         places = {id(loop): k for k, loop in enumerate(distinct)}
-        others = [] if unlike is None else [unlike]
-        flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in [*distinct[1:], *others])]
+        others = distinct[1:] + ([] if variant is None else [variant])
+        flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in others)]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
-        # At once: somebody may write to an array later, and code is made of what stands there now.
+        # Now: somebody may write to an array later, and code is generated from its present numbers.
         self._constant = self._fixed(self._flat)
         values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
@@ -70,13 +71,13 @@ class VaryingNumbers:
         self._flat, self._tree = jax.tree.flatten(bare(loop))
 
     def of(self, loop: Loop) -> Array:
-        """Return the numbers (k,) of a loop that is like the others."""
+        """Return the numbers (k,) of a loop that differs from the others only in them."""
         return self._values(jax.tree.leaves(bare(loop)))
 
     def _values(self, leaves: Sequence[Any]) -> Array:
         pairs = zip(leaves, self._masks, strict=True)
-        found = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
-        return np.concatenate([np.zeros(0), *found])
+        parts = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
+        return np.concatenate([np.zeros(0), *parts])
 
     @property
     def count(self) -> int:
@@ -84,22 +85,22 @@ class VaryingNumbers:
         return self.values.shape[1]
 
     def covers(self, loop: Loop) -> bool:
-        """Tell whether a loop is like the first but for these numbers."""
+        """Tell whether a loop differs from the first only in these numbers."""
         leaves, tree = jax.tree.flatten(bare(loop))
         forms = _forms(leaves, tree)
         same = forms == _forms(self._flat, self._tree) and _are_numbers(forms)
         return same and self._fixed(leaves) == self._constant
 
     def turn(self, loop: Loop) -> None:
-        """Take another loop that is like the first but for these numbers in its place."""
+        """Replace the loop by one that differs from it only in these numbers."""
         self._take(loop)
         self.values = self._values(self._flat)[None]
 
     @property
     def signature(self) -> Hashable:
-        """What decides the program, the same for other values; None where it cannot be told.
+        """What determines the program, equal for other values; None if that is not known.
 
-        As of a stranger's class, whose methods may be others when they are traced again.
+        It is not known of a user's class, whose methods may change before they are traced again.
         """
         forms = _forms(self._flat, self._tree)
         if not (_are_numbers(forms) and is_ours(self.loop)):
@@ -112,50 +113,50 @@ class VaryingNumbers:
         return key
 
     def _fixed(self, leaves: Sequence[Any]) -> list[bytes]:
-        """Return what says the leaves without the numbers that differ."""
+        """Return the bits of the leaves without the numbers that differ."""
         return [
             bits_of(np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf))
             for leaf, mask in zip(leaves, self._masks, strict=True)
         ]
 
     def leaves(self, entries: Array) -> list[Array]:
-        """Return the leaves in which something differs, of these entries where it does."""
-        found, at = list[Array](), 0
+        """Return the leaves in which numbers differ, with these entries in place of those."""
+        leaves, at = list[Array](), 0
         for leaf, mask in zip(self._flat, self._masks, strict=True):
             if not mask.any():
                 continue
             filled = np.asarray(leaf, float).astype(object)
             filled[mask] = entries[at : at + int(mask.sum())]
-            found.append(filled)
+            leaves.append(filled)
             at += int(mask.sum())
-        return found
+        return leaves
 
     def filled(self, leaves: Sequence[Any]) -> Loop:
-        """Return the loop with these leaves in the place of those in which something differs."""
+        """Return the loop with these leaves in place of those in which numbers differ."""
         if not leaves:
             return self.loop
-        given, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
-        new = self._tree.unflatten([next(given) if m.any() else leaf for leaf, m in pairs])
-        return eqx.tree_at(_apart, new, _apart(self.loop), is_leaf=lambda x: x is None)
+        new_leaves, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
+        new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
+        return eqx.tree_at(_separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None)
 
 
 def alike(loop: Loop, other: Loop) -> bool:
-    """Tell whether two loops are alike but for what stands in their leaves."""
+    """Tell whether two loops are equal except for the numbers in their leaves."""
     return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
 
 
-def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
+def _forms(leaves: Sequence[Any], tree: PyTreeDef) -> tuple[Any, ...]:
     arrays = [np.asarray(leaf) for leaf in leaves]
     return tree, *((array.dtype, array.shape) for array in arrays)
 
 
 def _are_numbers(forms: tuple[Any, ...]) -> bool:
-    """Tell whether the bits of leaves say what stands there; those of functions are addresses."""
+    """Tell whether the bits of leaves identify them; those of functions are addresses."""
     return not any(kind.hasobject for kind, _ in forms[1:])
 
 
 def _differing(leaves: Sequence[Any]) -> Array:
-    """Return which entries of a leaf are not the same in all loops."""
+    """Return which entries of a leaf are not equal in all loops."""
     if not is_number(leaves[0]) or len(leaves) == 1:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])

@@ -61,11 +61,11 @@ def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
     """Return both; the graph keeps what they share once."""
     g, eps, width = x.graph, EPS[x.graph.bits], 0.62  # (pi / 4)^2 is 0.617
     # Below, nothing is taken off, and no quarter is turned.
-    far = g.make("rare", _less(g.constant(0.61), x * x))
+    far = g.make("unlikely", _less(g.constant(0.61), x * x))
     # Adding 1.5 2^52 leaves the whole number nearest to x / (pi / 2) in the last bits.
     magic = 1.5 * 2.0 ** (52 if g.bits == 64 else 23)
     shifted = x * (2.0 / math.pi) + magic
-    r = choose(far, _reduce(x, g.make("apart", shifted, magic), PI / 2), x)
+    r = choose(far, _reduce(x, g.make("unfused_sub", shifted, magic), PI / 2), x)
     s = r * r
     sine = r + r * s * polynomial(s, economized(sine_series, width, eps))
     cosine = polynomial(s, economized(cosine_series, width, eps))
@@ -216,7 +216,7 @@ def atan2(y: Node, x: Node) -> Node:
         return whole
     # What lies ahead mostly does so by less than tan(pi/8): then the ratio is taken as it is.
     t = y / x
-    beside = y.graph.make("rare", _less(y.graph.constant(0.41**2), t * t))
+    beside = y.graph.make("unlikely", _less(y.graph.constant(0.41**2), t * t))
     return choose(beside, whole, signed(_small_angle(t), y))
 
 
@@ -279,7 +279,7 @@ def rsqrt(x: Node) -> Node:
         return exact
     half, y = 0.5 * x, g.make("root_guess", x)
     # Where x is 0, infinite, negative or subnormal, the guess is none.
-    far = g.make("rare", _less(0.05, size((half * y) * y - 0.5)))
+    far = g.make("unlikely", _less(0.05, size((half * y) * y - 0.5)))
     # Each step squares the error, and takes it half as often again: 0.034, 1.8e-3, 4.7e-6, 3e-11.
     for _ in range(4 if g.bits == 64 else 3):
         y = y * (1.5 - (half * y) * y)
@@ -331,7 +331,7 @@ def sign(x: Node) -> Node:
 def remainder(x: Node, y: Node) -> Node:
     """Return x - y trunc(x / y), exact while the quotient is small."""
     g = x.graph
-    quotient = g.make("over", x, y)
+    quotient = g.make("exact_div", x, y)
     rest = x - y * signed(g.make("floor", size(quotient)), quotient)
     # A quotient just below a whole number may be rounded to it, which takes one y too many.
     beyond = _less(rest * signed(g.constant(1.0), x), g.constant(0.0))
