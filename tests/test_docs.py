@@ -180,7 +180,12 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     head = "import numpy as np\nimport scipy.linalg\n\nimport echelon as ech\n\n\n"
     (package / "synthesis/gains/decay.py").write_text(head + code, "utf-8")
     added = re.findall(r"^ (.+)\n\+(.+)$", section.partition("## A reference")[0], re.MULTILINE)
-    files = ("synthesis/gains/__init__.py", "experiments/scenario/registry.py")
+    scenario = "experiments/scenario"
+    files = (
+        "synthesis/gains/__init__.py",
+        f"{scenario}/registry.py",
+        f"{scenario}/law_sections.py",
+    )
     for file, (above, line) in zip(files, added, strict=True):
         text = (package / file).read_text("utf-8")
         assert text.count(f"{above}\n") == 1
@@ -203,7 +208,7 @@ def test_the_gain_method_of_extending_is_at_home_in_three_places(tmp_path):
     )
     refused = call("--set", "follower.gain.Q=[1, 1]")
     assert refused.returncode == 2
-    said = "got a key that `decay` does not take, allowed beside it are `weight`, `coupling`."
+    said = "got a key that `decay` does not take, allowed are `coupling`, `weight`."
     assert refused.stderr.strip().endswith(f"--set follower.gain.Q=[1, 1]: {said}")
     refused = call("--set", "follower.gain.wait=1")
     assert "follower.gain.wait=1: got an unknown key" in refused.stderr

@@ -17,6 +17,9 @@ from typing import Any
 
 import pytest
 
+from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.named_class import resolve
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "echelon"
 
@@ -45,6 +48,7 @@ def is_folder(module: str) -> bool:
 
 def statements(node: ast.AST):
     """Yield the import statements that can run, those inside functions included."""
+    # Those under TYPE_CHECKING are for annotations alone.
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             for other in child.orelse:
@@ -90,6 +94,14 @@ def imports(module: str) -> dict[str, int]:
         for name in targets(module, node)
     ]
     return {target: line for target, line in pairs if target is not None}
+
+
+@cache
+def mentions(module: str) -> set[str]:
+    """The modules of echelon that a module imports at all, for annotations alone too."""
+    nodes = [n for n in ast.walk(tree(module)) if isinstance(n, ast.Import | ast.ImportFrom)]
+    found = {inside(name) for node in nodes for name in targets(module, node)}
+    return {target for target in found if target is not None} - {module}
 
 
 def loads(module: str) -> set[str]:
@@ -167,6 +179,21 @@ def test_no_import_cycle():
     assert set(sorter.static_order()) == set(PATHS)
 
 
+def test_no_cycle_even_among_imports_for_annotations():
+    sorter = graphlib.TopologicalSorter({module: mentions(module) for module in PATHS})
+    assert set(sorter.static_order()) == set(PATHS)
+
+
+def test_no_import_goes_up_not_even_for_annotations():
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
+    [layers] = [c["layers"] for c in contracts["contracts"] if c.get("containers") == ["echelon"]]
+    rank = {layer: -number for number, layer in enumerate(layers)}
+    edges = [(module, target) for module in PATHS for target in mentions(module)]
+    ranks = [(rank.get(module.split(".")[0]), rank.get(t.split(".")[0])) for module, t in edges]
+    up = [e for e, (a, b) in zip(edges, ranks, strict=True) if None not in (a, b) and a < b]
+    assert len(rank) > 8 and not up
+
+
 def test_folders_are_layers_and_packages():
     assert max(len(path.relative_to(PACKAGE).parts) for path in FILES) <= 3
 
@@ -191,6 +218,35 @@ def test_every_class_is_abstract_or_final():
         if base in classes() and not issubclass(base, BaseException) and not is_abstract(base)
     }
     assert not faults, "\n".join(sorted(faults))
+
+
+def test_only_the_tables_and_the_verifier_name_laws_and_methods():
+    """So that a new one needs its class, its entry in the registry and its keys, and no more."""
+    tables = ("experiments.scenario.registry", "experiments.scenario.law_sections")
+    names = {*registry.METHODS, *registry.FOLLOWER_LAWS, *registry.LEADER_LAWS}
+    # These words have another meaning: a number of a run, and a column of the paper's table.
+    others = {("tracking", ""), ("consensus", "output.reports")}
+    found = {
+        (node.value, module)
+        for module in PATHS
+        if module not in tables and not module.startswith("guarantees.verifier")
+        for node in literals(tree(module))
+        if node.value in names
+    }
+    # A method says its own name, which gain files hold.
+    own = {(resolve(entry).name, module_of_entry(entry)) for entry in registry.METHODS.values()}
+    found -= {
+        each for each in found for word, part in others if each[0] == word and part in each[1]
+    }
+    assert found == own
+
+
+def literals(node: ast.AST) -> list[ast.Constant]:
+    return [each for each in ast.walk(node) if isinstance(each, ast.Constant)]
+
+
+def module_of_entry(entry: registry.Entry) -> str:
+    return resolve(entry).__module__.removeprefix("echelon.")
 
 
 def test_importing_echelon_loads_nothing_heavy():
@@ -292,4 +348,4 @@ def test_dev_refuses_a_verb_it_does_not_have():
     command = [sys.executable, str(ROOT / "dev.py"), "dmeo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr.startswith("dev.py: `dmeo` is no verb.")
+    assert done.stderr.startswith("dev.py: `dmeo` is not a command.")

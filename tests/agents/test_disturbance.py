@@ -30,7 +30,7 @@ from echelon.experiments.results.dataset import dataset, summary
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import load_scenario, scenario_from_mapping
 from echelon.laws import Consensus, Tracking, TrimInput
 from echelon.output.reports.run_report import report

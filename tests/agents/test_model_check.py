@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model_family import MODELS
 from runs import simulate
-from test_models import FAMILY
 
 from echelon.agents.models import ControlAffine, SingleIntegrator
 from echelon.agents.models.linearization import at_trim
@@ -56,7 +56,7 @@ def told(model):
     return sentence
 
 
-@pytest.mark.parametrize("model", [*FAMILY.values(), Tank()], ids=[*FAMILY, "tank"])
+@pytest.mark.parametrize("model", [*MODELS.values(), Tank()], ids=[*MODELS, "tank"])
 def test_sound_agents_pass_without_a_word(model):
     assert checked(model) == ()
 

@@ -76,8 +76,8 @@ def test_a_fault_of_echelons_own_is_no_verdict(here, echelon, monkeypatch, comma
     code, out, err = echelon(command, "integrators")
     assert code == 70 and out == ""
     said = re.fullmatch(
-        r"echelon: this is a fault of echelon's own, and what you gave need not be wrong: "
-        r"ZeroDivisionError: nothing by nothing; the details are in `(.*)`\.\n",
+        r"echelon: internal error of echelon \(your input may be correct\): "
+        r"ZeroDivisionError: nothing by nothing\. Please report it with `(.*)`\.\n",
         err,
     )
     assert said is not None
@@ -91,7 +91,7 @@ def test_details_that_no_disk_takes_are_shown(monkeypatch, capsys):
         raise OSError("no room")
 
     monkeypatch.setattr(crash.tempfile, "NamedTemporaryFile", full)
-    assert "the details stand above" in crash.note_crash(ValueError("odd"))
+    assert "report it with the details above" in crash.note_crash(ValueError("odd"))
     assert "ValueError: odd" in capsys.readouterr().err
 
 
@@ -105,7 +105,7 @@ def test_a_screen_that_takes_no_more_is_told():
         open("/dev/full", "w") as full,
         started("list", stdout=full, stderr=subprocess.PIPE) as process,
     ):
-        assert process.communicate()[1].startswith("echelon: nothing more can be written: ")
+        assert process.communicate()[1].startswith("echelon: the output cannot be written: ")
     assert process.returncode == 2
 
 

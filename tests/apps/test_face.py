@@ -7,9 +7,9 @@ import subprocess
 
 import numpy as np
 import pytest
-from recordings import flown
+from oracles import rotation
+from recordings import as_file, flown
 from runs import made_up
-from test_figures import stored
 
 import echelon as ech
 from echelon.core.errors import MissingExtraError
@@ -26,7 +26,7 @@ def file(tmp_path_factory):
     """A stored run of four quadrotors."""
     path = tmp_path_factory.mktemp("stored") / "run.nc"
     run = dataclasses.replace(flown(seconds=1.0, rate=25.0), bounds=None)
-    path.write_bytes(stored(run, FORMAT))
+    path.write_bytes(as_file(run, FORMAT))
     return path
 
 
@@ -157,12 +157,9 @@ def test_the_camera_holds_the_whole_box_and_shows_near_things_larger(run):
 
 
 def test_rotations_are_those_of_roll_pitch_and_yaw():
-    from test_view import about
-
     for angles in np.random.default_rng(0).uniform(-3, 3, (5, 3)):
-        roll, pitch, yaw = angles
-        wanted = about(2, yaw) @ about(1, pitch) @ about(0, roll)
-        np.testing.assert_allclose(animation.rotations(angles[None])[0], wanted, atol=1e-12)
+        computed = animation.rotations(angles[None])[0]
+        np.testing.assert_allclose(computed, rotation(angles), atol=1e-12)
 
 
 def test_without_ffmpeg_a_sentence_says_how_to_get_it(monkeypatch):
@@ -177,7 +174,7 @@ def test_without_ffmpeg_a_sentence_says_how_to_get_it(monkeypatch):
     [
         (("run.avi",), "`run.avi` ends in `.avi`, and must end in .mp4 or .gif."),
         (("run.mp4", "--speed", "0"), "`--speed` is 0, and must be from 0.01 to 100."),
-        (("none/run.mp4",), "`none` is no folder to write `run.mp4` into."),
+        (("none/run.mp4",), "`none` is not a folder; create it first to write `none/run.mp4`."),
     ],
 )
 def test_a_video_that_cannot_be_is_refused(echelon, file, name, sentence):
@@ -210,7 +207,7 @@ def test_init_takes_a_new_folder_and_no_other(echelon, here):
         "echelon: `full` exists and is not empty; choose another name.\n"
     )
     code, _, fault = echelon("init", "my swarm")
-    assert code == 2 and "`my swarm` is no name for a scenario" in fault
+    assert code == 2 and "`my swarm` cannot name a scenario" in fault
     assert not (here / "my swarm").exists()
 
 

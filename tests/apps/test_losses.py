@@ -171,7 +171,7 @@ def test_a_killed_run_opens_as_stopped_and_goes_on_to_the_same_bits(here, echelo
     assert_same(here / "o", here / "again")
     np.testing.assert_array_equal(result.states, stored(here / "o")["states"][: len(result.times)])
     code, out, _ = echelon("run", "--resume", "o")
-    assert code == 0 and "is complete, and nothing is left to do" in out
+    assert code == 0 and "is complete; nothing to do" in out
 
 
 def interrupted(here, number, presses=1):
@@ -179,7 +179,7 @@ def interrupted(here, number, presses=1):
         wait_for(process, lambda: list(here.glob("o/chunks/*.npz")))
         process.send_signal(number)
         told = process.stderr.readline()
-        while told and "stopping after this chunk" not in told:
+        while told and "stopping and saving results" not in told:
             told = process.stderr.readline()
         for _ in range(presses - 1):
             process.send_signal(number)
@@ -189,7 +189,7 @@ def interrupted(here, number, presses=1):
 
 def test_interrupting_keeps_what_was_computed(here, echelon):
     code, out, told = interrupted(here, signal.SIGINT)
-    assert code == 130 and "stopping after this chunk" in told
+    assert code == 130 and "stopping and saving results" in told
     summary = json.loads((here / "o" / "summary.json").read_text())
     assert summary["outcome"]["name"] == "interrupted" and "was interrupted at t = " in out
     # The head of the table says what ran and not what was asked.
@@ -202,7 +202,7 @@ def test_interrupting_keeps_what_was_computed(here, echelon):
 @pytest.mark.slow
 def test_sigterm_is_an_interrupt(here):
     code, out, told = interrupted(here, signal.SIGTERM)
-    assert code == 143 and "stopping after this chunk" in told
+    assert code == 143 and "stopping and saving results" in told
     assert "was interrupted at t = " in out and (here / "o" / "run.nc").exists()
 
 
@@ -252,8 +252,8 @@ def run_on_a_full_disk(echelon, monkeypatch, seconds):
 
 def test_a_full_disk_shows_the_report_and_keeps_what_was_written(here, echelon, monkeypatch):
     assert run_on_a_full_disk(echelon, monkeypatch, 0.0).endswith(
-        "echelon: the folder `o` cannot be written: File too large; what was computed is kept, and "
-        "`echelon run --resume o` goes on.\n"
+        "echelon: `o` cannot be written: File too large; partial results are saved, and "
+        "`echelon run --resume o` continues.\n"
     )
     assert not list(here.rglob("*.part")) and not (here / "o" / "run.nc").exists()
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
@@ -264,7 +264,7 @@ def test_a_full_disk_shows_the_report_and_keeps_what_was_written(here, echelon, 
 def test_where_nothing_could_be_kept_nothing_is_said_to_be(here, echelon, monkeypatch):
     # The whole run is one stretch, which is larger than a file may be.
     told = run_on_a_full_disk(echelon, monkeypatch, np.inf)
-    assert told.endswith("File too large; nothing that was computed could be kept.\n")
+    assert told.endswith("File too large; no results could be saved.\n")
     assert not (here / "o").exists()
 
 
@@ -281,7 +281,7 @@ def test_a_disk_that_fills_while_a_run_lasts_ends_it_and_it_goes_on_later(
 
     monkeypatch.setattr(Chunks, "write", fill)
     code, out, err = echelon("run", "mine.yaml", *FRAMES, "--out", "o")
-    assert code == 2 and "cannot be written: File too large" in out and "goes on" in err
+    assert code == 2 and "cannot be written: File too large" in out and "continues" in err
     assert len(list(here.glob("o/chunks/*.npz"))) == 5
     monkeypatch.setattr(Chunks, "write", write)
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
@@ -337,7 +337,7 @@ def test_force_takes_nothing_that_echelon_did_not_write(here, echelon):
     (here / "figures").mkdir()
     (here / "figures" / "thesis.pdf").write_text("years of work")
     code, _, err = echelon("run", "mine.yaml", *FRAMES, "--out", ".", "--force")
-    assert code == 2 and "holds `figures`, which no run left there" in err
+    assert code == 2 and "holds `figures`, which echelon did not write" in err
     assert (here / "figures" / "thesis.pdf").read_text() == "years of work"
     assert echelon("run", "mine.yaml", "--no-figures")[0] == 0
     shutil.rmtree(here / "figures")
@@ -361,12 +361,12 @@ def test_a_changed_scenario_does_not_go_on(here, echelon):
     told["versions"]["jax"] = "0.1.0"
     begun.write_text(json.dumps(told))
     code, _, err = echelon("run", "--resume", "o")
-    assert code == 2 and "was begun under jax `0.1.0`, and this is" in err
+    assert code == 2 and "began with jax `0.1.0`, and" in err
     begun.write_text(before)
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
     for name in ("nowhere", "models"):
         code, _, err = echelon("run", "--resume", name)
-        assert code == 2 and f"`{name}` holds no run" in err
+        assert code == 2 and f"`{name}` holds no unfinished run" in err
 
 
 def test_a_refused_start_leaves_no_folder_and_says_where(here, echelon):
@@ -384,7 +384,7 @@ def test_design_overwrites_nothing(here, echelon):
     design = ["design", "mine.yaml", "--method", "riccati"]
     for more in ([], ["--force"]):
         code, _, err = echelon(*design, "--out", "mine.yaml", *more)
-        assert code == 2 and "is what is read here" in err
+        assert code == 2 and "is an input of this command" in err
     assert (here / "mine.yaml").read_text() == before
     assert echelon(*design, "--out", "gain.json")[0] == 0
     code, _, err = echelon(*design, "--out", "gain.json")
@@ -420,7 +420,7 @@ def test_a_comparison_that_is_interrupted_keeps_what_was_flown(here, echelon, mo
         code, out, err = echelon("compare", "integrators", *several, "--out", "o")
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert code == 143 and "stopping after this chunk" in err
+    assert code == 143 and "stopping and saving results" in err
     assert "it was not flown, since it was interrupted" in out
     assert [path.name for path in (here / "o" / "runs").iterdir()] == ["literal.nc"]
     assert (here / "o" / "comparison.json").exists()

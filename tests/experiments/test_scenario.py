@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sentences import LINES
 
 import echelon.experiments.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.part import accepted, resolve
+from echelon.experiments.scenario.checks import ROLES
+from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
+from echelon.experiments.scenario.named_class import accepted, resolve
 from echelon.experiments.scenario.registry import FORMATIONS, GRAPHS, METHODS, MODELS
 from echelon.experiments.scenario.scenario import (
     Fault,
@@ -23,26 +26,12 @@ from echelon.experiments.scenario.scenario import (
     load_scenario,
     scenario_from_mapping,
 )
+from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import read_yaml
 
 FOLDER = Path(echelon.experiments.scenario.scenario.__file__).parent
 
-# Each line of this file stands alone, so that a test replaces one and knows its number.
-LINES = {
-    "name": "name: paper",
-    "model": "model: {name: quadrotor, parameters: crazyflie}",
-    "graph": "graph: {edges: [[0, 1], [1, 2], [1, 3]], leaders: [0]}",
-    "formation": "formation: {offsets: {1: [1, 0, 0], 2: [1, 0.8, 0], 3: [1, -0.8, 0]}}",
-    "reference": "reference: {name: lemniscate, center: [0.25, 0.25, 1.0], amplitude: [1.25, 3.54],"
-    " rate: 0.646}",
-    "leader": "leader: {law: tracking, reacts: false, start_error: {x: -1.344, y: 0.530}}",
-    "follower": "follower: {law: consensus, gain: {method: riccati}, feedforward: relay}",
-    "initial": "initial: {spread: {position: 1.0, attitude: 0.3}}",
-    "simulation": "simulation: {horizon: 60.0, dt: 0.005, integrator: rk4, limits: true,"
-    " store_every: 10}",
-    "report": "report: {steady_window: 10.0}",
-    "seed": "seed: 0",
-}
 FOLDER_NAME = "text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"
 NUMBER = {name: number for number, name in enumerate(LINES, start=1)}
 
@@ -234,31 +223,36 @@ def test_further_sections_that_are_accepted(load, override):
     assert load(override).place(override.split("=")[0].split(".")[0])
 
 
-def test_the_tables_of_choices_cover_the_registry():
-    checks = echelon.experiments.scenario.checks
-    assert set(checks._GRAPH_KEYS) == {"edges", *GRAPHS}
-    assert set(checks._FORMATION_KEYS) == {"offsets", *FORMATIONS}
+@pytest.mark.parametrize("section", [GraphSpec, FormationSpec, GainSpec, LeaderSpec, FollowerSpec])
+def test_keys_belong_to_choices_that_exist(section):
+    choices = {
+        GraphSpec: {"edges", *GRAPHS},
+        FormationSpec: {"offsets", *FORMATIONS},
+        GainSpec: {*METHODS},
+        LeaderSpec: {*registry.LEADER_LAWS},
+        FollowerSpec: {*registry.FOLLOWER_LAWS},
+    }[section]
+    assert {name for mark in marked_keys(section).values() for name in mark.choices} <= choices
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_the_table_of_methods_says_what_their_classes_say(name):
-    entry, method = METHODS[name], resolve(METHODS[name])
+def test_a_method_takes_the_keys_that_its_class_takes(name):
+    method, marks = resolve(METHODS[name]), marked_keys(GainSpec)
     arguments = [field.name for field in dataclasses.fields(method)]
-    assert method.name == name and method.needs == entry.needs
-    assert sorted([*entry.needs, *entry.takes]) == sorted(arguments)
-    assert {*method.usual} <= {*method.needs}
+    assert sorted(key for key, mark in marks.items() if name in mark.choices) == sorted(arguments)
+    assert {key for key, mark in marks.items() if name in mark.needed_by} == {*method.needs}
+    assert method.name == name and {*method.usual} <= {*method.needs}
 
 
 @pytest.mark.parametrize("role", ["leader", "follower"])
-def test_the_table_of_laws_says_what_their_classes_say(role):
-    for name, entry in getattr(registry, f"{role.upper()}_LAWS").items():
-        stopping = ("roots", "rate", "coupling", "speed", "observer")
-        offered = {
-            "leader": ("gain", *stopping),
-            "follower": ("gain", "feedforward", "trim", "frame", *stopping, "hears"),
-        }[role]
-        taken = set(accepted(resolve(entry))) & {*offered}
-        assert {*entry.needs, *entry.takes} == taken, name
+def test_a_law_takes_the_keys_that_its_class_takes(role):
+    section, laws = ROLES[role]
+    for name, entry in laws.items():
+        taken = {key for key, mark in marked_keys(section).items() if name in mark.choices}
+        assert taken == set(accepted(resolve(entry))) & marked_keys(section).keys(), name
+        if role == "leader":
+            follows = "reference" in accepted(resolve(entry))
+            assert follows == (name in registry.TRACKING_LAWS), name
 
 
 def test_yaml_1_2_decides_what_a_word_is(load, refused):
@@ -266,23 +260,6 @@ def test_yaml_1_2_decides_what_a_word_is(load, refused):
     assert refused("simulation.limits=no") == [
         "--set simulation.limits=no: got `no`, allowed is `true` or `false`."
     ]
-
-
-def planted():
-    """Pairs of a faulty line and its sentence."""
-    text = (Path(__file__).parents[1] / "scenario_faults.txt").read_text("utf-8")
-    text = re.sub("<([A-Z_]+)>", lambda table: listing(getattr(registry, table[1])), text)
-    blocks = [block.splitlines() for block in text.split("\n\n") if not block.startswith("#")]
-    assert len(blocks) > 90
-    return [pytest.param(line, fault, id=line) for line, fault in blocks]
-
-
-@pytest.mark.parametrize(("line", "fault"), planted())
-def test_every_fault_is_one_sentence_with_its_line(refused, line, fault):
-    key = line.partition(":")[0]
-    # a reference that is gone is told at the law that needs it, and so the other way round
-    at = {"reference:": "leader", "leader: {law: passive}": "reference"}.get(line, key)
-    assert refused(**{key: line}) == [f"s.yaml:{NUMBER[at]}: {fault}"]
 
 
 @pytest.mark.parametrize("key", ["name", "model", "graph", "simulation"])
@@ -585,5 +562,7 @@ def test_a_named_set_of_parameters_may_be_changed(load):
         with pytest.raises(echelon.EchelonError) as caught:
             echelon.build(load(f"model={{name: quadrotor, parameters: {parameters}}}"))
         assert said in str(caught.value)
-    with pytest.raises(echelon.EchelonError, match="`pendulum` has no named parameter sets"):
+    with pytest.raises(
+        echelon.EchelonError, match="got the parameter set `small`, but `pendulum` has none"
+    ):
         echelon.build(load("model={name: pendulum, parameters: {set: small}}"))

@@ -530,7 +530,7 @@ def test_a_sweep_writes_its_folder_and_is_complete(here):
     assert {path.name for path in (here / "o").iterdir()} == names
     assert "3 runs: 3 completed." in (here / "o" / "sweep.txt").read_text()
     again = CliRunner().invoke(app, ["sweep", "--resume", "o"])
-    assert again.exit_code == 0 and "nothing is left to do" in again.output
+    assert again.exit_code == 0 and "nothing to do" in again.output
     over = CliRunner().invoke(app, call)
     assert "is not empty" in str(over.exception)
 

@@ -117,19 +117,19 @@ SENTENCES = {
     "a class that is not there": (
         {"follower": {"law": {"python": "mine.py:Pul"}}},
         "follower",
-        "`Pul` in `{folder}/mine.py` is no `Law` class; it has `Pull`, `Steer`, `Restless` (did "
+        "`Pul` in `{folder}/mine.py` is not a `Law` class; it has `Pull`, `Steer`, `Restless` (did "
         "you mean `Pull`?).",
     ),
     "a class of another kind": (
         {"reference": {"python": "mine.py:Pull"}},
         "reference",
-        "`Pull` in `{folder}/mine.py` is no `Reference` class; it has `Ray`.",
+        "`Pull` in `{folder}/mine.py` is not a `Reference` class; it has `Ray`.",
     ),
     "a key that a law of one's own does not take": (
         {"follower": {"law": {"python": "mine.py:Pull"}, "gain": {"method": "riccati"}}},
         "follower.gain",
-        "got a key that the law `mine.py:Pull` does not take, allowed are those that its class "
-        "names.",
+        "got a key that the law `mine.py:Pull` does not take, allowed are the arguments "
+        "of its class.",
     ),
     "a file that is not there": (
         {"follower": {"gain": {"python": "yours.py:Heavy"}}},
@@ -146,13 +146,12 @@ SENTENCES = {
     "a value that the reference refuses": (
         {"reference": {"python": "mine.py:Ray", "velocity": [1, 2, 3]}},
         "reference",
-        "`mine.py:Ray` cannot be made with these parameters: ValueError: `velocity` must be two "
-        "numbers.",
+        "`mine.py:Ray` refuses these parameters: ValueError: `velocity` must be two numbers.",
     ),
     "a reference that nobody takes": (
         {"leader": {"law": {"python": "mine.py:Pull"}}},
         "leader",
-        "there is a `reference`, and the law `mine.py:Pull` takes none.",
+        "got a `reference`, but the law `mine.py:Pull` takes none.",
     ),
     "a method that fails": (
         {"follower": {"gain": {"python": "mine.py:Fails"}}},
@@ -235,7 +234,7 @@ def test_keys_that_only_another_law_takes_give_way_to_a_law_on_the_command_line(
         ech.load_scenario("paper", ["follower.law=passive", "follower.gain.coupling=2"])
     assert str(caught.value) == (
         "--set follower.gain.coupling=2: follower.gain: got a key that `passive` does not take, "
-        "allowed beside it is no other key."
+        "it takes no keys."
     )
 
 

@@ -11,6 +11,7 @@ import pytest
 import echelon as ech
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.registry import METHODS
 
 # ---- all tellers say the same ----
@@ -27,9 +28,8 @@ ATTITUDE = "{attitude: 0.1, rate: 0.2, thrust: 0.5}"
 def changes(scenario, method, feedforward):
     """What makes of a bundled scenario one with this method and feed-forward, and little to run."""
     text = f"method: {method}"
-    if METHODS[method].needs:
-        needs = {"P": "identity", "rate": "0.05", "domain": DOMAINS.get(scenario, ATTITUDE)}
-        text += "".join(f", {key}: {needs[key]}" for key in METHODS[method].needs)
+    needs = {"P": "identity", "rate": "0.05", "domain": DOMAINS.get(scenario, ATTITUDE)}
+    text += "".join(f", {key}: {needs[key]}" for key in resolve(METHODS[method]).needs)
     own = ech.load_scenario(scenario)
     return [
         f"follower.gain={{{text}}}",

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import echelon as ech
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 from echelon.guarantees.verifier.algebra import (
     ends_of_many,
     grounded_rows,

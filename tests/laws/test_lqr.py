@@ -203,10 +203,10 @@ def test_a_scenario_names_a_path_of_states_by_its_file(tmp_path):
     ("change", "said"),
     [
         ("reference.file=none.csv", "is no line of names with lines of numbers below it"),
-        ("reference={name: circle, file: swing.csv}", "`circle` is made of its keys, and is read"),
+        ("reference={name: circle, file: swing.csv}", "`circle` does not read files"),
         ("model={name: van-der-pol}", "has the columns `rate`, `t`, `angle`, `torque`, and `Van"),
         ("reference={name: states, times: [0, 0], states: [[0]], inputs: [[0]]}", "increasing"),
-        ("leader={law: lqr, reacts: true}", "the law `lqr` cannot be told to react"),
+        ("leader={law: lqr, reacts: true}", "the law `lqr` cannot react to neighbours"),
         ("reference={name: states, file: swing.csv, times: [0, 1]}", "got `file` and `times`"),
     ],
 )

@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 from echelon.core.errors import GainError
 from echelon.core.numerics import INTEGRATORS
+from echelon.core.rational import bisect
 from echelon.core.types import Array
 
 _DEGREE = 18  # of Taylor's polynomial: at norm 1 its remainder is 1e-17
@@ -91,12 +92,8 @@ def longest_step(
         dt *= 1.1
         if dt > end:
             return float("inf")
-    low, high = dt, 1.1 * dt
     # 20 halvings of a tenth leave 1e-7 of the step.
-    for _ in range(20):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if decays(middle) else (low, middle)
-    return float(low)
+    return float(bisect(decays, dt, 1.1 * dt, 20))
 
 
 def eigenvalue_text(eigenvalue: complex) -> str:

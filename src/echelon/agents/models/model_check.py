@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from echelon.agents.models.heading import check_heading
+from echelon.agents.models.heading_symmetry import check_heading
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine, Limits
 from echelon.core.compiled import cached_jit

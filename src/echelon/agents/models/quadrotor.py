@@ -3,7 +3,6 @@
 It has the gravity and the thrust rotation that the paper's equations leave out.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,18 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.airframe import Airframe
-from echelon.agents.models.heading import Heading
-from echelon.agents.models.model import (
-    ControlAffine,
-    FlatBound,
-    FlatChains,
-    Flattened,
-    Limits,
-    Rows,
-    check_positive,
-    diagonal,
-    wound,
-)
+from echelon.agents.models.model import Flattened, Limits, Rows, check_positive, diagonal
 from echelon.agents.models.rigid_body import (
     attitude_along,
     body_axes,
@@ -35,9 +23,10 @@ from echelon.agents.models.rigid_body import (
     free_spin,
     thrust_axis,
 )
+from echelon.agents.models.rigid_vehicle import UPRIGHT, RigidVehicle
 from echelon.agents.models.rotors import attitude_priority, fits
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import Input, InputMap, State
 
 _IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
 """Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015); no other propellers' is published."""
@@ -77,7 +66,7 @@ _LEFT = (1.0, 1.0, -1.0, -1.0)
 _SPIN = (1.0, -1.0, 1.0, -1.0)
 
 
-class Quadrotor(ControlAffine):
+class Quadrotor(RigidVehicle):
     """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles.
 
     pdot = v, vdot = -g e3 + R(zeta) e3 T / m,
@@ -103,17 +92,9 @@ class Quadrotor(ControlAffine):
     allow_unphysical: bool = eqx.field(default=False, static=True)
 
     state_names = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
-    state_units = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
     input_names = ("thrust", "torque_x", "torque_y", "torque_z")
     input_units = ("N", "N m", "N m", "N m")
-    output_names = ("x", "y", "z", "yaw")
-    position = ("x", "y", "z")
-    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
-    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
-    flat_outputs = ("x", "y", "z", "yaw")
-    # The path's second derivative sets the attitude, whose second derivative is the torque.
-    flat_order = 4
-    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
+    flat_bounds = UPRIGHT
     state_groups = {
         "position": ("x", "y", "z"),
         "velocity": ("vx", "vy", "vz"),
@@ -125,8 +106,6 @@ class Quadrotor(ControlAffine):
     # A tilt turns the thrust into the direction that weighs 500: with a weight of 1 for it the
     # fastest mode goes from 143 1/s at hover to 706 1/s at 30 degrees.
     symmetry_inputs = (4.0, 1.0, 1.0, 1.0)
-    # One over the square of what counts as much: 1 m, 2 m/s, 0.7 rad, 5 rad/s; 5 m/s^2, 20 rad/s^2.
-    weights = ((1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3, (1 / 25,) + (1 / 400,) * 3)
 
     @classmethod
     def named(cls, name: str, **changes: Any) -> "Quadrotor":
@@ -151,7 +130,7 @@ class Quadrotor(ControlAffine):
 
     def __check_init__(self) -> None:
         """Refuse parameters that no vehicle can have."""
-        names = ("mass", "gravity", "arm", "motor_thrust", "torque_per_thrust")
+        names = ("mass", "arm", "motor_thrust", "torque_per_thrust")
         check_positive(self, **{name: getattr(self, name) for name in names})
         check_moments(self, self.inertia)
         if not self.allow_unphysical:
@@ -215,14 +194,6 @@ class Quadrotor(ControlAffine):
         spin = jnp.pad(jnp.diag(1.0 / jnp.asarray(self.inertia, x.dtype)), ((0, 0), (1, 0)))
         return jnp.concatenate([nothing, lift, nothing, spin])
 
-    def output(self, x: State) -> Output:
-        """Return position and yaw."""
-        return jnp.concatenate([x[:3], x[8:9]])
-
-    def difference(self, x: State, y: State) -> State:
-        """Return x - y with the angles the shorter way round."""
-        return wound(x - y, 6, 7, 8)
-
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).
 
@@ -246,12 +217,6 @@ class Quadrotor(ControlAffine):
             jnp.concatenate([position, velocity, attitude(now), omega]),
             jnp.concatenate([thrust[None], torque]),
         )
-
-    @property
-    def flat_bounds(self) -> tuple[FlatBound, ...]:
-        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three can pass 0 unless it does.
-        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
 
     def flatten(self, x: State, e: jax.Array) -> Flattened:
         """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""

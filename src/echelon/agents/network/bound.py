@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from echelon.core.rational import float_below
 from echelon.core.types import Array
 
 _EFFORT = 1200
@@ -67,8 +68,7 @@ def least_eigenvalue_bound(matrix: Grounded, vector: Array, near: float) -> floa
         # Inverse iteration: L^-1 has positive entries only, so x stays positive.
         tried = _solve(matrix, tried)
         best, above = _quotients(matrix, tried)
-    down = float(best)
-    return down if Fraction(down) <= best else float(np.nextafter(down, -np.inf))
+    return float_below(best)
 
 
 def rounded_bound(matrix: Grounded, x: Array) -> float:

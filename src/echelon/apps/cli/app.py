@@ -1,4 +1,4 @@
-"""The command line: its commands in the order of `--help`, and how errors leave it.
+"""The command line: its commands in the order of `--help`, and the exit code of each error.
 
 Heavy modules are imported inside each command, so that `--help` is quick.
 """
@@ -6,10 +6,11 @@ Heavy modules are imported inside each command, so that `--help` is quick.
 import contextlib
 import errno
 import functools
+import logging
 import os
 import sys
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -39,13 +40,13 @@ from echelon.core import disk_cache
 from echelon.core.errors import EchelonError, ModelError
 
 _EPILOG = (
-    "Exit codes: 0 done, or promised; 1 not promised, refused by verify or doctor, or an agent "
-    "left the chart of its equations; 2 bad input, or a file that cannot be written; 3 diverged; "
-    "4 an optional part is not installed; 5 verified as far as it could be checked; 70 a fault of "
-    "echelon's own; 130 ended by Ctrl-C and 143 by SIGTERM, what was computed kept; "
-    "141 done, and the reader of the output left before its end. "
-    "ECHELON_CACHE names the folder where compiled code, and what is proved and found of bundled "
-    "parts, is kept between runs; `off` keeps none."
+    "Exit codes: 0 success; 1 nothing is guaranteed, verify or doctor refused, or an agent left "
+    "the domain of its equations; 2 invalid input, or a file that cannot be written; 3 diverged; "
+    "4 an optional dependency is missing; 5 verify could not check every claim; 70 internal error "
+    "of echelon; 130 stopped by Ctrl-C and 143 by SIGTERM, with results saved; "
+    "141 success, but the reader of the output closed it early. "
+    "ECHELON_CACHE names the folder for compiled code and proofs of bundled parts; "
+    "`off` disables it."
 )
 
 app = typer.Typer(
@@ -54,13 +55,15 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=_EPILOG,
-    help="Formation tracking by consensus: synthesize gains, simulate swarms, "
-    "say what is promised.",
+    help="Leader-follower formation control by consensus: design gains, simulate swarms, "
+    "compute guarantees.",
 )
 
 
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
+    # Where the home folder is read-only, matplotlib prints two lines about its cache.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     folder = keep_compiled_code(os.environ)
     with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:
@@ -68,10 +71,10 @@ def main() -> None:
         except EchelonError as error:
             _leave(str(error), error.exit_code)
         except Ended:
-            _leave("ended before anything was computed, or left to write.", STOP.exit_code)
+            _leave("stopped; there were no results to save.", STOP.exit_code)
         except Exception as error:
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-                _leave(f"nothing more can be written: {error.strerror}.", EchelonError.exit_code)
+                _leave(f"the output cannot be written: {error.strerror}.", EchelonError.exit_code)
             _leave(note_crash(error), CRASHED)
 
 
@@ -79,7 +82,7 @@ def _call() -> None:
     try:
         app()
     finally:
-        # Here, since what fails after `main` has no exit code of ours.
+        # Here, since a failure after `main` would get an exit code of Python.
         sys.stdout.flush()
 
 
@@ -91,12 +94,8 @@ def _leave(sentence: str, code: int) -> None:
 @app.callback(invoke_without_command=True)
 def _about(
     context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version and leave.")
-    ] = False,
-    quiet: Annotated[
-        bool, typer.Option("-q", "--quiet", help="Print nothing but what goes wrong.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    quiet: Annotated[bool, typer.Option("-q", "--quiet", help="Print errors only.")] = False,
 ) -> None:
     if quiet:
         nowhere = context.with_resource(open(os.devnull, "w"))
@@ -106,24 +105,24 @@ def _about(
         raise typer.Exit()
 
 
-def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command that a file of the user's cannot end."""
+def _guarded(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that a user's file cannot end by `sys.exit`."""
 
     @functools.wraps(command)
-    def call(*args: Any, **named: Any) -> Any:
+    def call(*args: object, **options: object) -> None:
         try:
-            return command(*args, **named)
-        # Typer's own way out is another exception.
+            command(*args, **options)
+        # Typer itself leaves by another exception.
         except SystemExit as error:
             raise ModelError(
-                f"a file that the scenario names calls `sys.exit({error.code!r})`, and must not."
+                f"a file of the scenario calls `sys.exit({error.code!r})`; remove that call."
             ) from error
 
     return call
 
 
-# Listed here and not decorated at home, so that a command's file knows nothing of the program.
-_COMMANDS: tuple[Callable[..., Any], ...] = (
+# Listed here instead of decorated in their files, so that the order is that of `--help`.
+_COMMANDS: tuple[Callable[..., None], ...] = (
     *(init, run, sweep, view, live, plot, video, report, export),
     *(check, design, tune, compare, verify, list_, explain, doctor, schema),
 )

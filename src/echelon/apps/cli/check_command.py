@@ -1,37 +1,27 @@
-"""`echelon check`: the paper's assumptions on a scenario."""
+"""`echelon check`: the paper's assumptions, tested on a scenario."""
 
 import json
-from typing import Annotated
 
 import typer
 
 from echelon.apps.cli import tables
-from echelon.apps.cli.console import JsonOption, ScenarioArgument
+from echelon.apps.cli.options import JsonOption, ScenarioArgument, SetOption
 
 
-def check(
-    scenario: ScenarioArgument,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change a value before checking."),
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Walk through the paper's assumptions on a scenario; exit code 0 if something is promised."""
+def check(scenario: ScenarioArgument, set_: SetOption = None, as_json: JsonOption = False) -> None:
+    """Test the paper's assumptions on a scenario; exit code 0 if anything is guaranteed."""
     from echelon.experiments.scenario.scenario import load_scenario
 
-    checked = load_scenario(scenario, set_ or [])
-    # Not above: a typing error in the file is told without the wait for JAX.
+    loaded = load_scenario(scenario, set_ or [])
+    # Not above: an error in the file is reported without the wait for JAX.
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.check import check as examine
 
-    found = examine(*build(checked))
+    assumptions = examine(*build(loaded))
+    promise = assumptions.promise
     if as_json:
-        lines = [line.as_mapping() for line in found.lines]
-        print(json.dumps({"promise": found.promise.as_mapping(), "lines": lines}, indent=2))
+        lines = [line.as_mapping() for line in assumptions.lines]
+        print(json.dumps({"promise": promise.as_mapping(), "lines": lines}, indent=2))
     else:
-        console = tables.console()
-        whole = not console.is_terminal
-        console.print(tables.statements_table(found.lines), soft_wrap=whole)
-        console.print(found.promise.sentence(), highlight=False, markup=False, soft_wrap=whole)
-    raise typer.Exit(0 if found.promised else 1)
+        tables.print_table(tables.statements_table(assumptions.lines), promise.sentence())
+    raise typer.Exit(0 if assumptions.promised else 1)

@@ -1,13 +1,21 @@
-"""`echelon compare`: laws and optimization from the same starts."""
+"""`echelon compare`: consensus laws and optimization-based methods from the same starts."""
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.apps.cli import tables
-from echelon.apps.cli.console import JsonOption, announce, written
+from echelon.apps.cli.console import print_folder
+from echelon.apps.cli.options import (
+    FiguresOption,
+    FolderOption,
+    ForceOption,
+    JsonOption,
+    SetOption,
+)
 from echelon.apps.cli.stop import STOP
 
 if TYPE_CHECKING:
@@ -19,60 +27,53 @@ if TYPE_CHECKING:
 def compare(
     scenarios: Annotated[
         list[str],
-        typer.Argument(help="Bundled scenarios' names, or YAML ", metavar="SCENARIO..."),
+        typer.Argument(help="Names of bundled scenarios, or YAML files.", metavar="SCENARIO..."),
     ],
-    horizon: Annotated[float, typer.Option(help="Length of every run, s.")] = 10.0,
+    horizon: Annotated[float, typer.Option(help="Duration of every run, s.")] = 10.0,
     method: Annotated[
-        list[str] | None, typer.Option(help="Only this method; may be given several times.")
+        list[str] | None, typer.Option(help="Only this method; repeat the option for several.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change a value in every scenario."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder; default runs/compare-NAME-TIME.")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an earlier comparison in --out.")
-    ] = False,
-    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    set_: SetOption = None,
+    out: FolderOption = None,
+    force: ForceOption = False,
+    figures: FiguresOption = True,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly the consensus laws and an optimization-based method from the same starts."""
+    """Simulate the consensus laws and the optimization-based methods from the same starts."""
     from echelon.experiments.scenario.scenario import load_scenario
 
     # First, so that `--set simulation.horizon` wins over it.
     changes = [f"simulation.horizon={horizon!r}", *(set_ or [])]
-    checked = [load_scenario(each, changes) for each in scenarios]
+    loaded = [load_scenario(name, changes) for name in scenarios]
     from echelon.experiments.scenario.build import build
     from echelon.experiments.studies.compare import known_labels
     from echelon.output.archive.folder import claim_folders
     from echelon.output.reports.comparison_report import comparison_mapping
 
     labels = known_labels(method)
-    parts = [build(each, to_run=True) for each in checked]
-    folders = claim_folders([each.name for each in checked], out, force)
+    experiments = [build(scenario, to_run=True) for scenario in loaded]
+    folders = claim_folders([scenario.name for scenario in loaded], out, force)
     with STOP.hold():
-        found = [
-            _compare(*each, labels, figures, as_json)
-            for each in zip(checked, parts, folders, strict=True)
+        comparisons = [
+            _compare(*job, labels, figures, as_json)
+            for job in zip(loaded, experiments, folders, strict=True)
         ]
     if as_json:
-        told = [comparison_mapping(each) for each in found]
-        print(json.dumps(told[0] if len(told) == 1 else told, indent=2))
+        rows = [comparison_mapping(comparison) for comparison in comparisons]
+        print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2))
     raise typer.Exit(STOP.exit_code)
 
 
 def _compare(
     scenario: "Scenario",
-    built: "Experiment",
+    experiment: "Experiment",
     folder: Path,
     labels: tuple[str, ...],
     figures: bool,
     quiet: bool,
 ) -> "Comparison":
-    """Fly all methods on a scenario, show what they did, and write it."""
-    from echelon.experiments.studies.compare import compare as fly
+    """Simulate all methods on a scenario, print the results, and write them."""
+    from echelon.experiments.studies.compare import compare as simulate
     from echelon.output.archive.comparison_folder import Flights, write_comparison
     from echelon.output.reports.comparison_report import (
         comparison_mapping,
@@ -80,13 +81,18 @@ def _compare(
         print_comparison,
     )
 
+    def announce(label: str) -> None:
+        if not quiet and sys.stderr.isatty():
+            print(f"simulating {label} ...", file=sys.stderr)
+
     flights = Flights(folder)
-    found = fly(scenario, built, labels, announce(quiet), STOP.check, flights.write)
-    # Shown before anything more is written: a full disk takes nothing of it.
+    comparison = simulate(scenario, experiment, labels, announce, STOP.check, flights.write)
+    # Printed before anything more is written, so that a full disk loses nothing of it.
     if not quiet:
-        print_comparison(tables.console(), found)
+        print_comparison(tables.console(), comparison)
     flights.check()
-    write_comparison(found, comparison_mapping(found), comparison_report(found), folder, figures)
+    rows, text = comparison_mapping(comparison), comparison_report(comparison)
+    write_comparison(comparison, rows, text, folder, figures)
     if not quiet:
-        print(f"- Written to {folder}: {written(folder)}.")
-    return found
+        print_folder(folder)
+    return comparison

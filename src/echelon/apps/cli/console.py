@@ -1,27 +1,22 @@
-"""What the commands share: their common options, and what they show while they work."""
+"""Output shared by commands: progress, the guarantee of a run, and the files written."""
 
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from echelon.experiments.scenario.build import Experiment
+    from rich.progress import ProgressColumn
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
-ScenarioArgument = Annotated[str, typer.Argument(help="A bundled scenario's name, or a YAML file.")]
+    from echelon.experiments.scenario.build import Experiment
 
 
 @contextlib.contextmanager
-def show_progress(
-    quiet: bool, what: str = "steps"
-) -> "Iterator[Callable[[int, int], None] | None]":
-    """Show steps and time left on standard error while a run lasts, where someone watches."""
+def show_progress(quiet: bool, unit: str = "steps") -> Iterator[Callable[[int, int], None]]:
+    """Show steps and time left on standard error, if it is a terminal and not `quiet`."""
     if quiet or not sys.stderr.isatty():
-        yield None
+        yield lambda done, total: None
         return
     from rich.console import Console
     from rich.progress import (
@@ -32,38 +27,36 @@ def show_progress(
         TimeRemainingColumn,
     )
 
-    columns: tuple[Any, ...] = (
+    columns: tuple[ProgressColumn, ...] = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn(f"{what}, left"),
+        TextColumn(f"{unit}, left"),
         TimeRemainingColumn(),
     )
-    # Standard error, so that the bar is seen while the report goes into a file.
+    # Standard error, so that the bar is visible while the report goes into a file.
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("simulating", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def foretell(built: "Experiment", quiet: bool) -> None:
-    """Say on standard error what is promised of a run, and always if nothing is."""
+def foretell(experiment: "Experiment", quiet: bool) -> None:
+    """Print the guarantee of a run on a terminal; anywhere, if nothing is guaranteed."""
     if quiet:
         return
     from echelon.experiments.studies.forecast import outlook
     from echelon.guarantees.promises.promise import promise
 
-    if sys.stderr.isatty() or not promise(*built).promised:
-        print(f"echelon: {outlook(*built)}", file=sys.stderr, flush=True)
+    if sys.stderr.isatty() or not promise(*experiment).promised:
+        print(f"echelon: {outlook(*experiment)}", file=sys.stderr, flush=True)
 
 
-def announce(quiet: bool) -> "Callable[[str], None]":
-    """Return what tells on standard error which method is flying, where someone watches."""
-    if quiet or not sys.stderr.isatty():
-        return lambda label: None
-    return lambda label: print(f"flying {label} ...", file=sys.stderr)
-
-
-def written(folder: Path) -> str:
-    """Return the names of what lies in a folder."""
+def print_folder(folder: Path) -> None:
+    """Print the names of all files in a folder."""
     names = sorted(path.name + ("/" if path.is_dir() else "") for path in folder.iterdir())
-    return ", ".join(names)
+    print(f"- Written to {folder}: {', '.join(names)}.")
+
+
+def print_file(file: Path, remark: str) -> None:
+    """Print the size of a file, with a remark that goes before it or after it."""
+    print(f"- Written to {file}: {remark.format(f'{file.stat().st_size / 1e6:.2f} MB')}.")

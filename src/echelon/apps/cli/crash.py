@@ -1,4 +1,4 @@
-"""What is told of a fault of echelon's own."""
+"""The report of an internal error: a file with versions and traceback, and a sentence about it."""
 
 import sys
 import tempfile
@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Final
 
 CRASHED: Final = 70
-"""Exit code of a fault in the program itself, as BSD's `sysexits.h` has it."""
+"""Exit code of an error in the program itself, as in BSD's `sysexits.h`."""
 
 
 def note_crash(error: Exception) -> str:
-    """Write down what a report of a fault needs, and return the sentence that says where."""
-    kind, what = type(error).__name__, (str(error).splitlines() or ["no message"])[0].rstrip(".")
-    told = f"this is a fault of echelon's own, and what you gave need not be wrong: {kind}: {what}"
+    """Write the details of an internal error to a file, and return the sentence that names it."""
+    kind = type(error).__name__
+    reason = (str(error).splitlines() or ["no message"])[0].rstrip(".")
+    sentence = f"internal error of echelon (your input may be correct): {kind}: {reason}"
     details = "".join(traceback.format_exception(error))
     try:
         from echelon.core.provenance import versions
@@ -23,8 +24,8 @@ def note_crash(error: Exception) -> str:
             "w", prefix="echelon-crash-", suffix=".txt", delete=False, encoding="utf-8"
         ) as file:
             file.write(head + details)
-        return f"{told}; the details are in `{Path(file.name)}`."
+        return f"{sentence}. Please report it with `{Path(file.name)}`."
     except OSError:
-        # No disk takes them; better on the screen than lost.
+        # No file can be written, so the details go to the terminal.
         print(details, file=sys.stderr)
-        return f"{told}; the details stand above."
+        return f"{sentence}. Please report it with the details above."

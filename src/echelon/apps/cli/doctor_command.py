@@ -5,24 +5,26 @@ import json
 import typer
 
 from echelon.apps.cli import tables
-from echelon.apps.cli.console import JsonOption
+from echelon.apps.cli.options import JsonOption
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Print versions and devices, and run the physics' self-checks."""
+    """Print versions and devices, and run the self-checks of the physics."""
     from echelon.experiments.studies.doctor import checks as all_checks
     from echelon.experiments.studies.doctor import facts as all_facts
 
     facts, checks = all_facts(), list(all_checks())
     if as_json:
-        print(
-            json.dumps({"facts": facts, "checks": [check._asdict() for check in checks]}, indent=2)
-        )
+        rows = [check._asdict() for check in checks]
+        print(json.dumps({"facts": facts, "checks": rows}, indent=2))
     else:
+        from rich.markup import escape
+
         console = tables.console()
         console.print(tables.pairs(facts))
         for check in checks:
             verdict = "[green]pass[/]" if check.holds else "[red]FAIL[/]"
-            console.print(f"{verdict}  {check.claim} ({check.found})", highlight=False)
+            sentence = escape(f"{check.claim} ({check.found})")
+            console.print(f"{verdict}  {sentence}", highlight=False)
     if not all(check.holds for check in checks):
         raise typer.Exit(1)

@@ -7,22 +7,22 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.console import JsonOption
+from echelon.apps.cli.options import JsonOption
 
 
 def explain(
-    term: Annotated[str | None, typer.Argument(help="A word of a table or a report.")] = None,
+    term: Annotated[str | None, typer.Argument(help="A term of a table or a report.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what a word means that tables and reports print; without one, list them all."""
+    """Explain a term of tables and reports; without one, list all terms."""
     from echelon.output.reports.glossary import explain_term, glossary
 
-    found = glossary() if term is None else explain_term(term)
+    entries = glossary() if term is None else explain_term(term)
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(entries, indent=2))
         return
-    wide = min(100, shutil.get_terminal_size().columns)
-    for name, text in found.items():
+    width = min(100, shutil.get_terminal_size().columns)
+    for name, text in entries.items():
         print(name)
         if term is not None:
-            print(textwrap.indent(textwrap.fill(text, wide - 4), "    "))
+            print(textwrap.indent(textwrap.fill(text, width - 4), "    "))

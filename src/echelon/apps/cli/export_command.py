@@ -5,20 +5,24 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.view_command import ForceOption, RunArgument, check_target
+from echelon.apps.cli.console import print_file
+from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.output.archive.folder import claim_file
 
 
 def export(
     run: RunArgument,
     to: Annotated[str, typer.Option("--to", help="csv, parquet, npz or mat.")] = "csv",
-    out: Annotated[Path | None, typer.Option(help="The file; default run.csv and so on.")] = None,
-    force: ForceOption = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output file (default: run.csv, run.npz, ...).")
+    ] = None,
+    force: OverwriteOption = False,
 ) -> None:
     """Write a run's states, inputs and errors for pandas, NumPy, MATLAB or a spreadsheet."""
     from echelon.output.archive.export import export as write
     from echelon.output.archive.open_folder import open_run
 
     file = Path(f"run.{to}") if out is None else out
-    check_target(file, force)
+    claim_file(file, force)
     write(open_run(run), file, to)
-    print(f"- Written to {file}: {file.stat().st_size / 1e6:.2f} MB.")
+    print_file(file, "{}")

@@ -1,4 +1,4 @@
-"""`echelon init`: a folder to begin with."""
+"""`echelon init`: a starter folder with a scenario, a model, a law and a notebook."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,9 +9,9 @@ import typer
 def init(
     folder: Annotated[Path, typer.Argument(help="A new folder, such as my-swarm.")],
 ) -> None:
-    """Make a folder with a scenario, a model, a law and a notebook, all of which run."""
-    from echelon.output.archive.starter_folder import begin
+    """Create a folder with a scenario, a model, a law and a notebook that run as they are."""
+    from echelon.output.archive.starter_folder import create_starter
 
-    files = begin(folder)
+    files = create_starter(folder)
     print(f"- Written to {folder}: {', '.join(file.name for file in files)}.")
     print(f"- Next: cd {folder} && echelon run scenario.yaml")

@@ -1,8 +1,8 @@
-"""`echelon list` and `echelon schema`: what a scenario may name."""
+"""`echelon list` and `echelon schema`: everything a scenario may name."""
 
 import json
 
-from echelon.apps.cli.console import JsonOption
+from echelon.apps.cli.options import JsonOption
 
 
 def list_(as_json: JsonOption = False) -> None:

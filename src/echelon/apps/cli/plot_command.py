@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.view_command import ForceOption, RunArgument
+from echelon.apps.cli.options import OverwriteOption, RunArgument
 from echelon.core.errors import OutputError
+from echelon.output.archive.folder import claim_files, write_errors
 
 _KINDS = ("png", "pdf", "svg")
 _LEAST, _MOST = 30, 1200
@@ -23,17 +24,18 @@ def plot(
         ),
     ] = None,
     paper: Annotated[
-        bool, typer.Option("--paper", help="For one and for two columns of a page, 8 pt letters.")
+        bool,
+        typer.Option("--paper", help="Sizes of one and two columns of a paper, in 8 pt."),
     ] = False,
     dpi: Annotated[
-        int | None, typer.Option(help="Of the PNG; default 150, with --paper 300.")
+        int | None, typer.Option(help="Resolution of the PNG (default: 150, with --paper 300).")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Output folder; default the run's own figures/.")
+        Path | None, typer.Option(help="Output folder (default: figures/ of the run).")
     ] = None,
-    force: ForceOption = False,
+    force: OverwriteOption = False,
 ) -> None:
-    """Draw a run's figures again, at any time, as PNG, PDF and SVG."""
+    """Draw a run's figures again, as PNG, PDF and SVG."""
     if dpi is not None and not _LEAST <= dpi <= _MOST:
         raise OutputError(f"`--dpi` is {dpi}, and must be from {_LEAST} to {_MOST}.")
     from echelon.output.archive.open_folder import open_run
@@ -45,29 +47,16 @@ def plot(
     names = NAMES if what is None else tuple(filter(None, map(str.strip, what.split(","))))
     folder = (run if run.is_dir() else run.parent) / "figures" if out is None else out
     pages = {"_one_column": ONE_COLUMN, "_two_columns": TWO_COLUMNS} if paper else {"": SCREEN}
-    made = {
+    drawings = {
         f"{name}{suffix}": figure
         for suffix, page in pages.items()
         for name, figure in figures(recording, names, page).items()
     }
-    if not made:
-        raise OutputError("the run has nothing to draw in these figures.")
-    _check_folder(folder, [f"{name}.{kind}" for name in made for kind in _KINDS], out, force)
-    try:
-        paths = save(made, folder, _KINDS, dpi or (300 if paper else 150))
-    except OSError as error:
-        raise OutputError(f"`{folder}` cannot be written: {error.strerror or error}.") from error
-    told = ", ".join(dict.fromkeys(path.stem for path in paths))
-    print(f"- Written to {folder}: {told}, each as {', '.join(k.upper() for k in _KINDS)}.")
-
-
-def _check_folder(folder: Path, names: list[str], out: Path | None, force: bool) -> None:
-    """Check that no other file is lost; those in a run's own folder are drawn again."""
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"`{folder}` is a file, and the output must be a folder.")
-    taken = [name for name in names if out is not None and (folder / name).exists()]
-    if taken and not force:
-        raise OutputError(
-            f"the file `{folder / taken[0]}` exists; choose another folder, or `--force` to "
-            "replace it."
-        )
+    if not drawings:
+        raise OutputError("the run has no data for these figures.")
+    # Figures in a run's own folder are replaced without a question.
+    claim_files(folder, [f"{n}.{kind}" for n in drawings for kind in _KINDS], force or out is None)
+    with write_errors(folder):
+        paths = save(drawings, folder, _KINDS, dpi or (300 if paper else 150))
+    stems = ", ".join(dict.fromkeys(path.stem for path in paths))
+    print(f"- Written to {folder}: {stems}, each as {', '.join(k.upper() for k in _KINDS)}.")

@@ -5,25 +5,23 @@ from typing import Annotated
 
 import typer
 
-from echelon.apps.cli.view_command import ForceOption, RunArgument, check_target
-from echelon.core.errors import OutputError
+from echelon.apps.cli.console import print_file
+from echelon.apps.cli.options import OverwriteOption, RunArgument
+from echelon.core.files import write_atomic
+from echelon.output.archive.folder import claim_file, write_errors
 
 
 def report(
     run: RunArgument,
-    out: Annotated[Path | None, typer.Option(help="The page; default report.html.")] = None,
-    force: ForceOption = False,
+    out: Annotated[Path, typer.Option(help="Output file.")] = Path("report.html"),
+    force: OverwriteOption = False,
 ) -> None:
-    """Write a run as one HTML page: table, promise, figures, scenario, versions, how to cite."""
-    file = Path("report.html") if out is None else out
-    check_target(file, force)
-    from echelon.core.files import write_atomic
+    """Write a run as one HTML page: table, guarantee, figures, scenario, versions, citation."""
+    claim_file(out, force)
     from echelon.output.archive.open_folder import open_run
     from echelon.output.archive.report_page import report_page
 
     page = report_page(open_run(run), run if run.is_dir() else None)
-    try:
-        write_atomic(file, page)
-    except OSError as error:
-        raise OutputError(f"`{file}` cannot be written: {error.strerror or error}.") from error
-    print(f"- Written to {file}: {len(page) / 1e6:.2f} MB, one file that needs no network.")
+    with write_errors(out):
+        write_atomic(out, page)
+    print_file(out, "{}, one self-contained file")

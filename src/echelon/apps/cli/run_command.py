@@ -1,16 +1,24 @@
-"""`echelon run`: simulate a scenario and keep what it shows."""
+"""`echelon run`: simulate a scenario and write its results."""
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from echelon.apps.cli import tables
-from echelon.apps.cli.console import JsonOption, foretell, show_progress, written
+from echelon.apps.cli.console import foretell, print_folder, show_progress
+from echelon.apps.cli.job import Job, check_inputs
+from echelon.apps.cli.options import (
+    FiguresOption,
+    FolderOption,
+    ForceOption,
+    JsonOption,
+    ResumeOption,
+    SetOption,
+)
 from echelon.apps.cli.stop import STOP
 from echelon.core.errors import Outcome, OutputError
 
@@ -18,119 +26,100 @@ if TYPE_CHECKING:
     from echelon.apps.cli.watch import WatchedRun
     from echelon.experiments.scenario.build import Experiment
     from echelon.experiments.scenario.scenario import Scenario
-    from echelon.output.archive.chunks import Chunks
     from echelon.simulation.engine.record import Stretch
     from echelon.simulation.engine.result import Result
     from echelon.simulation.engine.simulate import RunSoFar
 
 
-class _RunJob(NamedTuple):
-    """A run to do, and what is computed of it already."""
-
-    scenario: "Scenario"
-    built: "Experiment"
-    chunks: "Chunks"
-    before: "Sequence[Stretch]" = ()
-
-
 def run(
     scenario: Annotated[
         str | None,
-        typer.Argument(help="A bundled scenario's name, a YAML file, or the folder of a run."),
+        typer.Argument(help="The name of a bundled scenario, a YAML file, or a run's folder."),
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="Change a value, as in simulation.horizon=10."
-        ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Output folder; default runs/NAME-TIME.")] = None,
-    resume: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Go on with the run in this folder.")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an earlier run in --out.")
-    ] = False,
-    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    set_: SetOption = None,
+    out: FolderOption = None,
+    resume: ResumeOption = None,
+    force: ForceOption = False,
+    figures: FiguresOption = True,
     view: Annotated[
-        bool, typer.Option("--view", help="Show it in the browser while it is computed.")
+        bool, typer.Option("--view", help="Show the run in the browser while it is computed.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate a scenario; write its table, figures and dataset."""
+    """Simulate a scenario; write its report, figures and dataset."""
     if view:
         from echelon.output.viewer.page import check_page
 
         check_page()
-    if resume is None:
-        job = _begin(scenario, set_ or [], out, force, as_json)
-    elif scenario or set_ or out or force:
-        raise OutputError("`--resume` goes on with what a folder holds, and takes no other input.")
-    else:
-        job = _continue(resume)
+    check_inputs("run", scenario, resume, set_, out, force)
     from echelon.apps.cli.watch import watching
     from echelon.output.archive.folder import writing
 
+    if resume is None:
+        specification, experiment, job = _new_run(str(scenario), set_ or [], out, force, as_json)
+    else:
+        specification, experiment, job = _unfinished_run(resume)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_undone(job.chunks))
-        watched = stack.enter_context(watching(job.scenario, job.built)) if view else None
-        stack.enter_context(writing(job.chunks.folder))
+        stack.enter_context(job.cleanup())
+        watched = stack.enter_context(watching(specification, experiment)) if view else None
+        stack.enter_context(writing(job.folder))
         with STOP.hold():
-            result = _fly(job, watched, as_json)
-            _show(result, as_json)
-            _write(job.chunks, result, figures, as_json)
+            result = _simulate(specification, experiment, job, watched, as_json)
+            _print(result, as_json)
+            _write(job, result, figures, as_json)
         if watched is not None and STOP.number is None and len(result.times):
-            watched.show_all(job.chunks.folder)
+            watched.show_all(job.folder)
     if result.outcome is Outcome.INTERRUPTED and STOP.number is None:
         # Then the disk ended it, and its message says so.
-        raise OutputError(f"{result.message[:-1]}, and {_kept(job.chunks)}.")
+        raise OutputError(f"{result.message[:-1]}; {job.remainder}.")
     raise typer.Exit(STOP.exit_code or result.outcome.exit_code)
 
 
-def _begin(
-    scenario: str | None, changes: Sequence[str], out: Path | None, force: bool, quiet: bool
-) -> _RunJob:
-    """Return a new run, its folder taken and its inputs kept there."""
-    if scenario is None:
-        raise OutputError("got no scenario, allowed is one, or `--resume` with a run's folder.")
+def _new_run(
+    name: str, changes: Sequence[str], out: Path | None, force: bool, quiet: bool
+) -> "tuple[Scenario, Experiment, Job]":
+    """Return the scenario, its parts, and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
 
-    checked = load_scenario(scenario, changes)
+    scenario = load_scenario(name, changes)
     from echelon.experiments.scenario.build import build
     from echelon.output.archive.chunks import Chunks
     from echelon.output.archive.folder import claim_folder
 
     # Parts before the folder: a bad scenario must leave no empty folder behind.
-    built = build(checked, to_run=True)
-    chunks = Chunks(claim_folder(checked.name, out, force))
-    with _undone(chunks):
-        chunks.begin(checked)
-        foretell(built, quiet)
-    return _RunJob(checked, built, chunks)
+    experiment = build(scenario, to_run=True)
+    job = Job("run", Chunks(claim_folder(scenario.name, out, force)))
+    with job.cleanup():
+        job.chunks.begin(scenario)
+        foretell(experiment, quiet)
+    return scenario, experiment, job
 
 
-def _continue(folder: Path) -> _RunJob:
-    """Return a run that was ended before, or leave where it is complete."""
+def _unfinished_run(folder: Path) -> "tuple[Scenario, Experiment, Job]":
+    """Return the scenario, its parts, and the job in a folder."""
     from echelon.experiments.scenario.scenario import KEPT, load_scenario
     from echelon.output.archive.chunks import Chunks
 
-    chunks = Chunks(folder)
-    if not chunks.exist and (folder / "summary.json").is_file():
-        print(f"echelon: the run in `{folder}` is complete, and nothing is left to do.")
-        raise typer.Exit()
-    chunks.check()
-    checked = load_scenario(folder / KEPT)
+    job = Job("run", Chunks(folder))
+    job.resume("summary.json")
+    scenario = load_scenario(folder / KEPT)
     from echelon.experiments.scenario.build import build
 
-    return _RunJob(checked, build(checked), chunks, chunks.read())
+    return scenario, build(scenario), job
 
 
-def _fly(job: _RunJob, watched: "WatchedRun | None", quiet: bool) -> "Result":
-    """Return the run, written while it lasts."""
+def _simulate(
+    scenario: "Scenario",
+    experiment: "Experiment",
+    job: Job,
+    watched: "WatchedRun | None",
+    quiet: bool,
+) -> "Result":
+    """Return the run, which is stored and shown while it is computed."""
     from echelon.experiments.scenario import build
     from echelon.simulation.step.drive import Stopped
 
-    def keep(stretch: "Stretch") -> None:
+    def store(stretch: "Stretch") -> None:
         if watched is not None:
             watched.add(stretch)
         try:
@@ -138,38 +127,21 @@ def _fly(job: _RunJob, watched: "WatchedRun | None", quiet: bool) -> "Result":
         except OSError as error:
             raise Stopped(f"its folder cannot be written: {error.strerror or error},") from error
 
+    stored = job.chunks.read()
     if watched is not None:
-        for stretch in job.before:
+        for stretch in stored:
             watched.add(stretch)
-    with _undone(job.chunks), show_progress(quiet) as show:
+    with job.cleanup(), show_progress(quiet) as show:
 
         def progress(run: "RunSoFar") -> None:
-            if show is not None:
-                show(run.done, run.steps)
+            show(run.done, run.steps)
             STOP.check()
 
-        return build.run(job.scenario, progress, job.built, keep, job.before)
+        return build.run(scenario, progress, experiment, store, stored)
 
 
-def _kept(chunks: "Chunks") -> str:
-    """Return what becomes of a run that could not be written whole."""
-    if not chunks.hold_any:
-        return "nothing that was computed could be kept"
-    return f"what was computed is kept, and `echelon run --resume {chunks.folder}` goes on"
-
-
-@contextmanager
-def _undone(chunks: "Chunks") -> Iterator[None]:
-    """Leave no folder behind where a run ends before anything is computed."""
-    try:
-        yield
-    except BaseException:
-        chunks.forget()
-        raise
-
-
-def _show(result: "Result", as_json: bool) -> None:
-    """Print what a run shows, before anything more is written."""
+def _print(result: "Result", as_json: bool) -> None:
+    """Print the report before files are written, so that a full disk loses nothing of it."""
     if as_json:
         from echelon.experiments.results.dataset import summary
 
@@ -181,17 +153,15 @@ def _show(result: "Result", as_json: bool) -> None:
     print_report(tables.console(), result, metrics(result))
 
 
-def _write(chunks: "Chunks", result: "Result", figures: bool, quiet: bool) -> None:
-    """Write what a run shows; its chunks stay until all of it is written, and nothing is left."""
+def _write(job: Job, result: "Result", figures: bool, quiet: bool) -> None:
+    """Write all output; the chunks stay until the run is complete and everything is written."""
     from echelon.output.archive.run_folder import write_findings
 
     try:
-        write_findings(result, chunks.folder, figures)
+        write_findings(result, job.folder, figures)
     except OutputError as error:
-        raise OutputError(f"{str(error)[:-1]}; {_kept(chunks)}.") from error
+        raise OutputError(f"{str(error)[:-1]}; {job.remainder}.") from error
     if result.outcome.reached or result.outcome is Outcome.DIVERGED:
-        chunks.remove()
+        job.chunks.remove()
     if not quiet:
-        from echelon.output.reports.run_report import say
-
-        say(tables.console(), f"Written to {chunks.folder}: {written(chunks.folder)}.")
+        print_folder(job.folder)

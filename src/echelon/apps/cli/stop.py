@@ -1,4 +1,4 @@
-"""How a user or the system ends the program: Ctrl-C or SIGTERM, between two chunks of a run."""
+"""Ctrl-C and SIGTERM: the first stops a run after its chunk, the second ends the process."""
 
 import contextlib
 import os
@@ -9,80 +9,80 @@ import threading
 from collections.abc import Iterator
 from typing import final
 
-_SAID = "echelon: stopping after this chunk, and writing what was computed; again ends at once."
+_MESSAGE = "echelon: stopping and saving results. Press Ctrl-C again to quit immediately."
 
 _CURSOR = "\x1b[?25h\n"
-"""Shows the cursor again, which the bar of progress hides."""
+"""Shows the cursor again, which the progress bar hides."""
 
 
 @final
 class Ended(BaseException):
-    """Raised by a signal where nothing is held; what goes on after Ctrl-C does not go on after it.
+    """Raised by a signal while nothing needs to be saved.
 
-    A comparison would else take it for the end of one flight.
+    It is no KeyboardInterrupt, which a comparison would take for the end of one simulation.
     """
 
 
 @final
 class Stop:
-    """Whether the program was told to end, and by what.
+    """Whether a signal has asked the program to stop, and which one.
 
-    Python runs its own handlers between two of its instructions only, and a compilation or a chunk
-    is one instruction. So a thread hears of a signal through a socket, and answers at once.
+    Python runs its signal handlers only between two of its instructions, and a compilation or a
+    chunk is one instruction. So a thread receives signals through a socket, and answers at once.
     """
 
     def __init__(self) -> None:
-        """Begin untold."""
+        """Begin without a signal."""
         self.number: int | None = None
-        self._held, self._said = False, _SAID
+        self._saving, self._message = False, _MESSAGE
 
     @property
     def exit_code(self) -> int:
-        """What shells report of a program that such a signal ended; 0 without one."""
+        """The exit code that shells report for the signal; 0 without one."""
         return 0 if self.number is None else 128 + self.number
 
     @contextlib.contextmanager
     def listen(self) -> Iterator[None]:
-        """Hear Ctrl-C and SIGTERM as long as this lasts; the second of them ends the process."""
+        """Handle Ctrl-C and SIGTERM inside this context; the second signal ends the process."""
         if threading.current_thread() is not threading.main_thread():
-            yield  # Python lets no other thread hear of signals
+            yield  # Python lets no other thread handle signals
             return
         # One that the parent has switched off, as `nohup` does, stays off.
-        heard = [
-            each
-            for each in (signal.SIGINT, signal.SIGTERM)
-            if signal.getsignal(each) != signal.SIG_IGN
+        signals = [
+            number
+            for number in (signal.SIGINT, signal.SIGTERM)
+            if signal.getsignal(number) != signal.SIG_IGN
         ]
-        self.number, self._held = None, False
-        ears, mouth = socket.socketpair()
-        mouth.setblocking(False)
-        wakeup = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
-        before = {each: signal.signal(each, self._interrupt) for each in heard}
-        thread = threading.Thread(target=self._answer, args=(ears, {*heard}), daemon=True)
+        self.number, self._saving = None, False
+        receiver, sender = socket.socketpair()
+        sender.setblocking(False)
+        wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+        before = {number: signal.signal(number, self._interrupt) for number in signals}
+        thread = threading.Thread(target=self._answer, args=(receiver, {*signals}), daemon=True)
         thread.start()
         try:
             yield
         finally:
-            for each, handler in before.items():
-                signal.signal(each, handler)
+            for number, handler in before.items():
+                signal.signal(number, handler)
             signal.set_wakeup_fd(wakeup)
-            mouth.close()
+            sender.close()
             thread.join()
-            ears.close()
-            # Another call in the same process was told nothing.
+            receiver.close()
+            # Another call in the same process begins without a signal.
             self.number = None
 
     @contextlib.contextmanager
-    def hold(self, said: str = _SAID) -> Iterator[None]:
-        """Let signals wait for `check`, as long as there is something to lose; say what follows."""
-        self._held, self._said = True, said
+    def hold(self, message: str = _MESSAGE) -> Iterator[None]:
+        """Defer signals to `check` while there are results to save; print what follows then."""
+        self._saving, self._message = True, message
         try:
             yield
         finally:
-            self._held = False
+            self._saving = False
 
     def check(self) -> None:
-        """Raise what a signal stands for, if there was one.
+        """Raise if there was a signal.
 
         Raises:
             KeyboardInterrupt: there was.
@@ -90,27 +90,27 @@ class Stop:
         if self.number is not None:
             raise KeyboardInterrupt
 
-    def _answer(self, ears: socket.socket, heard: set[int]) -> None:
-        told = 0
-        while number := ears.recv(1):
-            if number[0] not in heard:
+    def _answer(self, receiver: socket.socket, signals: set[int]) -> None:
+        count = 0
+        while number := receiver.recv(1):
+            if number[0] not in signals:
                 continue
-            told += 1
-            if told > 1:
-                # Nothing is lost: every file is either whole or under another name.
+            count += 1
+            if count > 1:
+                # Nothing is lost: every file is either complete or under another name.
                 if sys.stderr.isatty():
                     sys.stderr.write(_CURSOR)
                     sys.stderr.flush()
                 os._exit(self.exit_code)
             self.number = number[0]
-            if self._held and self._said:
-                print(self._said, file=sys.stderr, flush=True)
+            if self._saving and self._message:
+                print(self._message, file=sys.stderr, flush=True)
 
     def _interrupt(self, number: int, _: object) -> None:
         self.number = number
-        if not self._held:
+        if not self._saving:
             raise Ended
 
 
 STOP = Stop()
-"""That of this process."""
+"""The state of this process."""

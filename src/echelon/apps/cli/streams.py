@@ -1,4 +1,4 @@
-"""Standard output and error, for a reader who may leave before the end, as `head` does."""
+"""Standard output and error that survive a closed pipe, as that of `| head`."""
 
 import contextlib
 import os
@@ -7,20 +7,19 @@ from collections.abc import Iterator
 from typing import Any, Final, TextIO, final
 
 LEFT: Final = 141
-"""Exit code of what is done and was not read to its end: 128 + SIGPIPE, what shells report."""
+"""Exit code of a success whose output was not read to its end: 128 + SIGPIPE, as in shells."""
 
 
 @final
 class Stream:
-    """A stream that takes all that is written, also when nobody reads it any more.
+    """A stream that accepts all text, also after its reader has closed the pipe.
 
-    What prints need not know. Were the closed pipe an error, each printer would answer it in its
-    own way: rich and typer leave with 1, which means that nothing is promised, and a run would end
-    between its table and its files.
+    If a closed pipe were an error, rich and typer would leave with 1, which means that nothing is
+    guaranteed, and a run would end between its report and its files.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
-        """Wrap a stream; None is what Python makes of a descriptor that was closed before."""
+        """Wrap a stream; Python gives None for a descriptor that was closed before it started."""
         self._stream = stream or open(os.devnull, "w")
         self.left = False
 
@@ -28,34 +27,34 @@ class Stream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write text, to nowhere if there is no reader, and return its length."""
-        with self._outlived():
+        """Write text, to the null device if there is no reader, and return its length."""
+        with self._survive():
             self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        """Send what is buffered, to nowhere if there is no reader."""
-        with self._outlived():
+        """Send what is buffered, to the null device if there is no reader."""
+        with self._survive():
             self._stream.flush()
 
     @contextlib.contextmanager
-    def _outlived(self) -> Iterator[None]:
+    def _survive(self) -> Iterator[None]:
         try:
             yield
         except BrokenPipeError:
             self.left = True
-            # The descriptor and not only this object: Python flushes the buffer below once more
-            # when it ends, and would complain.
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            # The descriptor, not only this object: Python flushes the buffer of the descriptor once
+            # more when it ends, and would report an error.
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, self._stream.fileno())
+            os.close(null)
 
 
 @contextlib.contextmanager
 def outlive_readers() -> Iterator[None]:
-    """Let a command go on to its end whoever reads, and leave with `LEFT` if it ends well.
+    """Let a command finish although its reader has left; a success then has the code `LEFT`.
 
-    Another exit code stands: it is right whether or not the table was read, and no pipe loses it.
+    Another exit code is kept, since it is right whether or not the output was read.
     """
     out, error = Stream(sys.stdout), Stream(sys.stderr)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):

@@ -1,16 +1,24 @@
 """`echelon sweep`: a scenario many times, with other seeds or other values of its keys."""
 
+import contextlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from echelon.apps.cli.console import JsonOption, show_progress, written
+from echelon.apps.cli.console import print_folder, show_progress
+from echelon.apps.cli.job import Job, check_inputs
+from echelon.apps.cli.options import (
+    FiguresOption,
+    FolderOption,
+    ForceOption,
+    JsonOption,
+    ResumeOption,
+    SetOption,
+)
 from echelon.apps.cli.stop import STOP
-from echelon.core.errors import OutputError
 
 if TYPE_CHECKING:
     from echelon.experiments.sweeps.plan import Sweep
@@ -20,143 +28,118 @@ if TYPE_CHECKING:
 
 def sweep(
     scenario: Annotated[
-        str | None, typer.Argument(help="A bundled scenario's name, or a YAML file.")
+        str | None, typer.Argument(help="The name of a bundled scenario, or a YAML file.")
     ] = None,
     over: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUES",
-            help="What varies, as in seed=0..99 or follower.gain.coupling=1,2.",
+            help="Values to vary, as in seed=0..99 or follower.gain.coupling=1,2.",
         ),
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change a value in every run."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Output folder; default runs/sweep-NAME-TIME.")
-    ] = None,
-    resume: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Go on with the sweep in this folder.")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace an earlier sweep in --out.")
-    ] = False,
+    set_: SetOption = None,
+    out: FolderOption = None,
+    resume: ResumeOption = None,
+    force: ForceOption = False,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="For native code; one a processor if left out.")
+        int | None, typer.Option(min=1, help="Threads of native code (default: one per processor).")
     ] = None,
     cluster: Annotated[
-        str | None, typer.Option(metavar="URL", help="A dask scheduler whose workers compute.")
+        str | None,
+        typer.Option(metavar="URL", help="Compute on workers of this dask scheduler."),
     ] = None,
-    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    figures: FiguresOption = True,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a scenario with all combinations of values; write one dataset of what each comes to."""
-    if resume is None:
-        plan, batches = _begin(scenario, over or [], set_ or [], out, force)
-    elif scenario or over or set_ or out or force:
-        raise OutputError("`--resume` goes on with what a folder holds, and takes no other input.")
-    else:
-        plan, batches = _continue(resume)
+    """Run a scenario for all combinations of values; write the numbers of all runs as a dataset."""
+    check_inputs("sweep", scenario, resume, over, set_, out, force)
     from echelon.output.archive.folder import BATCHES, writing
 
-    with writing(batches.folder, BATCHES), STOP.hold():
-        done = _compute(plan, batches, threads, cluster, as_json)
-        _finish(plan, batches, done, figures, as_json)
+    if resume is None:
+        plan, batches, job = _new_sweep(str(scenario), over or [], set_ or [], out, force)
+    else:
+        plan, batches, job = _unfinished_sweep(resume)
+    with writing(job.folder, BATCHES), STOP.hold():
+        with job.cleanup():
+            results = _compute(plan, batches, threads, cluster, as_json)
+        _write(plan, job, results, figures, as_json)
     raise typer.Exit(STOP.exit_code)
 
 
-def _begin(
-    scenario: str | None, over: Sequence[str], changes: Sequence[str], out: Path | None, force: bool
-) -> "tuple[Sweep, Batches]":
-    """Return a new sweep, its folder taken and its inputs kept there."""
-    if scenario is None:
-        raise OutputError("got no scenario, allowed is one, or `--resume` with a sweep's folder.")
+def _new_sweep(
+    name: str, over: Sequence[str], changes: Sequence[str], out: Path | None, force: bool
+) -> "tuple[Sweep, Batches, Job]":
+    """Return a sweep and a job in a new folder that holds all inputs."""
     from echelon.experiments.scenario.scenario import load_scenario
     from echelon.experiments.sweeps.axes import read_axes
 
     axes = read_axes(over)
-    checked = load_scenario(scenario, changes)
+    scenario = load_scenario(name, changes)
     from echelon.experiments.sweeps.plan import Sweep
     from echelon.output.archive.folder import BATCHES, claim_folder
     from echelon.output.archive.sweep_folder import Batches
 
-    plan = Sweep(checked, axes)
-    batches = Batches(claim_folder(f"sweep-{checked.name}", out, force, BATCHES))
-    with _undone(batches):
+    plan = Sweep(scenario, axes)
+    batches = Batches(claim_folder(f"sweep-{scenario.name}", out, force, BATCHES))
+    job = Job("sweep", batches.chunks)
+    with job.cleanup():
         batches.begin(plan)
-    return plan, batches
+    return plan, batches, job
 
 
-def _continue(folder: Path) -> "tuple[Sweep, Batches]":
-    """Return a sweep that was ended before, or leave where it is complete."""
+def _unfinished_sweep(folder: Path) -> "tuple[Sweep, Batches, Job]":
+    """Return the sweep and the job in a folder."""
     from echelon.output.archive.sweep_folder import Batches
 
     batches = Batches(folder)
-    if not batches.chunks.exist and (folder / "sweep.nc").is_file():
-        print(f"echelon: the sweep in `{folder}` is complete, and nothing is left to do.")
-        raise typer.Exit()
-    return batches.plan(), batches
+    job = Job("sweep", batches.chunks)
+    job.resume("sweep.nc")
+    return batches.plan(), batches, job
 
 
 def _compute(
     plan: "Sweep", batches: "Batches", threads: int | None, cluster: str | None, quiet: bool
 ) -> "list[SweepBatch]":
-    """Return the batches of a sweep, each written as soon as it is there."""
+    """Return the batches of a sweep, each written as soon as it is computed."""
     from echelon.experiments.sweeps.sweep import compute
 
-    found = batches.read()
+    results = batches.read()
 
-    def keep(batch: "SweepBatch") -> None:
+    def store(batch: "SweepBatch") -> None:
         batches.write(batch)
-        found.append(batch)
+        results.append(batch)
 
-    with _undone(batches), show_progress(quiet, "runs") as show:
-        try:
-            compute(plan, keep, _watched(show), tuple(found), threads, cluster)
-        except KeyboardInterrupt:
-            pass  # what is done is kept, and told below
-    return found
+    with show_progress(quiet, "runs") as show:
 
-
-def _watched(show: Callable[[int, int], None] | None) -> Callable[[int, int], None]:
-    def progress(done: int, runs: int) -> None:
-        if show is not None:
+        def progress(done: int, runs: int) -> None:
             show(done, runs)
-        STOP.check()
+            STOP.check()
 
-    return progress
-
-
-@contextmanager
-def _undone(batches: "Batches") -> Iterator[None]:
-    """Leave no folder behind where a sweep ends before anything is computed."""
-    try:
-        yield
-    except BaseException:
-        batches.chunks.forget()
-        raise
+        # What is computed by then is stored, and the report says so.
+        with contextlib.suppress(KeyboardInterrupt):
+            compute(plan, store, progress, tuple(results), threads, cluster)
+    return results
 
 
-def _finish(
-    plan: "Sweep", batches: "Batches", done: "Sequence[SweepBatch]", figures: bool, quiet: bool
+def _write(
+    plan: "Sweep", job: Job, results: "Sequence[SweepBatch]", figures: bool, quiet: bool
 ) -> None:
-    """Write and show what the batches hold; they stay until all runs are in the dataset."""
+    """Write and print the results; the batches stay until all runs are in the dataset."""
     from echelon.experiments.sweeps.sweep_dataset import dataset_of
     from echelon.output.archive.sweep_folder import write_sweep
     from echelon.output.reports.sweep_report import sweep_mapping, sweep_report
 
-    data = dataset_of(plan, done)
+    data = dataset_of(plan, results)
     text = sweep_report(data)
     if not quiet:
         print(text, flush=True)
-    write_sweep(data, text, batches.folder, figures)
-    whole = sum(batch.runs for batch in done) == plan.count
-    if whole:
-        batches.chunks.remove()
+    write_sweep(data, text, job.folder, figures)
+    complete = sum(batch.runs for batch in results) == plan.count
+    if complete:
+        job.chunks.remove()
     if quiet:
-        print(json.dumps({"folder": str(batches.folder), **sweep_mapping(data)}, indent=2))
-    elif whole:
-        print(f"- Written to {batches.folder}: {written(batches.folder)}.")
+        print(json.dumps({"folder": str(job.folder), **sweep_mapping(data)}, indent=2))
+    elif complete:
+        print_folder(job.folder)
     else:
-        print(f"- What was computed is kept; `echelon sweep --resume {batches.folder}` goes on.")
+        print(f"- Incomplete: {job.remainder}.")

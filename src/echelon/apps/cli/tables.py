@@ -22,12 +22,20 @@ def console() -> "Console":
 
 def pairs(facts: dict[str, str]) -> "Table":
     """Return facts as two columns."""
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table.grid(padding=(0, 2))
     for name, text in facts.items():
-        table.add_row(name, text)
+        table.add_row(name, escape(text))
     return table
+
+
+def print_table(table: "Table", sentence: str) -> None:
+    """Print a table and a sentence, each row on one line where the output is no terminal."""
+    out = console()
+    out.print(table, soft_wrap=not out.is_terminal)
+    out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
 def design_row(design: "Design") -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`echelon verify`: a second opinion on a gain file."""
+"""`echelon verify`: independent recomputation of the claims in a gain file."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from echelon.apps.cli import tables
-from echelon.apps.cli.console import JsonOption
+from echelon.apps.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from echelon.agents.models.model import ControlAffine
@@ -17,38 +17,36 @@ _EXIT_CODES = {"verified": 0, "refused": 1, "incomplete": 5}
 
 def verify(
     gain: Annotated[
-        Path, typer.Argument(help="The folder of a run, or a gain file, as `design` writes it.")
+        Path, typer.Argument(help="The folder of a run, or a gain file written by `design`.")
     ],
     scenario: Annotated[
         str | None,
-        typer.Option(help="A scenario or run whose model, not a bundled one, the agents are."),
+        typer.Option(help="The scenario or run with the agents' model, if it is not bundled."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Recompute what a run's gain promises, or a saved one, from its file alone.
+    """Recompute all claims about a gain from its file alone.
 
-    Exit code 0 if all of it holds, 1 if a claim does not, 5 if one could not be checked.
+    Exit code 0 if all claims hold, 1 if one does not, 5 if one could not be checked.
     """
     from echelon.guarantees.verifier.verify import verify as recompute
     from echelon.output.archive.open_folder import promise_file
 
-    found = recompute(promise_file(gain), None if scenario is None else _model(scenario))
+    model = None if scenario is None else _model(scenario)
+    verification = recompute(promise_file(gain), model)
     if as_json:
-        lines = [each._asdict() for each in found.findings]
-        told = {
-            "verdict": found.verdict,
-            "holds": found.holds,
-            "sentence": found.sentence,
-            "findings": lines,
+        text = {
+            "verdict": verification.verdict,
+            "holds": verification.holds,
+            "sentence": verification.sentence,
+            "findings": [finding._asdict() for finding in verification.findings],
         }
-        print(json.dumps(told, indent=2))
+        print(json.dumps(text, indent=2))
     else:
-        console = tables.console()
         titles = ("claim", "stored", "recomputed", "verdict", "how, or why not")
-        whole = not console.is_terminal
-        console.print(tables.plain_table(titles, found.findings), soft_wrap=whole)
-        console.print(found.sentence, highlight=False, markup=False, soft_wrap=whole)
-    raise typer.Exit(_EXIT_CODES[found.verdict])
+        table = tables.plain_table(titles, verification.findings)
+        tables.print_table(table, verification.sentence)
+    raise typer.Exit(_EXIT_CODES[verification.verdict])
 
 
 def _model(scenario: str) -> "ControlAffine":

@@ -18,58 +18,62 @@ if TYPE_CHECKING:
 
 @final
 class WatchedRun:
-    """A run that pages are fed with; what they cannot show ends nothing.
+    """A run whose page shows each part as soon as it is computed; a fault of the page ends nothing.
 
     Args:
         scenario: of the run.
-        built: what it builds.
+        experiment: that it describes.
     """
 
-    def __init__(self, scenario: "Scenario", built: "Experiment") -> None:
-        """Foresee it."""
+    def __init__(self, scenario: "Scenario", experiment: "Experiment") -> None:
+        """Prepare the page, as far as it is known before the run."""
         from echelon.experiments.results.foreseen import foreseen
         from echelon.experiments.results.lyapunov import goes_both_ways, potential
         from echelon.guarantees.promises.promise import promise
         from echelon.output.viewer.growing import Growing
         from echelon.simulation.engine.prepare import prepare
 
-        prepared = prepare(*built)
+        prepared = prepare(*experiment)
         parts, settings = prepared.parts, prepared.problem.settings
-        told = promise(parts, settings).as_mapping()
-        self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, told)
+        guarantee = promise(parts, settings).as_mapping()
+        self.run = foreseen(parts, settings, prepared.problem.states, scenario.name, guarantee)
         P = parts.drive.metric(parts.model)
-        # Of a law that turns, P stands in axes that turn too, and V is told at the end.
-        turns = getattr(getattr(parts.drive, "follower", None), "turning", False)
-        shown = P if goes_both_ways(parts.graph) and not turns else None
-        self.potential = shown if shown is None else potential(parts.model, parts.graph, shown)
+        # P of a law in heading axes turns with them, so V is computed only at the end.
+        turning = getattr(getattr(parts.drive, "follower", None), "turning", False)
+        self.potential = None
+        if P is not None and goes_both_ways(parts.graph) and not turning:
+            self.potential = potential(parts.model, parts.graph, P)
         self.page = Growing(self.run)
 
     def add(self, stretch: "Stretch") -> None:
-        """Show a stretch that was computed."""
+        """Show a part that was computed."""
         from echelon.experiments.results.foreseen import so_far
 
-        # What was lost has no place, and a page says so at the end.
+        # An agent without finite numbers cannot be drawn; the page says so at the end.
         if stretch.finite:
             with contextlib.suppress(OutputError):
                 self.page.add(so_far(self.run, stretch, self.potential))
 
     def show_all(self, folder: Path) -> None:
-        """Show the run that is done, until Ctrl-C."""
+        """Show the complete run until Ctrl-C."""
         from echelon.output.archive.open_folder import open_run
 
-        with STOP.hold(said=""):
+        with STOP.hold(message=""):
             self.page.finish(open_run(folder))
-            print("echelon: the run is done, and its page stays. Ctrl-C ends.", file=sys.stderr)
+            print(
+                "echelon: complete; the page is still served. Ctrl-C quits.",
+                file=sys.stderr,
+            )
             wait()
 
 
 @contextlib.contextmanager
-def watching(scenario: "Scenario", built: "Experiment") -> Iterator[WatchedRun]:
-    """Serve the page of a run that begins, and open a browser."""
+def watching(scenario: "Scenario", experiment: "Experiment") -> Iterator[WatchedRun]:
+    """Serve the page of a run that is about to start, and open a browser."""
     from echelon.output.viewer.growing import serve_growing
     from echelon.output.viewer.serve import serving
 
-    watched = WatchedRun(scenario, built)
+    watched = WatchedRun(scenario, experiment)
     server = serve_growing(watched.page, None)
     with serving(server) as address:
         show_address(server, address, None, browser=True)

@@ -9,6 +9,7 @@ from echelon.core.errors import EchelonError, ScenarioError
 from echelon.core.types import Array
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
+from echelon.experiments.scenario.checks import surplus_keys
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.simulation.engine.parts import Parts
 
@@ -24,8 +25,8 @@ def under(scenario: Scenario, law: str) -> tuple[Scenario, Experiment]:
     Raises:
         ScenarioError: the law does not fit these agents.
     """
-    # Followers under `stopping-point` are sent what no other law has.
-    ways = (False,) if law == "stopping-point" else (True, False)
+    # A leader law that goes with the followers' law replaces the scenario's.
+    ways = (True, False) if registry.FOLLOWER_LAWS[law].leader is None else (False,)
     for own in ways:
         try:
             made = _with(scenario, law, own)
@@ -40,15 +41,15 @@ def _with(scenario: Scenario, law: str, own: bool) -> Scenario:
     """Return a scenario with another law, and what of the keys fits it; `own` leaves the leader."""
     data = copy.deepcopy(scenario.data)
     data.pop("live", None)
-    takes = registry.FOLLOWER_LAWS[law].takes
-    # A feed-forward of one law may be none of another's.
-    takes = tuple(key for key in takes if key != "feedforward" or law == "consensus")
-    given = data.get("follower") or {}
-    data["follower"] = {"law": law} | {key: given[key] for key in takes if key in given}
+    surplus = surplus_keys("follower", law)
+    # A feed-forward of another law may be none of a law whose agents exchange more.
+    dropped = {"law", *surplus, *(["feedforward"] if registry.FOLLOWER_LAWS[law].leader else [])}
+    follower = data.get("follower") or {}
+    data["follower"] = {"law": law} | {k: v for k, v in follower.items() if k not in dropped}
     leader = data.get("leader") or {}
     if not own:
         leader = {key: leader[key] for key in ("start_error",) if key in leader}
-    if law != "consensus":
+    if "gain" in surplus:
         # Only a gain makes a leader react.
         leader = {key: value for key, value in leader.items() if key != "reacts"}
     return scenario_from_mapping(data | ({"leader": leader} if leader else {}), scenario.folder)

@@ -19,10 +19,12 @@ from echelon.experiments.scenario.override import named_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml
 from echelon.laws.stopping_point import StoppingPoint
+from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain
+from echelon.synthesis.gains.inner_loop import InnerLoop
 from echelon.synthesis.gains.riccati import Riccati
 
-_METHODS = ("riccati", "inner-loop")
+_METHODS = (Riccati.name, InnerLoop.name)
 """Those that find a gain in no time, and need nothing more to be said."""
 
 
@@ -340,7 +342,7 @@ class Panel:
         gain = self.parts.drive.gain
         assert gain is not None
         P, R = gain.P.tolist(), gain.R.tolist()
-        return {"method": "given", "P": P, "R": R, "coupling": coupling}
+        return {"method": FixedGain.name, "P": P, "R": R, "coupling": coupling}
 
     def graph(self, knobs: Knobs) -> Graph:
         """Return the graph without what is cut.

@@ -21,6 +21,7 @@ from echelon.core.enclosure.rules import polynomials
 from echelon.core.enclosure.slopes import number, slopes_in, variable
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import evaluate, map_entries
+from echelon.core.rational import float_above
 from echelon.core.types import Array
 
 Bounds: TypeAlias = Sequence[float | Fraction] | Array
@@ -233,14 +234,7 @@ def _round_values(
         except OverflowError as fault:
             raise GainError("an entry of the hull exceeds float64 on the domain.") from fault
         worst = max(worst, abs(Fraction(float(rounded[place])) - exact))
-    return values, rounded, _round_up(worst + values.slack)
-
-
-def _round_up(x: Fraction) -> float:
-    """Return the smallest float that is not below x."""
-    near = float(x)
-    # `float` rounds to nearest, and a bound must not be rounded down.
-    return near if Fraction(near) >= x else math.nextafter(near, math.inf)
+    return values, rounded, float_above(worst + values.slack)
 
 
 def _expand_values(values: CornerValues, array: np.ndarray, counts: dict[int, int]) -> np.ndarray:

@@ -12,6 +12,8 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import NamedTuple
 
+from echelon.core.rational import root_bounds
+
 _BITS = 96  # significant bits of an end that had to be rounded
 _ONE = 1 << 256  # units of the last place in 1, for sums of series
 
@@ -219,22 +221,12 @@ def _atan(x: Fraction) -> Interval:
     return _within(total, Fraction(1, 1 << 150))
 
 
-def _sqrt(x: Fraction) -> Interval:
-    """Enclose the root of x >= 0; exact where the root is a short rational."""
-    shift = max(0, _BITS - x.numerator.bit_length() // 2 + x.denominator.bit_length() // 2)
-    whole = x * (1 << (2 * shift))
-    # The root of a number lies between that of its floor, rounded down, and one more.
-    low = math.isqrt(math.floor(whole))
-    high = low if low * low == whole else low + 1
-    return Interval(Fraction(low, 1 << shift), Fraction(high, 1 << shift))
-
-
 def _asin(x: Fraction) -> Interval:
     if abs(x) == 1:
         return pi().scale(x / 2)
     # arcsin x = arctan(x / sqrt(1 - x^2)).
-    root = _sqrt(1 - x * x)
-    return _monotone_range(_atan)(outward(*sorted((x / root.lo, x / root.hi))))
+    ends = sorted(x / root for root in root_bounds(1 - x * x))
+    return _monotone_range(_atan)(outward(*ends))
 
 
 def _tan(x: Fraction) -> Interval:
@@ -279,6 +271,10 @@ def _monotone_range(at: Callable[[Fraction], Interval]) -> Callable[[Interval], 
     return lambda x: Interval(at(x.lo).lo, at(x.hi).hi)
 
 
+def _sqrt(x: Interval) -> Interval:
+    return Interval(root_bounds(x.lo)[0], root_bounds(x.hi)[1])
+
+
 def _acos(x: Interval) -> Interval:
     rest, quarter = _monotone_range(_asin)(x), pi().scale(Fraction(1, 2))
     return outward(quarter.lo - rest.hi, quarter.hi - rest.lo)
@@ -313,8 +309,8 @@ ELEMENTARY: dict[str, Elementary] = {
     "log1p": Elementary(
         lambda x: _monotone_range(_log)(x + point(1)), lambda x: x.lo > -1, "must be above -1"
     ),
-    "sqrt": Elementary(_monotone_range(_sqrt), lambda x: x.lo >= 0, "must not be negative"),
-    "rsqrt": Elementary(lambda x: inverse(_monotone_range(_sqrt)(x)), *_POSITIVE),
+    "sqrt": Elementary(_sqrt, lambda x: x.lo >= 0, "must not be negative"),
+    "rsqrt": Elementary(lambda x: inverse(_sqrt(x)), *_POSITIVE),
     "tan": Elementary(
         _monotone_range(_tan),
         # Between two poles tan rises and cos has no zero: a cos that keeps clear of 0 says both.

@@ -1,10 +1,6 @@
-"""From a checked scenario to parts, and from parts to a run.
-
-Names are looked up in the registry alone.
-"""
+"""Builds the parts of a checked scenario, and runs them."""
 
 import contextlib
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -28,11 +24,19 @@ from echelon.core.errors import (
 from echelon.core.numerics import precision
 from echelon.core.provenance import versions
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.checks import section
-from echelon.experiments.scenario.part import Part, accepted, known, law_part, offered, part_of
+from echelon.experiments.scenario.checks import ROLES, section
+from echelon.experiments.scenario.law_sections import GainSpec, law_arguments
+from echelon.experiments.scenario.named_class import (
+    NamedClass,
+    accepted,
+    check_names,
+    law_class,
+    named_class,
+    offered,
+)
 from echelon.experiments.scenario.scenario import Fault, Scenario, refuse
-from echelon.experiments.scenario.sections import FollowerSpec, GainSpec, LeaderSpec
-from echelon.experiments.scenario.user_code import own_code
+from echelon.experiments.scenario.user_code import as_scenario_error
+from echelon.experiments.scenario.values import marked_keys
 from echelon.experiments.scenario.yaml import joined
 from echelon.laws.law import Law
 from echelon.laws.law_check import prepare_law
@@ -49,47 +53,49 @@ from echelon.synthesis.gains.gain_file import load_gain
 
 
 class Experiment(NamedTuple):
-    """What `simulate` takes: the parts of a scenario, and how it is computed."""
+    """The arguments of `simulate`: the parts of a scenario, and its settings."""
 
     parts: Parts
     settings: Settings
 
 
 class _Faults:
-    """Collects the faults of parts, each with the place of the key that made it."""
+    """Collects the faults of parts, each with the place of its key."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.found: list[Fault] = []
+        self.faults: list[Fault] = []
 
     @contextlib.contextmanager
     def at(self, *path: str | int) -> Iterator[None]:
-        """Note an error that is raised inside, and go on."""
+        """Record an error that is raised inside, and continue."""
         try:
             yield
         except MissingExtraError:
             raise
         except EchelonError as error:
-            self.found.append(Fault(self.scenario.place(*path), joined(path), str(error)))
+            self.faults.append(Fault(self.scenario.place(*path), joined(path), str(error)))
 
     def settle(self) -> None:
-        """Raise all that was noted, a line each."""
-        if self.found:
-            refuse(self.found)
+        """Raise all recorded faults, a line each."""
+        if self.faults:
+            refuse(self.faults)
 
 
 def build(scenario: Scenario, to_run: bool = False) -> Experiment:
     """Return the parts and the settings of a scenario.
 
-    Where it is to run as it stands, what it stores must have room, and nothing may have been done
-    live, which a run cannot repeat.
+    Args:
+        scenario: a checked scenario.
+        to_run: also check that a run of it would fit in memory and has no `live` events, which
+            `echelon run` cannot repeat.
 
     Raises:
-        ScenarioError: one line for each part that cannot be made, with its place in the file.
+        ScenarioError: one line for each part that cannot be built, with its place in the file.
     """
     _check_scenario(scenario)
     faults = _Faults(scenario)
-    # Gains are computed here, and would keep 7 digits under another precision.
+    # Gains are computed here, and would have 7 digits under float32.
     with precision("float64"):
         model = graph = None
         with faults.at("simulation"):
@@ -102,10 +108,10 @@ def build(scenario: Scenario, to_run: bool = False) -> Experiment:
         reference = None
         with faults.at("reference"):
             reference = _reference(scenario, model)
-        # Before the laws: without a model and a graph each would be blamed for theirs.
+        # Before the laws: they need the model and the graph, and would report these faults again.
         faults.settle()
         if to_run:
-            # And before a gain is made, which takes long for many agents.
+            # And before a gain is computed, which takes long for many agents.
             _check_run(scenario, faults, cast(ControlAffine, model), cast(Graph, graph))
         return _with_laws(
             scenario, faults, cast(ControlAffine, model), cast(Graph, graph), reference
@@ -113,12 +119,12 @@ def build(scenario: Scenario, to_run: bool = False) -> Experiment:
 
 
 def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph) -> None:
-    """Check that a scenario can be run as it stands, and that what is stored of it has room."""
+    """Check that a scenario has no live events, and that its run fits in memory."""
     with faults.at("live"):
         if scenario.live:
             raise ScenarioError(
-                f"got {len(scenario.live)} events, allowed is none in a run; `echelon live` "
-                "repeats them, and without `live` this is the scenario before them."
+                f"got {len(scenario.live)} events, which only `echelon live` repeats; remove "
+                "`live` to run the scenario without them."
             )
     with faults.at("simulation"):
         check_memory(model, graph.agents, _settings(scenario))
@@ -128,14 +134,14 @@ def _check_run(scenario: Scenario, faults: _Faults, model: ControlAffine, graph:
 def _check_scenario(scenario: object) -> None:
     if not isinstance(scenario, Scenario):
         raise ScenarioError(
-            f"`scenario` is {scenario!r}, and must be a `Scenario`, as `load_scenario` returns it."
+            f"`scenario` is {scenario!r}, and must be a `Scenario`, as returned by `load_scenario`."
         )
 
 
 def _with_laws(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph, reference: Any
 ) -> Experiment:
-    """Return all parts, with those that need a model and a graph, with these."""
+    """Return all parts, from the model, the graph and the reference."""
     formation = leader = follower = plant = None
     with faults.at("plant"):
         plant = _plant(scenario, model)
@@ -172,7 +178,7 @@ def _with_laws(
 
 def _initial(scenario: Scenario) -> Any:
     """Return spreads by state or group, and states by agent, in one mapping."""
-    # States have names and agents numbers, so that no key meets another.
+    # Names of states and numbers of agents are different keys.
     return dict(scenario.initial.spread or {}) | dict(scenario.initial.states or {})
 
 
@@ -183,12 +189,12 @@ def run(
     keep: Keep | None = None,
     before: Sequence[Stretch] = (),
 ) -> Result:
-    """Simulate a scenario, built unless its parts are given, and note where the result comes from.
+    """Simulate a scenario, and record in the result what it was computed from.
 
-    `progress`, `keep` and `before` are those of `simulate`.
+    `built` are its parts, built if None; `progress`, `keep` and `before` are those of `simulate`.
 
     Raises:
-        ScenarioError: a part cannot be made.
+        ScenarioError: a part cannot be built.
     """
     _check_scenario(scenario)
     parts = build(scenario) if built is None else built
@@ -197,37 +203,33 @@ def run(
 
 def note_origin(result: Result, scenario: Scenario) -> Result:
     """Return a result with its scenario and the versions of what computed it."""
-    told = {f"version_{name}": text for name, text in versions().items()}
-    return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **told)
-
-
-# ---- parts --------------------------------------------------------------------------------------
+    software = {f"version_{name}": text for name, text in versions().items()}
+    return result.with_provenance(scenario=scenario.name, scenario_text=scenario.text, **software)
 
 
 def _model(scenario: Scenario) -> ControlAffine:
     spec = scenario.model
-    part = part_of(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
+    part = named_class(scenario, ControlAffine, registry.MODELS, spec.name, spec.python)
     extra = {"allow_unphysical": True} if spec.allow_unphysical else {}
     if extra and "allow_unphysical" not in accepted(part.cls):
-        raise ModelError(
-            f"`allow_unphysical` has no meaning for `{part.what}`, which has no such parameter."
-        )
-    given = spec.parameters or {}
-    given = {"set": given} if isinstance(given, str) else dict(given)
-    if "set" in given and "set" not in accepted(part.cls):
-        return _named_set(part, given.pop("set"), {**given, **extra})
-    return part._replace(given={**given, **extra}).made()
+        raise ModelError(f"`allow_unphysical` is not a parameter of `{part.name}`; leave it out.")
+    parameters = spec.parameters or {}
+    arguments = {"set": parameters} if isinstance(parameters, str) else {**parameters}
+    if "set" in arguments and "set" not in accepted(part.cls):
+        return _named_set(part, arguments.pop("set"), {**arguments, **extra})
+    return part._replace(arguments={**arguments, **extra}).create()
 
 
-def _named_set(part: Part, name: object, changes: Mapping[str, Any]) -> ControlAffine:
+def _named_set(part: NamedClass, name: object, changes: Mapping[str, object]) -> ControlAffine:
     """Return a model with a named set of parameters, some of them changed."""
     named = getattr(part.cls, "named", None)
     if named is None:
         raise ModelError(
-            f"`{part.what}` has no named parameter sets, and got `{name}`; give a mapping."
+            f"got the parameter set `{name}`, but `{part.name}` has none; give a mapping."
         )
-    with own_code(f"`{part.what}` cannot be made with these parameters"):
-        return named(name, **known(part.cls, part.what, changes))
+    check_names(part.cls, part.name, changes)
+    with as_scenario_error(f"`{part.name}` refuses these parameters"):
+        return named(name, **changes)
 
 
 def _plant(scenario: Scenario, model: ControlAffine) -> ControlAffine | None:
@@ -246,7 +248,7 @@ def _disturbance(scenario: Scenario, faults: _Faults, model: ControlAffine) -> D
         return None
     for key in ("constant", "rms", "input_rms"):
         with faults.at("disturbance", key):
-            # Each alone, so that its fault is told at its own line.
+            # Each alone, so that its fault is reported at its own line.
             Disturbance(**{key: getattr(spec, key)}).prepared(model, scenario.simulation.dt, 0)
     return Disturbance(**spec.model_dump())
 
@@ -259,33 +261,34 @@ def _graph(scenario: Scenario) -> Graph:
             return Graph.switching(spec.stretches, *rest, spec.period)
         return Graph.from_edges(spec.stretches[0][1], *rest)
     make = getattr(Graph, str(spec.name))
-    given = {key: value for key, value in spec.model_dump().items() if value is not None}
-    graph = make(**offered(make, given))
+    graph = make(**offered(make, spec.model_dump(exclude_none=True)))
     return graph.one_way() if spec.directed and not graph.directed else graph
 
 
 def _reference(scenario: Scenario, model: ControlAffine | None) -> Guide | None:
     spec = scenario.reference
-    # What is read from a file needs the model's names, and a model that fails is told of itself.
+    # Files use the model's names, and a model that fails is reported by itself.
     if spec is None or model is None:
         return None
-    part = part_of(
+    part = named_class(
         scenario, Reference, registry.REFERENCES, spec.name, spec.python, spec.parameters
     )
     reference = (
-        part.made() if spec.file is None else _read(part, scenario.folder / spec.file, model)
+        part.create() if spec.file is None else _read(part, scenario.folder / spec.file, model)
     )
     check_reference(reference)
     return reference
 
 
-def _read(part: Part, file: Path, model: ControlAffine) -> Guide:
+def _read(part: NamedClass, file: Path, model: ControlAffine) -> Guide:
     """Return a reference from its file."""
     read = getattr(part.cls, "read", None)
     if read is None:
-        raise ScenarioError(f"`{part.what}` is made of its keys, and is read from no `file`.")
-    if part.given:
-        raise ScenarioError(f"got `file` and {listing(part.given)}, allowed is one of them.")
+        raise ScenarioError(f"`{part.name}` does not read files; leave `file` out.")
+    if part.arguments:
+        raise ScenarioError(
+            f"got `file` and {listing(part.arguments)}, allowed is the file or the keys."
+        )
     return read(file, model)
 
 
@@ -300,9 +303,9 @@ def _formation(scenario: Scenario, model: ControlAffine, graph: Graph) -> Format
 def _gain(model: ControlAffine, graph: Graph, spec: GainSpec, scenario: Scenario) -> Gain:
     if spec.file is not None:
         return load_gain(scenario.folder / spec.file, model, graph)
-    part = part_of(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
-    method = part.made()
-    with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
+    part = named_class(scenario, Method, registry.METHODS, spec.method, spec.python, spec.arguments)
+    method = part.create()
+    with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
         return synthesize(model, graph, method)
 
 
@@ -310,11 +313,9 @@ def _follower(
     scenario: Scenario, faults: _Faults, model: ControlAffine, graph: Graph
 ) -> Law | None:
     spec = scenario.follower
-    part = law_part(scenario, registry.FOLLOWER_LAWS, spec.law)
+    part = law_class(scenario, registry.FOLLOWER_LAWS, spec.law)
     _check_keys(scenario, faults, "follower", part)
-    plain = ("feedforward", "trim", "frame")
-    offers: dict[str, Any] = {key: getattr(spec, key) for key in plain}
-    offers |= _stopping(spec)
+    offers = law_arguments(spec)
     if "gain" in accepted(part.cls):
         with faults.at("follower", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)
@@ -323,32 +324,22 @@ def _follower(
     return _law(part, offers, model, graph)
 
 
-def _stopping(spec: LeaderSpec | FollowerSpec) -> dict[str, Any]:
-    """Return the keys of the law `stopping-point` that a role gives."""
-    given = {name: getattr(spec, name, None) for name in _STOPPING_KEYS}
-    given = {name: value for name, value in given.items() if value is not None}
-    return given | ({"speed": math.inf} if given.get("speed") == "inf" else {})
-
-
-_STOPPING_KEYS = ("roots", "rate", "coupling", "speed", "observer", "hears")
-_LAW_KEYS = ("gain", "feedforward", "trim", "frame", *_STOPPING_KEYS)
-
-
-def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: Part) -> None:
-    """Note the keys of a role that its law does not take, which of one's own its class knows."""
-    for key in section(scenario.data, role):
-        if key in _LAW_KEYS and key not in accepted(part.cls):
-            with faults.at(role, str(key)):
+def _check_keys(scenario: Scenario, faults: _Faults, role: str, part: NamedClass) -> None:
+    """Note the keys of a role that its law, a class of the user, does not take."""
+    taken = accepted(part.cls)
+    for key in marked_keys(ROLES[role][0]):
+        if key in section(scenario.data, role) and key not in taken:
+            with faults.at(role, key):
                 raise ScenarioError(
-                    f"got a key that the law `{part.what}` does not take, allowed are those that "
-                    "its class names."
+                    f"got a key that the law `{part.name}` does not take, allowed are the "
+                    "arguments of its class."
                 )
 
 
-def _law(part: Part, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
+def _law(part: NamedClass, offers: Mapping[str, Any], model: ControlAffine, graph: Graph) -> Law:
     """Return the law of a scenario, completed and checked."""
-    law = part.made(offers)
-    with own_code(f"`{part.what}` fails") if part.own else contextlib.nullcontext():
+    law = part.create(offers)
+    with as_scenario_error(f"`{part.name}` fails") if part.by_user else contextlib.nullcontext():
         return prepare_law(law, model, graph)
 
 
@@ -361,29 +352,27 @@ def _leader(
     reaction: Gain | None,
 ) -> Law | None:
     spec = scenario.leader
-    part = law_part(scenario, registry.LEADER_LAWS, spec.law)
+    part = law_class(scenario, registry.LEADER_LAWS, spec.law)
     _check_keys(scenario, faults, "leader", part)
     if spec.reacts and "reaction" not in accepted(part.cls):
         raise ScenarioError(
-            f"`reacts` is true, and the law `{part.what}` cannot be told to react; use `tracking`."
+            f"`reacts` is true, but the law `{part.name}` cannot react to neighbours; use "
+            "`tracking`."
         )
     if spec.reacts and reaction is None:
-        raise ScenarioError("`reacts` needs a follower law with a gain, and this one has none.")
+        raise ScenarioError("`reacts` needs a follower law with a gain, but this law has none.")
     if reference is not None and "reference" not in accepted(part.cls):
-        raise ScenarioError(f"there is a `reference`, and the law `{part.what}` takes none.")
-    offers: dict[str, Any] = {
+        raise ScenarioError(f"got a `reference`, but the law `{part.name}` takes none.")
+    offers = {
         "reference": reference,
         "reaction": reaction,
         "start_error": spec.start_error,
         "horizon": scenario.simulation.horizon,
         "limits": scenario.simulation.limits,
-        # One inner loop for all, unless the file says otherwise.
-        **{k: v for k, v in _stopping(scenario.follower).items() if k in ("roots", "rate")},
+        **law_arguments(spec),
+        # All agents have the same inner loop, unless the file says otherwise.
+        **spec.inner_loop(scenario.follower),
     }
-    own = _stopping(spec)
-    if {"roots", "rate"} & own.keys():
-        offers = {key: value for key, value in offers.items() if key not in ("roots", "rate")}
-    offers |= own
     if spec.gain is not None:
         with faults.at("leader", "gain"):
             offers["gain"] = _gain(model, graph, spec.gain, scenario)

@@ -1,59 +1,43 @@
-"""Faults of a scenario that no single key shows: keys at odds with others, agents not there.
+"""Checks of a scenario across its keys: keys that exclude each other, agents that do not exist.
 
-The checks read the plain data of the file and step around whatever is malformed (the schema reports
-that), so one fault never hides another. Each check yields the path of a fault and its sentence.
+They read the plain data of the file and skip whatever is malformed (the schema reports that), so
+one fault never hides another. Each check yields the path of a fault and its sentence.
 """
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from pydantic import BaseModel
+
 from echelon.core.errors import did_you_mean, listing
 from echelon.core.limits import horizon_fault
 from echelon.experiments.scenario import registry
+from echelon.experiments.scenario.law_sections import FollowerSpec, GainSpec, LeaderSpec
+from echelon.experiments.scenario.sections import FormationSpec, GraphSpec
+from echelon.experiments.scenario.values import foreign_keys, marked_keys
 from echelon.experiments.scenario.yaml import Document, KeyPath, are, shown
 
 Finding = tuple[KeyPath, str]
 Part = Mapping[object, object]
 
-_STOPPING = "stopping-point"
-_TRACKS = ("tracking", "lqr", "optimal-tracking", _STOPPING)
-"""The leader laws that follow a reference; the last one does without, too."""
-
-# Of these two keys a section has one at most; True where it must have one.
-SOURCES: dict[str, tuple[str, str, bool]] = {
-    "model": ("name", "python", True),
-    "graph": ("edges", "name", True),
-    "formation": ("offsets", "name", False),
-    "reference": ("name", "python", True),
+_GAIN_SOURCES = (("file", "method", "python"), False)
+SOURCES: dict[KeyPath, tuple[tuple[str, ...], bool]] = {
+    ("model",): (("name", "python"), True),
+    ("graph",): (("edges", "name"), True),
+    ("formation",): (("offsets", "name"), False),
+    ("reference",): (("name", "python"), True),
+    ("leader", "gain"): _GAIN_SOURCES,
+    ("follower", "gain"): _GAIN_SOURCES,
 }
-
-# What a choice needs beside itself and what it takes; keys that stand nowhere here are everybody's.
-_Taken = dict[str, tuple[tuple[str, ...], tuple[str, ...]]]
-_GRAPH_KEYS: _Taken = dict.fromkeys(registry.GRAPHS, (("agents",), ("directed",))) | {
-    "edges": ((), ("agents", "weights", "directed", "schedule", "period")),
-    "grid": (("rows", "columns"), ("agents", "directed")),
-    "geometric": (("agents", "radius"), ("seed", "directed")),
-}
-_FORMATION_KEYS: _Taken = dict.fromkeys(registry.FORMATIONS, ((), ("spacing",))) | {
-    "offsets": ((), ()),
-    "grid": ((), ("spacing", "columns")),
-}
-_GAIN_KEYS: _Taken = {name: (entry.needs, entry.takes) for name, entry in registry.METHODS.items()}
-_GAIN_KEYS["file"] = ((), ())
-_LAW_KEYS: dict[str, _Taken] = {
-    "leader": {
-        # Where a leader starts is the run's, and who cannot react is told so by the builder.
-        name: (entry.needs, ("reacts", "start_error", *entry.takes))
-        for name, entry in registry.LEADER_LAWS.items()
-    },
-    "follower": {
-        name: (entry.needs, entry.takes) for name, entry in registry.FOLLOWER_LAWS.items()
-    },
+"""The keys of each section of which at most one is allowed, and whether one is required."""
+ROLES: dict[str, tuple[type[BaseModel], Mapping[str, registry.Entry]]] = {
+    "leader": (LeaderSpec, registry.LEADER_LAWS),
+    "follower": (FollowerSpec, registry.FOLLOWER_LAWS),
 }
 
 
-def section(data: Part, *path: str) -> Part:
+def section(data: Part, *path: str | int) -> Part:
     """Return the mapping at `path`; an empty one where there is none."""
     for key in path:
         inner = data.get(key)
@@ -63,19 +47,17 @@ def section(data: Part, *path: str) -> Part:
 
 def law_of(data: Part, role: str) -> object:
     """Return the law of a role, as the file names it or by default."""
-    default = "consensus"
+    default = registry.DEFAULT_FOLLOWER_LAW
     if role == "leader":
-        default = "passive" if data.get("reference") is None else "tracking"
-        # Its followers are sent what no other law has.
-        if law_of(data, "follower") == _STOPPING:
-            default = _STOPPING
+        reference = data.get("reference") is not None
+        default = registry.default_leader_law(law_of(data, "follower"), reference)
     return section(data, role).get("law", default)
 
 
 def surplus_keys(role: str, law: object) -> list[str]:
     """Return the keys of a role that a law does not take; none of a law that no table has."""
-    table = _LAW_KEYS.get(role, {})
-    return [] if not isinstance(law, str) or law not in table else _foreign(law, table)
+    kind, laws = ROLES.get(role, (BaseModel, {}))
+    return foreign_keys(kind, law) if isinstance(law, str) and law in laws else []
 
 
 def number_of(value: object) -> float | None:
@@ -105,68 +87,66 @@ def _infinite(value: object, path: KeyPath) -> Iterator[Finding]:
 
 
 def _sources(data: Part) -> Iterator[Finding]:
-    for name, (one, other, required) in SOURCES.items():
-        part = data.get(name)
-        if not isinstance(part, dict):
-            continue
-        given = [key for key in (one, other) if part.get(key) is not None]
-        if len(given) == 2:
-            yield (name,), f"got both `{one}` and `{other}`, allowed is one of them."
-        elif required and not given:
-            yield (name,), f"got neither `{one}` nor `{other}`, allowed is exactly one of them."
+    for path, (sources, required) in SOURCES.items():
+        part = section(data, *path)
+        present = [key for key in sources if part.get(key) is not None]
+        if len(present) > 1:
+            got = " and ".join(f"`{key}`" for key in present)
+            yield path, f"got {got}, allowed is one of them."
+        elif required and not present and isinstance(data.get(path[0]), dict):
+            yield path, f"got neither {' nor '.join(map('`{}`'.format, sources))}, one is required."
 
 
-def _choice(part: Part, free: str) -> object:
-    """Return what a section is made from, the key `free` or its name; None where both stand."""
-    if part.get(free) is None:
-        return part.get("name")
-    return free if part.get("name") is None else None
-
-
-def _taken(path: KeyPath, part: Part, choice: object, table: _Taken) -> Iterator[Finding]:
-    """Yield keys that `choice` lacks, and keys that belong to another choice."""
-    if not isinstance(choice, str) or choice not in table:
+def _taken(
+    data: Part, path: KeyPath, kind: type[BaseModel], choice: object, choices: Iterable[str]
+) -> Iterator[Finding]:
+    """Yield the keys that `choice` lacks, and those that belong to other choices."""
+    if not isinstance(choice, str) or choice not in choices:
         return
-    needed, optional = table[choice]
-    for key in needed:
-        if part.get(key) is None:
+    part, foreign = section(data, *path), foreign_keys(kind, choice)
+    for key, mark in marked_keys(kind).items():
+        if choice in mark.needed_by and part.get(key) is None:
             yield (*path, key), f"got nothing, `{choice}` needs this key."
-    foreign = _foreign(choice, table)
-    allowed = are(needed + optional) if needed + optional else "is no other key"
-    for key in part:
-        if key in foreign:
-            yield (
-                (*path, str(key)),
-                f"got a key that `{choice}` does not take, allowed beside it {allowed}.",
-            )
+    # The keys that make the choice are no keys of what is chosen.
+    other = {"law", *SOURCES.get(path, ((), False))[0], *foreign}
+    allowed = [key for key in kind.model_fields if key not in other]
+    for key in (key for key in part if key in foreign):
+        said = f"allowed {are(allowed)}" if allowed else "it takes no keys"
+        yield (*path, str(key)), f"got a key that `{choice}` does not take, {said}."
 
 
-def _foreign(choice: str, table: _Taken) -> list[str]:
-    """Return the keys that other choices take, and this one does not."""
-    keys = dict.fromkeys(key for pair in table.values() for keys in pair for key in keys)
-    return [key for key in keys if key not in (*table[choice][0], *table[choice][1])]
+def _source(data: Part, path: KeyPath) -> str | None:
+    """Return the only one of its sources that a section has, else None."""
+    part = section(data, *path)
+    present = [key for key in SOURCES[path][0] if part.get(key) is not None]
+    return present[0] if len(present) == 1 else None
 
 
 def _choices(data: Part) -> Iterator[Finding]:
-    graph, formation = section(data, "graph"), section(data, "formation")
-    yield from _taken(("graph",), graph, _choice(graph, "edges"), _GRAPH_KEYS)
-    yield from _taken(("formation",), formation, _choice(formation, "offsets"), _FORMATION_KEYS)
-    for role in ("leader", "follower"):
-        yield from _taken((role,), section(data, role), law_of(data, role), _LAW_KEYS[role])
-        gain = section(data, role, "gain")
-        sources = [key for key in ("file", "method", "python") if gain.get(key) is not None]
-        if len(sources) > 1:
-            both = " and ".join(f"`{key}`" for key in sources)
-            yield (role, "gain"), f"got {both}, allowed is one of them."
-        if "python" in sources:  # whose keys its class alone knows
-            continue
-        method = gain.get("method", registry.DEFAULT_METHOD)
-        made_by = "file" if "file" in sources else method
-        yield from _taken((role, "gain"), gain, made_by, _GAIN_KEYS)
-        # The schema leaves open which further keys a method has.
-        for key in (key for key in gain if isinstance(key, str) and key not in registry.GAIN_KEYS):
-            said = f"got an unknown key, allowed {are(registry.GAIN_KEYS)}"
-            yield (role, "gain", key), f"{said}{did_you_mean(key, registry.GAIN_KEYS)}."
+    for name, kind, table in (
+        ("graph", GraphSpec, registry.GRAPHS),
+        ("formation", FormationSpec, registry.FORMATIONS),
+    ):
+        source = _source(data, (name,))
+        choice = section(data, name).get("name") if source == "name" else source
+        yield from _taken(data, (name,), kind, choice, (*table, "edges", "offsets"))
+    for role, (kind, laws) in ROLES.items():
+        yield from _taken(data, (role,), kind, law_of(data, role), laws)
+        yield from _gain_choices(data, (role, "gain"))
+
+
+def _gain_choices(data: Part, path: KeyPath) -> Iterator[Finding]:
+    gain = section(data, *path)
+    # The class of the user alone knows its keys.
+    if gain.get("python") is not None:
+        return
+    made_by = gain.get("method", registry.DEFAULT_METHOD)
+    made_by = made_by if gain.get("file") is None else "file"
+    yield from _taken(data, path, GainSpec, made_by, (*registry.METHODS, "file"))
+    # The schema accepts further keys, which a class of the user may have.
+    keys = list(GainSpec.model_fields)
+    for key in (key for key in gain if isinstance(key, str) and key not in keys):
+        yield (*path, key), f"got an unknown key, allowed {are(keys)}{did_you_mean(key, keys)}."
 
 
 def _pairs(graph: Part) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -192,26 +172,26 @@ def _edges(document: Document) -> Iterator[Finding]:
         path = ("graph", "edges", index)
         if pair in first:
             at = document.place(("graph", "edges", first[pair]))
-            said = f"got agents `{pair[0]}` and `{pair[1]}` again, allowed is one edge for "
-            said += "each way" if graph.get("directed") is True else "each pair"
-            yield path, f"{said}, and theirs stands at {at}."
+            per = "direction" if graph.get("directed") is True else "pair"
+            said = f"got a second edge of agents `{pair[0]}` and `{pair[1]}`"
+            yield path, f"{said}, allowed is one for each {per}; the first is at {at}."
         first.setdefault(pair, index)
         if agents is not None and max(pair) >= agents > 0:
             yield path, f"got agent `{max(pair)}`, {_range(agents)}."
 
 
 def _weights(data: Part) -> Iterator[Finding]:
-    """Yield weights that are not one for each edge, and edges that have one already."""
+    """Yield a wrong number of weights, and edges that already have a weight."""
     graph = section(data, "graph")
     edges, weights = graph.get("edges"), graph.get("weights")
     if not isinstance(edges, list) or not isinstance(weights, list):
         return
     if len(edges) != len(weights):
-        said = f"got {len(weights)} weights, allowed is one for each of the {len(edges)} edges"
+        said = f"got {len(weights)} weights for {len(edges)} edges, allowed is one for each edge"
         yield ("graph", "weights"), f"{said}."
     for index, edge in enumerate(edges):
         if isinstance(edge, list) and len(edge) == 3:
-            said = "got an edge with a weight, allowed is `[i, j]` beside `weights`"
+            said = "got an edge with a weight, allowed with `weights` is `[i, j]`"
             yield ("graph", "edges", index), f"{said}."
     for index, weight in enumerate(weights):
         number = number_of(weight)
@@ -220,22 +200,22 @@ def _weights(data: Part) -> Iterator[Finding]:
 
 
 def _schedule(data: Part) -> Iterator[Finding]:
-    """Yield a period of nothing, and times that do not ascend."""
+    """Yield a period without a schedule, and times that do not ascend."""
     graph = section(data, "graph")
     stretches, period = graph.get("schedule"), number_of(graph.get("period"))
     if not isinstance(stretches, list) or not stretches:
         if graph.get("period") is not None:
-            yield ("graph", "period"), "got a period, allowed is one beside a `schedule`."
+            yield ("graph", "period"), "got a period without a `schedule`, which it needs."
         return
     last = 0.0
     for index, stretch in enumerate(stretches):
         at = number_of(stretch.get("at")) if isinstance(stretch, dict) else None
         if at is not None and 0.0 < at <= last:
-            said = f"got `{stretch['at']}`, allowed are times that ascend, above {last:g} s here"
+            said = f"got `{stretch['at']}`, allowed are ascending times, here above {last:g} s"
             yield ("graph", "schedule", index, "at"), f"{said}."
         last = max(last, at or 0.0)
     if period is not None and 0.0 < period <= last:
-        said = f"got `{graph['period']}`, allowed is more than the last time of the schedule"
+        said = f"got `{graph['period']}`, allowed is a time after the last of the schedule"
         yield ("graph", "period"), f"{said}, {last:g} s."
 
 
@@ -256,7 +236,7 @@ def _numbered(graph: Part) -> int | None:
 
 
 def _agents(graph: Part) -> int | None:
-    """Return how many agents the graph has, as far as the file tells; None where it does not."""
+    """Return how many agents the graph has; None where the file does not say."""
     agents = _whole(graph.get("agents"))
     rows, columns = _whole(graph.get("rows")), _whole(graph.get("columns"))
     if graph.get("name") == "grid":
@@ -271,13 +251,13 @@ def _grid(data: Part) -> Iterator[Finding]:
     agents, size = _whole(graph.get("agents")), _agents(graph)
     if graph.get("name") == "grid" and agents is not None and size is not None and agents != size:
         said = f"got `{agents}`, allowed is rows times columns, `{size}`"
-        yield ("graph", "agents"), f"{said}, or no such key."
+        yield ("graph", "agents"), f"{said}; the key may be left out."
 
 
 def _unknown(
     path: KeyPath, what: str, numbers: Iterable[tuple[Any, object]], agents: int
 ) -> Iterator[Finding]:
-    """Yield every one of `numbers` (the key it stands at, and its value) that is no agent."""
+    """Yield every one of `numbers` (its key and its value) that is no agent of the graph."""
     for key, value in numbers:
         agent = _whole(value)
         if agent is not None and not 0 <= agent < agents:
@@ -307,23 +287,21 @@ def _members(data: Part) -> Iterator[Finding]:
 
 
 def _following(data: Part) -> Iterator[Finding]:
-    """Yield a leader that tracks nothing, and a reference that nobody tracks."""
-    law, given = law_of(data, "leader"), data.get("reference") is not None
-    if law in _TRACKS and law != _STOPPING and not given:
-        yield (
-            ("leader", "law"),
-            f"got `{law}` without a `reference`, a leader that tracks needs one.",
-        )
-    if given and isinstance(law, str) and law in registry.LEADER_LAWS and law not in _TRACKS:
-        said = f"got a reference for a leader whose law is `{law}`"
-        yield ("reference",), f"{said}, allowed is one only with a law of {listing(_TRACKS)}."
+    """Yield a leader's law that lacks its reference, and a reference that the law does not take."""
+    law, reference = law_of(data, "leader"), data.get("reference")
+    entry = registry.LEADER_LAWS.get(law) if isinstance(law, str) else None
+    if entry is not None and entry.reference == "needed" and reference is None:
+        yield ("leader", "law"), f"got `{law}` without a `reference`, this law needs one."
+    if entry is not None and entry.reference == "none" and reference is not None:
+        said = f"got a reference, but the leader's law `{law}` takes none"
+        yield ("reference",), f"{said}; {listing(registry.TRACKING_LAWS)} take one."
 
 
 def _changed(data: Part) -> Iterator[Finding]:
-    """Yield parameters of the plant that are both given and scaled."""
-    given, scaled = (section(data, "plant", key) for key in ("parameters", "scale"))
-    for name in (name for name in scaled if isinstance(name, str) and name in given):
-        said = "got a factor on a parameter that `plant.parameters` gives"
+    """Yield parameters of the plant that are both set and scaled."""
+    values, factors = (section(data, "plant", key) for key in ("parameters", "scale"))
+    for name in (name for name in factors if isinstance(name, str) and name in values):
+        said = "got a factor for a parameter that `plant.parameters` sets"
         yield ("plant", "scale", name), f"{said}, allowed is one of them."
 
 
@@ -339,10 +317,10 @@ def _durations(data: Part) -> Iterator[Finding]:
 
 
 def cross_faults(document: Document) -> Iterator[Finding]:
-    """Yield the path and the sentence of every fault that takes more than one key to see.
+    """Yield the path and the sentence of every fault that concerns more than one key.
 
-    Numbers that are not finite come first: where the schema stumbles over the same number, the
-    sentence found here counts.
+    Numbers that are not finite come first: where the schema rejects the same number, this sentence
+    is reported.
     """
     data = document.data
     yield from _infinite(data, ())

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from echelon.experiments.scenario import registry
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import json_schema
 
 _HEAD = """# Scenario keys
@@ -41,7 +41,7 @@ def _section(title: str, part: Mapping[str, Any], defs: Mapping[str, Any]) -> It
     rows = []
     for key, what in part["properties"].items():
         inner = _referred(what, defs)
-        section = inner is not None and inner is not defs["OwnClass"]
+        section = inner is not None and inner is not defs["UserClass"]
         meaning = what.get("description") or (inner or {}).get("description", "")
         kind = "section" if section else _kind(what, defs)
         default = _default(key, what, part)

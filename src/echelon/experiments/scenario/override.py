@@ -29,18 +29,17 @@ def settle_overrides(document: Document) -> Document:
 
 
 def _rivals(path: KeyPath, part: Any) -> list[Any]:
-    """Return the keys beside a path that mean the same in another way, or nothing beside it."""
+    """Return the keys of the same section that the one at `path` excludes."""
     if not isinstance(part, dict) or part.get(path[-1]) is None:
         return []
     if path[1:] == ("law",):
         return [key for key in surplus_keys(str(path[0]), part["law"]) if key in part]
-    if path[-2:-1] == ("gain",):
-        # A file holds all that the other keys say.
-        names = [*part] if path[-1] == "file" else ["file", "method", "python"]
-        ways = ("file", "method", "python")
-        return [key for key in names if key in part and key != path[-1] and path[-1] in ways]
-    pair = SOURCES.get(str(path[0]), ())[:2] if len(path) == 2 else ()
-    return [key for key in pair if key in part and key != path[-1] and path[-1] in pair]
+    sources, _ = SOURCES.get(path[:-1], ((), False))
+    if path[-1] not in sources:
+        return []
+    # A gain file contains what the other keys would say.
+    excluded = part if path[-1] == "file" else sources
+    return [key for key in excluded if key in part and key != path[-1]]
 
 
 def _make_absolute(data: Any, path: KeyPath) -> None:

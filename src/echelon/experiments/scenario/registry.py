@@ -1,26 +1,27 @@
-"""The one table of names that a scenario file may use.
+"""The table of all names that a scenario file may use, each with its class and a summary.
 
-Each stands with where it lives and one line on what it is. Only text stands here, so that names can
-be listed and checked without importing JAX. A new member of a family adds one line.
+It holds only text, so that names are listed and checked without importing JAX. A new member of a
+family adds one entry here; its keys are declared in `sections`.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 
 class Entry(NamedTuple):
-    """Where a named part lives and what it is, in one line; of methods and laws also their keys.
+    """A named part of a scenario: the class that it means and what that is, in one line.
 
     Attributes:
         target: `module:Attribute`.
         summary: for lists.
-        needs: keys that a scenario must give with it.
-        takes: keys that it may give.
+        reference: of a leader law, whether it needs a reference, takes one, or takes none.
+        leader: of a follower law, the leader law that goes with it by default; None where that
+            depends on the reference alone.
     """
 
     target: str
     summary: str
-    needs: tuple[str, ...] = ()
-    takes: tuple[str, ...] = ()
+    reference: Literal["needed", "taken", "none"] = "none"
+    leader: str | None = None
 
 
 def _models(**entries: tuple[str, str]) -> dict[str, Entry]:
@@ -68,86 +69,81 @@ REFERENCES = {
     ),
 }
 
-# The keys of methods and laws are the arguments of the class; they stand here too since the class
-# needs JAX.
 METHODS = {
     "riccati": Entry(
-        "echelon.synthesis.gains:Riccati",
-        "Riccati equation at the trim, coupling 1/lambda_min",
-        takes=("Q", "R", "coupling"),
+        "echelon.synthesis.gains:Riccati", "Riccati equation at the trim, coupling 1/lambda_min"
     ),
-    "given": Entry(
-        "echelon.synthesis.gains:FixedGain",
-        "a P (and R, coupling) of your own",
-        needs=("P",),
-        takes=("R", "coupling"),
-    ),
+    "given": Entry("echelon.synthesis.gains:FixedGain", "a P (and R, coupling) of your own"),
     "inner-loop": Entry(
-        "echelon.synthesis.gains:InnerLoop",
-        "damp all but position, then any coupling works",
-        takes=("Q", "R", "coupling", "symmetry_weight"),
+        "echelon.synthesis.gains:InnerLoop", "damp all but position, then any coupling works"
     ),
     "monotone": Entry(
-        "echelon.synthesis.gains:Monotone",
-        "the paper's Assumption 5 on a domain, as an SDP",
-        needs=("domain",),
-        takes=("coupling",),
+        "echelon.synthesis.gains:Monotone", "the paper's Assumption 5 on a domain, as an SDP"
     ),
     "robust-lqr": Entry(
-        "echelon.synthesis.gains:RobustLQR",
-        "one P for all Jacobians of a domain, as an SDP",
-        needs=("domain",),
-        takes=("Q", "R", "coupling", "exact"),
+        "echelon.synthesis.gains:RobustLQR", "one P for all Jacobians of a domain, as an SDP"
     ),
     "contraction": Entry(
-        "echelon.synthesis.gains:Contraction",
-        "weakest gain of a given rate on a domain",
-        needs=("domain", "rate"),
-        takes=("coupling", "exact"),
+        "echelon.synthesis.gains:Contraction", "weakest gain of a given rate on a domain"
     ),
 }
 DEFAULT_METHOD = "riccati"
-_ARGUMENTS = (key for entry in METHODS.values() for key in entry.needs + entry.takes)
-GAIN_KEYS = tuple(dict.fromkeys(("method", *_ARGUMENTS, "python", "file")))
-"""All keys of a gain, each once."""
 
 FOLLOWER_LAWS = {
-    "consensus": Entry(
-        "echelon.laws:Consensus",
-        "u = u_ff - c R^-1 g(x)^T P (e + d)",
-        takes=("gain", "feedforward", "trim", "frame"),
-    ),
+    "consensus": Entry("echelon.laws:Consensus", "u = u_ff - c R^-1 g(x)^T P (e + d)"),
     "stopping-point": Entry(
         "echelon.laws:StoppingPoint",
         "agree on where each would come to rest; converges from anywhere",
-        takes=("roots", "rate", "coupling", "speed", "observer", "feedforward", "hears"),
+        # Its agents exchange what no other law sends.
+        leader="stopping-point",
     ),
     "agreement": Entry(
         "echelon.laws:Agreement", "the single-integrator law of Theorem 1, u = -(e + d)"
     ),
     "passive": Entry("echelon.laws:TrimInput", "the trim input, nothing else"),
 }
+DEFAULT_FOLLOWER_LAW = "consensus"
 
 LEADER_LAWS = {
     "tracking": Entry(
         "echelon.laws:Tracking",
         "flatness feed-forward and Riccati feedback on the reference",
-        takes=("gain",),
+        reference="needed",
     ),
-    "lqr": Entry("echelon.laws:PathLQR", "time-varying LQR along the reference, of any model"),
+    "lqr": Entry(
+        "echelon.laws:PathLQR",
+        "time-varying LQR along the reference, of any model",
+        reference="needed",
+    ),
     "optimal-tracking": Entry(
         "echelon.simulation.optimal.leader:OptimalTracking",
         "a plan of least tracking error, and feedback about it",
-        takes=("gain",),
+        reference="needed",
     ),
     "stopping-point": Entry(
         "echelon.laws:StoppingLeader",
         "the followers' law of that name, led by the reference",
-        takes=("roots", "rate", "coupling", "speed", "observer"),
+        reference="taken",
     ),
     "agreement": FOLLOWER_LAWS["agreement"],
     "passive": FOLLOWER_LAWS["passive"],
 }
+TRACKING_LAWS = [name for name, entry in LEADER_LAWS.items() if entry.reference != "none"]
+"""The leader laws that follow a reference."""
+
+
+def default_leader_law(follower: object, reference: bool) -> str:
+    """Return the leader's law where the file names none.
+
+    Args:
+        follower: the followers' law, as the file names it.
+        reference: whether there is a reference.
+    """
+    entry = FOLLOWER_LAWS.get(follower) if isinstance(follower, str) else None
+    if entry is not None and entry.leader is not None:
+        return entry.leader
+    return "tracking" if reference else "passive"
+
 
 GRAPHS = {
     "path": "agents in a line, each linked to the next",

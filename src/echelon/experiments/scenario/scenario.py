@@ -13,10 +13,10 @@ from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 from pydantic_core import ErrorDetails
 
 from echelon.core.errors import ScenarioError, did_you_mean, listing
-from echelon.experiments.scenario import sections
+from echelon.experiments.scenario import law_sections, sections
 from echelon.experiments.scenario.checks import cross_faults, law_of, number_of, section
 from echelon.experiments.scenario.override import settle_overrides
-from echelon.experiments.scenario.values import FolderName, Seed
+from echelon.experiments.scenario.values import STRICT, FolderName, Seed
 from echelon.experiments.scenario.yaml import (
     Document,
     Fault,
@@ -35,7 +35,7 @@ KEPT = "scenario.yaml"
 
 
 @final
-class Scenario(BaseModel, **sections.STRICT):
+class Scenario(BaseModel, **STRICT):
     """One experiment, checked and with its defaults filled in; made by `load_scenario`."""
 
     name: FolderName
@@ -45,8 +45,8 @@ class Scenario(BaseModel, **sections.STRICT):
     graph: sections.GraphSpec
     formation: sections.FormationSpec = Field(default_factory=sections.FormationSpec)
     reference: sections.ReferenceSpec | None = None
-    leader: sections.LeaderSpec = Field(default_factory=sections.LeaderSpec)
-    follower: sections.FollowerSpec = Field(default_factory=sections.FollowerSpec)
+    leader: law_sections.LeaderSpec = Field(default_factory=law_sections.LeaderSpec)
+    follower: law_sections.FollowerSpec = Field(default_factory=law_sections.FollowerSpec)
     initial: sections.InitialSpec = Field(default_factory=sections.InitialSpec)
     disturbance: sections.DisturbanceSpec | None = None
     simulation: sections.SimulationSpec

@@ -1,4 +1,4 @@
-"""Classes of the user's own: from `file.py:Class` to the class, a sentence for each fault."""
+"""Classes in files of the user: loads `file.py:Class`, and reports what goes wrong in it."""
 
 import contextlib
 import importlib.util
@@ -14,13 +14,13 @@ from echelon.core.trace import error_summary
 _T = TypeVar("_T")
 
 
-def own_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
+def user_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
     """Return a class of a kind from a user's file.
 
     Args:
         folder: to which the file is relative.
         target: `file.py:Class`.
-        kind: what it must be made from, such as `Law`.
+        kind: the base class, such as `Law`.
 
     Raises:
         ScenarioError: there is no such file, it does not import, or it has no such class.
@@ -33,49 +33,48 @@ def own_class(folder: Path, target: str, kind: type[_T]) -> type[_T]:
             "and on the command line to the working folder."
         )
     module = _imported(file)
-    classes = {key: value for key, value in vars(module).items() if _is_own(value, kind)}
+    classes = {key: value for key, value in vars(module).items() if _is_subclass(value, kind)}
     if name not in classes:
         has = f"it has {listing(classes)}" if classes else "it has none"
         raise ScenarioError(
-            f"`{name}` in `{file}` is no `{kind.__name__}` class; {has}"
+            f"`{name}` in `{file}` is not a `{kind.__name__}` class; {has}"
             f"{did_you_mean(name, classes)}."
         )
     return classes[name]
 
 
-def _is_own(value: object, kind: type) -> bool:
+def _is_subclass(value: object, kind: type) -> bool:
     return isinstance(value, type) and issubclass(value, kind) and value is not kind
 
 
 def _imported(file: Path) -> Any:
-    """Return the module in a file, run anew."""
-    # By its place and not by `import`: the folder need not be on the path, and a file that was
+    """Return the module in a file, executed anew."""
+    # By its path and not by `import`: the folder need not be on `sys.path`, and a file that was
     # changed since must be read again.
     spec = importlib.util.spec_from_file_location(f"echelon_user_{file.stem}", file)
     if spec is None or spec.loader is None:
-        raise ScenarioError(f"the file `{file}` is no Python file.")
+        raise ScenarioError(f"the file `{file}` is not a Python file.")
     module = importlib.util.module_from_spec(spec)
-    # Before it runs, as `import` does: dataclasses look up their own module there.
+    # Before it is executed, as `import` does: dataclasses look up their module there.
     sys.modules[spec.name] = module
-    # It may change anything, and what it makes is not known by its text.
+    # The file may change anything, and its text does not identify the values that it computes.
     disk_cache.close()
-    with own_code(f"the file `{file}` does not import"):
+    with as_scenario_error(f"the file `{file}` does not import"):
         spec.loader.exec_module(module)
     return module
 
 
 @contextlib.contextmanager
-def own_code(what: str) -> Iterator[None]:
-    """Turn whatever the user's own code raises into a sentence, which begins with `what`.
+def as_scenario_error(what: str) -> Iterator[None]:
+    """Raise whatever the user's code raises as a `ScenarioError` that begins with `what`.
 
     Raises:
-        ScenarioError: it has raised something; its class and first line are told.
+        ScenarioError: the user's code raised an error; the message has its class and first line.
     """
     try:
         yield
     except EchelonError:
         raise
-    # A program that leaves is a fault of the file too, and must not end echelon as if all were
-    # well.
+    # A file that exits is faulty too, and must not end echelon with exit code 0.
     except (Exception, SystemExit) as error:
         raise ScenarioError(f"{what}: {error_summary(error)}.") from error

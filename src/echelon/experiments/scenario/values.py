@@ -4,12 +4,15 @@ Numbers are real numbers only: neither truth values nor text that looks like a n
 are not finite pass here; they are refused for the whole file at once.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, final
 
 from pydantic import (
     AfterValidator,
+    BaseModel,
     BeforeValidator,
+    ConfigDict,
     Field,
     GetCoreSchemaHandler,
     PlainValidator,
@@ -18,6 +21,9 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from echelon.experiments.scenario.yaml import are
+
+STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, use_attribute_docstrings=True)
+"""The configuration of every section."""
 
 
 @final
@@ -48,6 +54,26 @@ def Unit(text: str) -> Any:
     return Field(json_schema_extra={"unit": text})
 
 
+@final
+class TakenBy:
+    """Marks a key that some choices of its section take; a key without a mark belongs to all."""
+
+    def __init__(self, *choices: str, needed_by: Iterable[str] = ()) -> None:
+        self.needed_by = tuple(needed_by)
+        self.choices = (*self.needed_by, *choices)
+
+
+def marked_keys(section: type[BaseModel]) -> dict[str, TakenBy]:
+    """Return the keys of a section that belong to some of its choices, such as laws, only."""
+    marks = ((key, mark) for key, field in section.model_fields.items() for mark in field.metadata)
+    return {key: mark for key, mark in marks if isinstance(mark, TakenBy)}
+
+
+def foreign_keys(section: type[BaseModel], choice: str) -> list[str]:
+    """Return the keys of a section that a choice does not take."""
+    return [key for key, mark in marked_keys(section).items() if choice not in mark.choices]
+
+
 def OneOf(names: Iterable[str]) -> Allowed:
     """Mark text that must be one of the names of a registry table."""
     listed = list(names)
@@ -55,8 +81,8 @@ def OneOf(names: Iterable[str]) -> Allowed:
     return Allowed(are(listed), listed, core_schema.literal_schema(listed))
 
 
-def OwnOr(names: Iterable[str]) -> Allowed:
-    """Mark what is a name of a registry table or a class of the user's own."""
+def NameOrUserClass(names: Iterable[str]) -> Allowed:
+    """Mark what is a name of a registry table or a class in a user's file."""
     listed = list(names)
     return Allowed(f"{are(listed)}, or `python: file.py:Class`", listed)
 
@@ -130,12 +156,13 @@ Numbers = Annotated[tuple[float, ...], Field(strict=False, min_length=1)]
 Speed = Annotated[
     Literal["inf"] | Positive | Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)],
     Allowed("is a positive number, a list of such, or `inf`", ["inf"]),
+    AfterValidator(lambda speed: math.inf if speed == "inf" else speed),
 ]
 Matrix = Annotated[
     Numbers | Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)],
     AfterValidator(_square),
 ]
-Array = Annotated[
+WeightMatrix = Annotated[
     Matrix, Allowed("is a list of numbers (the diagonal) or a list of as many rows as columns")
 ]
 MatrixOrIdentity = Annotated[

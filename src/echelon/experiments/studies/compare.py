@@ -31,15 +31,6 @@ from echelon.synthesis.gains.gain import Gain, Method, synthesize
 from echelon.synthesis.gains.inner_loop import InnerLoop
 from echelon.synthesis.gains.riccati import Riccati
 
-LABELS = (
-    "literal",
-    "riccati-relay",
-    "riccati",
-    "inner-loop",
-    "stopping-point",
-    "optimization",
-    "mpc",
-)
 OWN = "own"
 """Asks for what drives the agents in the scenario itself."""
 
@@ -125,10 +116,55 @@ class Comparison(NamedTuple):
     conditions: tuple[str, ...]
 
 
-_LAWS = registry.FOLLOWER_LAWS
+_LAW_NAMES = {
+    entry.target.rpartition(":")[2]: name for name, entry in registry.FOLLOWER_LAWS.items()
+}
 
 DriveOf = Callable[[Parts], Drive]
 """What drives the agents of a scenario under a method."""
+
+
+def _consensus(
+    gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
+) -> DriveOf:
+    """Return the drive under the consensus law with a gain, the scenario's leader kept."""
+    return lambda parts: parts.drive.with_follower(
+        Consensus(gain(parts), feedforward, trim, parts.drive.frame)
+    )
+
+
+def _synthesized(method: Method) -> Callable[[Parts], Gain]:
+    return lambda parts: synthesize(parts.model, parts.graph, method)
+
+
+def _riccati(parts: Parts) -> Gain:
+    """Return the scenario's own Riccati gain, or the model's default one."""
+    own = parts.drive.gain
+    if own is not None and own.method == Riccati.name:
+        return own
+    return synthesize(parts.model, parts.graph, Riccati())
+
+
+def _reference(parts: Parts) -> Any:
+    """Return what the scenario's leader follows, if anything."""
+    return getattr(getattr(parts.drive, "leader", None), "reference", None)
+
+
+_DRIVES: Mapping[str, DriveOf] = {
+    # The printed law has neither the leader's input nor a trim input.
+    "literal": _consensus(_synthesized(FixedGain()), Feedforward.NONE, trim=False),
+    f"{Riccati.name}-relay": _consensus(_riccati, Feedforward.RELAY),
+    Riccati.name: _consensus(_riccati, Feedforward.NONE),
+    InnerLoop.name: _consensus(_synthesized(InnerLoop()), Feedforward.RELAY),
+    _LAW_NAMES[StoppingPoint.__name__]: lambda parts: Laws(
+        StoppingLeader(reference=_reference(parts)), StoppingPoint()
+    ),
+    "optimization": lambda parts: Plans(_reference(parts)),
+    "mpc": lambda parts: RecedingHorizon(_reference(parts)),
+}
+
+LABELS = tuple(_DRIVES)
+"""The methods that are compared."""
 
 
 def known_labels(asked: Sequence[str] | None) -> tuple[str, ...]:
@@ -232,18 +268,6 @@ def _fly(parts: Parts, settings: Settings, check: Callable[[], None]) -> Flight:
     return Flight(result, found, told, computing, result.work)
 
 
-# ---- the methods --------------------------------------------------------------------------------
-
-
-def _consensus(
-    gain: Callable[[Parts], Gain], feedforward: Feedforward, trim: bool = True
-) -> DriveOf:
-    """Return the drive under the consensus law with a gain, the scenario's leader kept."""
-    return lambda parts: parts.drive.with_follower(
-        Consensus(gain(parts), feedforward, trim, parts.drive.frame)
-    )
-
-
 class _Watch:
     """Times the steps of a run, all but the first chunk, which compiles."""
 
@@ -262,10 +286,6 @@ class _Watch:
         return (last - first) * total / max(1, done - begun)
 
 
-def _synthesized(method: Method) -> Callable[[Parts], Gain]:
-    return lambda parts: synthesize(parts.model, parts.graph, method)
-
-
 def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
     """Return what to call the scenario's own drive; None where a row has flown it already."""
     drive = parts.drive.prepare(parts.model, parts.graph)
@@ -282,32 +302,4 @@ def _own_label(parts: Parts, rows: list[ComparisonRow]) -> str | None:
 def _law_name(drive: Drive) -> str:
     """Return a scenario's name of the followers' law, or that of the class that drives them."""
     kind = type(getattr(drive, "follower", drive)).__name__
-    names = {entry.target.rpartition(":")[2]: name for name, entry in _LAWS.items()}
-    return names.get(kind, kind)
-
-
-def _riccati(parts: Parts) -> Gain:
-    """Return the scenario's own Riccati gain, or the model's default one."""
-    own = parts.drive.gain
-    if own is not None and own.method == "riccati":
-        return own
-    return synthesize(parts.model, parts.graph, Riccati())
-
-
-def _reference(parts: Parts) -> Any:
-    """Return what the scenario's leader follows, if anything."""
-    return getattr(getattr(parts.drive, "leader", None), "reference", None)
-
-
-_DRIVES: Mapping[str, DriveOf] = {
-    # The printed law has neither the leader's input nor a trim input.
-    "literal": _consensus(_synthesized(FixedGain()), Feedforward.NONE, trim=False),
-    "riccati-relay": _consensus(_riccati, Feedforward.RELAY),
-    "riccati": _consensus(_riccati, Feedforward.NONE),
-    "inner-loop": _consensus(_synthesized(InnerLoop()), Feedforward.RELAY),
-    "stopping-point": lambda parts: Laws(
-        StoppingLeader(reference=_reference(parts)), StoppingPoint()
-    ),
-    "optimization": lambda parts: Plans(_reference(parts)),
-    "mpc": lambda parts: RecedingHorizon(_reference(parts)),
-}
+    return _LAW_NAMES.get(kind, kind)

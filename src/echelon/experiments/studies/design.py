@@ -19,9 +19,9 @@ from echelon.core.statement import Hypothesis
 from echelon.core.words import Theorem
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment, build
-from echelon.experiments.scenario.part import resolve
+from echelon.experiments.scenario.law_sections import GainSpec
+from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
-from echelon.experiments.scenario.sections import GainSpec
 from echelon.experiments.scenario.yaml import Fault
 from echelon.experiments.studies.speedup import speedup
 from echelon.experiments.studies.stopping_design import StoppingDesign, design_stopping
@@ -31,6 +31,7 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
 from echelon.synthesis.certificates.domain import Domain
+from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain, Method, synthesize
 
 _ADVISED = 100
@@ -136,7 +137,7 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     return Designs(tried, best, why, built.settings, stopping)
 
 
-_ALWAYS = GainSpec(method="given", P="identity")
+_ALWAYS = GainSpec(method=FixedGain.name, P="identity")
 """A gain that there is for every model."""
 
 

@@ -16,6 +16,7 @@ import scipy.optimize
 from echelon.agents.models.linearization import linearize
 from echelon.core.errors import EchelonError, GainError, did_you_mean, listing
 from echelon.core.types import Array
+from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.studies.design import with_gain
@@ -254,8 +255,13 @@ def _check_parameters(scenario: Scenario, parameters: Sequence[str]) -> None:
     spec, law = scenario.follower.gain, scenario.follower.law
     found = f"the gain file `{spec.file}`" if spec.file else f"the method `{spec.method}`"
     found = f"a method of one's own, `{spec.python}`" if spec.python else found
-    found = f"the law `{law}`" if law != "consensus" else found
-    if law != "consensus" or spec.file or spec.python or spec.method != Riccati.name:
+    found = f"the law `{law}`" if law != registry.DEFAULT_FOLLOWER_LAW else found
+    if (
+        law != registry.DEFAULT_FOLLOWER_LAW
+        or spec.file
+        or spec.python
+        or spec.method != Riccati.name
+    ):
         raise EchelonError(
             f"the followers have {found}, and what is tuned are the weights of `riccati`; set "
             "`follower={law: consensus, gain: {method: riccati}}`."

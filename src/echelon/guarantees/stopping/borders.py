@@ -8,6 +8,7 @@ import numpy as np
 
 from echelon.agents.models.model import FlatBound
 from echelon.core.errors import GainError, listing
+from echelon.core.rational import root_bounds
 from echelon.core.types import Array
 from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_clearance import (
@@ -15,7 +16,6 @@ from echelon.guarantees.stopping.chain_clearance import (
     Push,
     length_room_of,
     room_of,
-    root_above,
 )
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.path_bounds import Least, least_on_path
@@ -137,7 +137,7 @@ def _together(speeds: Any) -> Fraction | None:
     if any(map(math.isinf, each)):
         return None
     exact = [Fraction(s) for s in each]
-    return exact[0] if len(exact) == 1 else root_above(sum((s**2 for s in exact), Fraction(0)))
+    return exact[0] if len(exact) == 1 else root_bounds(sum((s**2 for s in exact), Fraction(0)))[1]
 
 
 def _told(asked: _Asked, least: Least, left: Fraction) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
-from echelon.core.enclosure.interval import ELEMENTARY, point
+from echelon.core.rational import root_bounds
 from echelon.guarantees.stopping.chain_response import (
     Chain,
     Poly,
@@ -82,14 +82,9 @@ def length_room_of(
     frees = [chain.derivative(chain.free(start), order) for start in starts if any(start)]
 
     def left(low: Fraction, high: Fraction) -> Fraction:
-        return root_above(sum((_size(p, low, high) ** 2 for p in frees), Fraction(0)))
+        return root_bounds(sum((_size(p, low, high) ** 2 for p in frees), Fraction(0)))[1]
 
     return _room(chain, order, left, speed, allowed)
-
-
-def root_above(x: Fraction) -> Fraction:
-    """Return a number that the root of x >= 0 is not above, and nearly is."""
-    return ELEMENTARY["sqrt"].range(point(x)).hi
 
 
 def _size(p: Poly, low: Fraction, high: Fraction) -> Fraction:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 from echelon.agents.models.airframe import Airframe
 from echelon.core.enclosure.interval import ELEMENTARY, point
-from echelon.guarantees.stopping.time_slices import TimeSlice, rounded_up
+from echelon.core.rational import norm_above, root_bounds, round_up
+from echelon.guarantees.stopping.time_slices import TimeSlice
 
 _HALF = Fraction(1, 2)
 
@@ -128,31 +129,22 @@ def motors_for(frame: Airframe, asked: MotorDemand) -> Motors:
     if low <= 0:
         return Motors(Fraction(-1), Fraction(-1), None)
     Jx, Jy, Jz = map(Fraction, frame.inertia)
-    tan = rounded_up(asked.sideways[0] / low)
+    tan = round_up(asked.sideways[0] / low)
     sec2 = 1 + tan * tan
-    sec, sine = _root(sec2), rounded_up(tan / _root(sec2, up=False))
-    jerk, snap = (_norm(asked.sideways[k + 1], asked.upward[k]) for k in range(2))
+    low_sec, high_sec = root_bounds(sec2)
+    sec, sine = round_up(high_sec), round_up(tan / low_sec)
+    jerk, snap = (norm_above(asked.sideways[k + 1], asked.upward[k]) for k in range(2))
     turn, turning = asked.turn
     # Of roll and pitch, rad/s, and what turns them but for what the yaw does, rad/s^2.
-    rate = rounded_up(jerk / low)
-    bend = rounded_up((snap + jerk * jerk / low) / low)
-    spin = rounded_up(sec * turn + tan * rate)
+    rate = round_up(jerk / low)
+    bend = round_up((snap + jerk * jerk / low) / low)
+    spin = round_up(sec * turn + tan * rate)
     spinning = sec * turning + 2 * turn * sec2 * (sine * rate + (1 - 1 / sec) * turn)
     spinning += (2 * sec2 - 1) * _HALF * rate * rate + tan * bend
     tilting = max(Jx, Jy) * bend + max(Jx + Jz - Jy, Jy + Jz - Jx) * rate * spin
     yawing = Jz * spinning + abs(Jy - Jx) * _HALF * rate * rate
-    root = ELEMENTARY["sqrt"].range(point(2)).hi
+    root = root_bounds(2)[1]
     more = root * tilting / Fraction(frame.arm) + yawing / Fraction(frame.torque_per_thrust)
-    mass, more = Fraction(frame.mass), rounded_up(more) / 4
-    high = _norm(asked.high + Fraction(frame.gravity), asked.sideways[0])
+    mass, more = Fraction(frame.mass), round_up(more) / 4
+    high = norm_above(asked.high + Fraction(frame.gravity), asked.sideways[0])
     return Motors(mass * low / 4 - more, mass * high / 4 + more, tan)
-
-
-def _norm(a: Fraction, b: Fraction) -> Fraction:
-    return _root(a * a + b * b)
-
-
-def _root(x: Fraction, up: bool = True) -> Fraction:
-    """Return a short rational near the root, not below it, or not above it."""
-    found = ELEMENTARY["sqrt"].range(point(x))
-    return rounded_up(found.hi) if up else found.lo

@@ -9,11 +9,12 @@ import numpy as np
 
 from echelon.agents.models.airframe import Airframe
 from echelon.agents.models.model import ControlAffine
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, point
+from echelon.core.enclosure.interval import Interval
 from echelon.core.memoize import memoize
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.rational import bisect, float_above, float_below, norm_above
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.motor_bounds import (
     MotorDemand,
@@ -25,7 +26,7 @@ from echelon.guarantees.stopping.motor_bounds import (
 )
 from echelon.guarantees.stopping.path_bounds import Pieces, pieces_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
-from echelon.guarantees.stopping.time_slices import rounded_up, slices_of
+from echelon.guarantees.stopping.time_slices import slices_of
 from echelon.laws.stopping_point import StoppingLeader
 
 _OUTPUTS, _DEGREES = ("x", "y", "z", "yaw"), (4, 4, 4, 2)
@@ -159,29 +160,30 @@ def strain_of(run: StoppingRun) -> LoadLine:
     """Return whether the motors of a run's agents suffice, by T5 with limits."""
     frame, reason = run.parts.model.airframe, _beyond(run)
     if frame is None or reason:
-        text = reason or _UNKNOWN
-        return LoadLine(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
+        return LoadLine(None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN))
     case = _MotorCase.of(run, frame)
     found, starts = _from(case)
-    kind, shown, most = case.path.kind, _shown(found), Fraction(frame.motor_thrust)
+    kind, most = case.path.kind, Fraction(frame.motor_thrust)
+    number = None if found.slope is None else float(found.least), _shown(found)
     if not found.within(most):
         text = "from these starts the motors are not shown to give what is asked"
-        text += f": {shown}" if shown else ", and the thrust not to vanish"
+        text += f": {number[1]}" if number[1] else ", and the thrust not to vanish"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
-        return LoadLine(None, _line(Verdict.FAILS, kind, found, shown, text, remedy))
+        # Without a reason: a promise of agents without limits is one too.
+        return LoadLine(None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy))
     ahead = _ahead(frame, run.ahead)
     strain = MotorLoad(
         kind,
-        _floor(found.least),
-        -_floor(-found.largest),
+        float_below(found.least),
+        float_above(found.largest),
         float(most),
-        -_floor(-found.tilt),
+        float_above(found.tilt),
         _alone(frame, case.chain, case.base, ahead),
         _told(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors give what is asked from these starts, all the way"
-    return LoadLine(strain, _line(Verdict.HOLDS, kind, found, shown, text))
+    return LoadLine(strain, holds(Hypothesis.LIMITS, kind, text, *number))
 
 
 def _beyond(run: StoppingRun) -> str:
@@ -195,25 +197,11 @@ def _beyond(run: StoppingRun) -> str:
     return "a `speed` is infinite" if any(map(math.isinf, speeds)) else ""
 
 
-def _line(
-    verdict: Verdict, kind: Kind, found: Motors | None, shown: str, text: str, remedy: str = ""
-) -> Statement:
-    number = None if found is None or found.slope is None else float(found.least)
-    # Without a reason: a promise of agents without limits is one too.
-    return Statement(Hypothesis.LIMITS, verdict, kind, number, shown, text, remedy)
-
-
 def _shown(found: Motors) -> str:
     if found.slope is None:
         return ""
     tilt = math.degrees(float(found.tilt))
     return f"{float(found.least):.3g} .. {float(found.largest):.3g} N, {tilt:.3g} deg"
-
-
-def _floor(x: Fraction) -> float:
-    """Return the largest float that is not above x."""
-    near = float(x)
-    return near if Fraction(near) <= x else math.nextafter(near, -math.inf)
 
 
 # ---- the path ------------------------------------------------------------------------------------
@@ -237,7 +225,7 @@ def _asked(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand
     rows = pieces.between(begin, end)
 
     def most(order: int, *outputs: int) -> Fraction:
-        return max(_norm([_size(row[order][k]) for k in outputs]) for row in rows)
+        return max(norm_above(*(_size(row[order][k]) for k in outputs)) for row in rows)
 
     low = min(row[2][2].lo for row in rows)
     high = max(row[2][2].hi for row in rows)
@@ -249,27 +237,18 @@ def _size(x: Interval) -> Fraction:
     return max(abs(x.lo), abs(x.hi))
 
 
-def _norm(sizes: Sequence[Fraction]) -> Fraction:
-    """Return a bound of the root of the sum of squares."""
-    [first, *rest] = sizes
-    if not any(rest):
-        return rounded_up(first)
-    total = sum((size * size for size in sizes), _ZERO)
-    return rounded_up(ELEMENTARY["sqrt"].range(point(total)).hi)
-
-
 # ---- agents --------------------------------------------------------------------------------------
 
 
 def _speeds(values: Sequence[float]) -> tuple[Fraction, Fraction, Fraction]:
     x, y, z, yaw = map(Fraction, values)
-    return _norm([x, y]), z, yaw
+    return norm_above(x, y), z, yaw
 
 
 def _start(flat: Array) -> Pushed:
     """Return the sizes of a start off what an agent follows, (4, 4) in flat coordinates."""
     sizes = [[abs(Fraction(x)) + _ROUNDED for x in row] for row in flat[1:].tolist()]
-    sideways = tuple(_norm(row[:2]) for row in sizes)
+    sideways = tuple(norm_above(*row[:2]) for row in sizes)
     return Pushed(sideways, tuple(row[2] for row in sizes), (sizes[0][3],), _STILL.speeds)
 
 
@@ -349,23 +328,18 @@ def _alone(
     if not fits((_ZERO,)):
         return None
     _, a, j, rise, lift, climb, _ = path
-    tilt = _farthest(lambda t: fits((_ZERO, lift * t + a, climb * t + j)), Fraction(4))
+
+    def farthest(fits: Callable[[Fraction], bool], most: int) -> float:
+        return float(bisect(fits, _ZERO, Fraction(most), _STEPS))
+
+    tilt = farthest(lambda t: fits((_ZERO, lift * t + a, climb * t + j)), 4)
     return Alone(
         math.atan(tilt),
-        _farthest(lambda x: fits((x,)), Fraction(40)),
-        _farthest(lambda x: fits((_ZERO,), x), Fraction(20)),
-        _farthest(lambda w: fits((_ZERO, a, j + lift * w)), Fraction(40)),
+        farthest(lambda x: fits((x,)), 40),
+        farthest(lambda x: fits((_ZERO,), x), 20),
+        farthest(lambda w: fits((_ZERO, a, j + lift * w)), 40),
         fits((path.speed, a, j), rise),
     )
-
-
-def _farthest(fits: Callable[[Fraction], bool], most: Fraction) -> float:
-    """Return a number that fits, and near which larger ones do not; zero where none does."""
-    low, high = _ZERO, most
-    for _ in range(_STEPS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return float(low)
 
 
 def _told(

@@ -11,10 +11,11 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
 from echelon.agents.references.reference import COORDINATES, Reference
-from echelon.core.enclosure.interval import ELEMENTARY, Interval, point
+from echelon.core.enclosure.interval import Interval, point
 from echelon.core.enclosure.series import enclose_derivatives
 from echelon.core.errors import GainError
 from echelon.core.memoize import memoize
+from echelon.core.rational import float_below, root_bounds
 from echelon.core.words import Kind
 from echelon.laws.stopping_point import StoppingLeader
 
@@ -129,15 +130,11 @@ def least_on_path(
     names = [leader.ready.chains.outputs[k] for k in outputs]
     found = pieces_of(leader, model, horizon, names, order)
     low = min(_least_of(rows[order]) for rows in found.values)
-    value = float(low)
-    # `float` rounds to nearest, and a bound must not be rounded up.
-    return Least(
-        value if Fraction(value) <= low else float(np.nextafter(value, -np.inf)), found.kind
-    )
+    return Least(float_below(low), found.kind)
 
 
 def _least_of(row: Sequence[Interval]) -> Fraction:
     if len(row) == 1:
         return row[0].lo
     sizes = (Fraction(0) if x.holds(0) else min(abs(x.lo), abs(x.hi)) for x in row)
-    return ELEMENTARY["sqrt"].range(point(sum((size**2 for size in sizes), Fraction(0)))).lo
+    return root_bounds(sum((size**2 for size in sizes), Fraction(0)))[0]

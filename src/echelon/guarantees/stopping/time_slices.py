@@ -5,22 +5,16 @@ asked for has built up. On a slice of x = exp(-unit t) each is bounded by itself
 """
 
 import functools
-import math
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
 from echelon.core.enclosure.interval import ELEMENTARY, point
+from echelon.core.rational import round_up
 from echelon.guarantees.stopping.chain_response import Chain, bounds_on_pieces, spreads_on_pieces
 
 _HALVINGS = 7
 """Of 0 < x <= 1: 128 slices, 8 ms long at first if the unit is 1 1/s."""
-_FINE = 1 << 64
-
-
-def rounded_up(x: Fraction) -> Fraction:
-    """Return a short rational that is not below x, 2^-64 above it at most."""
-    return Fraction(math.ceil(x * _FINE), _FINE)
 
 
 class DerivativeBounds(NamedTuple):
@@ -38,7 +32,7 @@ class DerivativeBounds(NamedTuple):
         """Return a bound of |v^(order)| from a start (v, v', ..), of which sizes are given."""
         row = zip(self.free[order], start, strict=False)
         left = sum((a * b for a, b in row if b), Fraction(0))
-        return rounded_up(left + self.driven[order] * speed)
+        return round_up(left + self.driven[order] * speed)
 
 
 class TimeSlice(NamedTuple):
@@ -85,7 +79,7 @@ def _reaches(chain: Chain) -> list[DerivativeBounds]:
     grown = [_grown(chain, order) for order in orders]
     return [
         DerivativeBounds(
-            tuple(tuple(rounded_up(column[k]) for column in row) for row in free),
+            tuple(tuple(round_up(column[k]) for column in row) for row in free),
             tuple(row[k] for row in grown),
         )
         # Time goes on as x falls from 1 to 0.
@@ -99,5 +93,5 @@ def _grown(chain: Chain, order: int) -> list[Fraction]:
     found = list[Fraction]()
     for spread in reversed(spreads_on_pieces(chain.kernel(order), _HALVINGS)):
         total += spread
-        found.append(rounded_up(total))
+        found.append(round_up(total))
     return found[::-1]

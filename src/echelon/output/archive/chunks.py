@@ -1,4 +1,4 @@
-"""What a run leaves in its folder while it lasts: a file a stretch, and what going on rests on."""
+"""The partial results of a run in its folder, from which it can be continued."""
 
 import contextlib
 import hashlib
@@ -18,102 +18,100 @@ from echelon.core.files import write_atomic
 from echelon.core.provenance import versions
 from echelon.experiments.scenario.scenario import KEPT, Scenario
 from echelon.experiments.scenario.self_contained import self_contained
-from echelon.output.archive.folder import CHUNKS, INPUTS, unwritable
+from echelon.output.archive.folder import CHUNKS, INPUTS, write_errors
 from echelon.simulation.engine.record import Stretch
 from echelon.simulation.step.meter import Sums
 
 _BEGUN = "begun.json"
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-"""What reading a file that is cut short or was changed may raise."""
+"""Errors of reading a file that is truncated or was changed."""
 
 
 @final
 class Chunks:
-    """The stretches of one run in its folder, each named by the step at which it begins.
+    """The stretches of one run in its folder, each in a file named by its first step.
 
-    So those of two processes that computed the same run fit together, wherever each was cut.
+    So stretches that two processes computed of the same run fit together.
 
     Args:
         folder: of the run.
-        by: the folder in it where they are.
+        by: the folder in it that holds them.
     """
 
     def __init__(self, folder: Path, by: str = CHUNKS) -> None:
-        """Take the folder."""
+        """Use a folder, which may not exist yet."""
         self.folder, self.place = folder, folder / by
 
     @property
     def exist(self) -> bool:
-        """Whether the run may go on."""
+        """Whether there is an unfinished run."""
         return self.place.is_dir()
 
     @property
     def hold_any(self) -> bool:
-        """Whether a stretch was written."""
+        """Whether a stretch is stored."""
         return any(self.place.glob("*.npz"))
 
     def begin(self, scenario: Scenario, more: Mapping[str, str] = MappingProxyType({})) -> None:
-        """Write the scenario with all files that it names, before anything is computed.
+        """Write the scenario and all files that it names, before anything is computed.
 
-        `more` are texts that the numbers rest on too, by their names among these files.
+        `more` are further inputs, as texts by the name of their file.
 
         Raises:
             OutputError: a file cannot be written.
         """
         text, files = self_contained(scenario, INPUTS)
-        try:
+        with write_errors(self.folder):
             for name, source in files.items():
                 (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
                 write_atomic(self.folder / name, source.read_bytes())
-            for name, told in more.items():
+            for name, content in more.items():
                 (self.folder / INPUTS).mkdir(exist_ok=True)
-                write_atomic(self.folder / INPUTS / name, told)
+                write_atomic(self.folder / INPUTS / name, content)
             write_atomic(self.folder / KEPT, text)
             begun = {"inputs": self._digest(), "versions": versions()}
             write_atomic(self.place / _BEGUN, json.dumps(begun) + "\n")
-        except OSError as error:
-            raise unwritable(self.folder, error) from error
 
     def check(self) -> None:
-        """Check that what the run is computed from is what it was begun with.
+        """Check that inputs and versions are those with which the run began.
 
         Raises:
-            OutputError: it is not, or is computed by other versions, which round otherwise.
+            OutputError: they are not, so that its numbers could differ.
         """
         try:
             begun = json.loads((self.place / _BEGUN).read_text("utf-8"))
         except _DAMAGED as error:
             raise OutputError(
-                f"`{self.folder}` holds no run that can go on; give the folder of one that ended."
+                f"`{self.folder}` holds no unfinished run; give the folder of one."
             ) from error
         if begun["inputs"] != self._digest():
             raise OutputError(
-                f"the scenario in `{self.folder}` was changed since the run began, so it cannot go "
-                f"on; `echelon run {self.folder}` runs what is there now from the start."
+                f"the scenario in `{self.folder}` was changed since the run began, so it cannot be "
+                f"continued; `echelon run {self.folder}` starts a new run of it."
             )
         for name, version in versions().items():
             before = begun["versions"].get(name)
             # Unknown where the checkout could not be asked.
             if before not in (None, version):
                 raise OutputError(
-                    f"the run in `{self.folder}` was begun under {name} `{before}`, and this is "
-                    f"`{version}`, which may round otherwise; `echelon run {self.folder}` runs it "
-                    "from the start."
+                    f"the run in `{self.folder}` began with {name} `{before}`, and `{version}` is "
+                    f"installed, which may round differently; `echelon run {self.folder}` starts a "
+                    "new run."
                 )
 
     def _digest(self) -> str:
-        """Return a number that changes with the scenario and with every file that it names."""
+        """Return a digest of the scenario and of every file that it names."""
         files = [self.folder / KEPT, *sorted((self.folder / INPUTS).rglob("*"))]
         digest = hashlib.sha256()
         for file in (file for file in files if file.is_file()):
-            # Names too, each ended by a byte that no name has: the same bytes under other names are
-            # other inputs.
+            # Names too, each followed by a byte that no name has: the same bytes under other names
+            # are other inputs.
             digest.update(file.relative_to(self.folder).as_posix().encode() + b"\0")
             digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()
 
     def write(self, stretch: Stretch) -> None:
-        """Write a stretch, whole or not at all.
+        """Write a stretch completely or not at all.
 
         Raises:
             OSError: it cannot be written.
@@ -121,12 +119,12 @@ class Chunks:
         self.store(stretch.first, _arrays(stretch))
 
     def store(self, first: int, arrays: Mapping[str, Any]) -> None:
-        """Write arrays under a number, whole or not at all.
+        """Write arrays under a number, completely or not at all.
 
         Raises:
             OSError: they cannot be written.
         """
-        # In memory first, since a file is written whole or not at all.
+        # In memory first, since `write_atomic` takes all bytes of a file.
         content = io.BytesIO()
         np.savez(content, allow_pickle=False, **arrays)
         write_atomic(self.place / f"{first}.npz", content.getvalue())
@@ -134,14 +132,14 @@ class Chunks:
     def stored(self, first: int) -> dict[str, Any] | None:
         """Return the arrays under a number; None where they are missing or damaged."""
         try:
-            # A pickle would run what it holds, and a folder may come from others.
+            # A pickle could run any code, and a folder may come from others.
             with np.load(self.place / f"{first}.npz", allow_pickle=False) as stored:
                 return dict(stored)
         except _DAMAGED:
             return None
 
     def read(self) -> list[Stretch]:
-        """Return the stretches in their order, up to the first that is missing or damaged."""
+        """Return the stretches in order, up to the first that is missing or damaged."""
         return list(self._read())
 
     def _read(self) -> Iterator[Stretch]:
@@ -161,12 +159,12 @@ class Chunks:
         shutil.rmtree(self.place, ignore_errors=True)
 
     def forget(self) -> None:
-        """Remove all that `begin` wrote, where nothing was computed since."""
+        """Remove all that `begin` wrote, if nothing was computed since."""
         if not self.exist or self.hold_any:
             return
         self.remove()
         shutil.rmtree(self.folder / INPUTS, ignore_errors=True)
-        # A folder in which a person has put something meanwhile is not empty, and stays.
+        # A folder that a user has put a file into is not empty, and stays.
         with contextlib.suppress(OSError):
             (self.folder / KEPT).unlink(missing_ok=True)
             self.folder.rmdir()
@@ -177,8 +175,8 @@ def _arrays(stretch: Stretch) -> dict[str, Any]:
     plain = {name: getattr(stretch, name) for name in _PLAIN}
     sums = {f"sums_{name}": value for name, value in stretch.sums._asdict().items()}
     moment = {f"moment_{k}": value for k, value in enumerate(stretch.moment)}
-    told = {"reference": stretch.reference, "stopped": stretch.stopped}
-    return {**plain, **sums, **moment, **{k: v for k, v in told.items() if v is not None}}
+    optional = {"reference": stretch.reference, "stopped": stretch.stopped}
+    return {**plain, **sums, **moment, **{k: v for k, v in optional.items() if v is not None}}
 
 
 _PLAIN = ("done", "times", "states", "inputs", "seconds")

@@ -1,4 +1,4 @@
-"""The folder of a comparison: numbers, text, each run's dataset, and the figures."""
+"""The folder of a comparison: numbers, text, the dataset of each run, and figures."""
 
 import json
 from pathlib import Path
@@ -7,42 +7,43 @@ from typing import Any, final
 from echelon.core.files import write_atomic
 from echelon.experiments.results.dataset import save_dataset
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
-from echelon.output.archive.folder import RUNS, unwritable
+from echelon.output.archive.folder import RUNS, write_errors
 
 
 @final
 class Flights:
-    """The datasets of a comparison, each written as soon as it is there.
+    """The datasets of a comparison, each written as soon as its run is complete.
 
     Args:
         folder: of the comparison.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Begin with nothing that went wrong."""
+        """Begin without an error."""
         self.folder = folder
         self.error: OSError | None = None
 
     def write(self, row: ComparisonRow) -> None:
-        """Write what a method flew; where that fails, the comparison goes on."""
-        # A method that was refused or failed to begin has no run, and a row all the same.
+        """Write the run of a method; the comparison continues if that fails."""
+        # A method that was refused or failed to start has a row without a run.
         if row.flight is None:
             return
         try:
             (self.folder / RUNS).mkdir(parents=True, exist_ok=True)
             save_dataset(row.flight.result, self.folder / RUNS / f"{row.label}.nc")
         except OSError as error:
-            # The first: what fails after it mostly fails of the same.
+            # The first, since later errors mostly have the same cause.
             self.error = self.error or error
 
     def check(self) -> None:
-        """Check that all were written.
+        """Check that all datasets were written.
 
         Raises:
-            OutputError: one could not be.
+            OutputError: one was not.
         """
-        if self.error is not None:
-            raise unwritable(self.folder, self.error) from self.error
+        with write_errors(self.folder):
+            if self.error is not None:
+                raise self.error
 
 
 def write_comparison(
@@ -53,14 +54,12 @@ def write_comparison(
     Raises:
         OutputError: a file cannot be written.
     """
-    try:
+    with write_errors(folder):
         content = json.dumps(summary, indent=2, allow_nan=False)
         write_atomic(folder / "comparison.json", content + "\n")
         write_atomic(folder / "comparison.txt", text + "\n")
         if figures:
-            # Here, since matplotlib takes long to load, and numbers alone need none of it.
+            # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.comparison_figures import save_comparison_figures
 
             save_comparison_figures(comparison, folder)
-    except OSError as error:
-        raise unwritable(folder, error) from error

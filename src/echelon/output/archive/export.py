@@ -10,31 +10,30 @@ import numpy as np
 from echelon.core.errors import MissingExtraError, OutputError, did_you_mean, listing
 from echelon.core.files import write_atomic
 from echelon.experiments.results.recording import Recording
+from echelon.output.archive.folder import write_errors
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 def export(run: Recording, file: Path, kind: str) -> None:
-    """Write a run: `csv` and `parquet` a row for each agent at each time, `npz` and `mat` arrays.
+    """Write a run: `csv` and `parquet` one row per agent and time, `npz` and `mat` arrays.
 
     Raises:
-        OutputError: there is no such kind, or the file cannot be written.
-        MissingExtraError: Parquet is asked for, and pyarrow is not installed.
+        OutputError: the kind is unknown, or the file cannot be written.
+        MissingExtraError: Parquet needs pyarrow, which is not installed.
     """
     if kind not in KINDS:
         raise OutputError(
             f"`--to` is `{kind}`{did_you_mean(kind, KINDS)}, and must be one of {listing(KINDS)}."
         )
     content = _WRITERS[kind](run)
-    try:
+    with write_errors(file):
         write_atomic(file, content)
-    except OSError as error:
-        raise OutputError(f"`{file}` cannot be written: {error.strerror or error}.") from error
 
 
 def table(run: Recording) -> "pd.DataFrame":
-    """Return a row for each agent at each time: states and inputs by name, and `error`."""
+    """Return one row per agent and time: states and inputs by name, and the formation error."""
     import pandas as pd
 
     frames, agents = run.states.shape[:2]
@@ -64,7 +63,7 @@ def _parquet(run: Recording) -> bytes:
     except ImportError as error:
         raise MissingExtraError(
             "Parquet needs pyarrow, which is not installed; "
-            "`pip install 'echelon-formation[parquet]'` adds it, and `--to csv` needs nothing."
+            "`pip install 'echelon-formation[parquet]'`, or use `--to csv`."
         ) from error
     return content.getvalue()
 
@@ -100,7 +99,7 @@ def _mat(run: Recording) -> bytes:
     from scipy.io import savemat
 
     content = io.BytesIO()
-    # Texts as cells, which MATLAB takes names from; agents are numbered from 0 all the same.
+    # Texts as cell arrays, MATLAB's type for names; agents are numbered from 0 here too.
     arrays = {
         name: value.astype(object) if value.dtype.kind == "U" else value
         for name, value in _arrays(run).items()

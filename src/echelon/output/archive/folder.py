@@ -1,6 +1,6 @@
-"""Where a run's files go: a folder that is new or empty.
+"""The folder of a run's files: new or empty, and claimed before the run.
 
-It is taken before the run, so that nothing is lost and no two runs mix.
+So no file is lost, and the files of two runs do not mix.
 """
 
 import contextlib
@@ -17,29 +17,28 @@ DATA, GAIN, SUMMARY = "run.nc", "gain.json", "summary.json"
 _RUN = (SUMMARY, DATA, GAIN, "scenario.yaml", "report.txt", "figures", INPUTS, CHUNKS)
 _COMPARISON = ("comparison.json", "comparison.txt", RUNS, "figures")
 _SWEEP = ("sweep.nc", "scenario.yaml", "sweep.txt", "figures", INPUTS, BATCHES)
-_OURS = {SUMMARY: _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
-_OURS |= {"sweep.nc": _SWEEP, BATCHES: _SWEEP}
-"""What shows that a command wrote a folder, and all that `--force` then removes."""
-_WANTED = {CHUNKS: _RUN, RUNS: _COMPARISON, BATCHES: _SWEEP}
+_MARKS = {SUMMARY: _RUN, CHUNKS: _RUN, "comparison.json": _COMPARISON}
+_MARKS |= {"sweep.nc": _SWEEP, BATCHES: _SWEEP}
+"""The name that shows which command wrote a folder, and the files that `--force` then removes."""
+_FILES = {CHUNKS: _RUN, RUNS: _COMPARISON, BATCHES: _SWEEP}
 
 
 def claim_folder(name: str, out: Path | None, force: bool, by: str = CHUNKS) -> Path:
-    """Return the folder for a run, made and empty of earlier runs.
+    """Return the folder for a run, created and empty of earlier runs.
 
     Without `out` it is `runs/<name>-<time>`, numbered where two runs start in the same second. It
-    is taken by making the folder `by` in it, which of two runs only one can.
+    is claimed by creating the folder `by` in it, which only one of two runs can.
 
     Raises:
         OutputError: `out` holds something and `force` was not given, or it cannot be written.
     """
-    try:
+    with write_errors(Path(RUNS) if out is None else out):
         folder = _new_folder(Path(RUNS), name) if out is None else _named_folder(out, force, by)
-        (folder / by).mkdir()
+        try:
+            (folder / by).mkdir()
+        except FileExistsError:
+            raise OutputError(f"another run has just started in the folder `{out}`.") from None
         return folder
-    except FileExistsError:
-        raise OutputError(f"another run has just taken the folder `{out}`.") from None
-    except OSError as error:
-        raise unwritable(out if out is not None else Path(RUNS), error) from error
 
 
 def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[Path]:
@@ -50,74 +49,102 @@ def claim_folders(names: Sequence[str], out: Path | None, force: bool) -> list[P
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise OutputError(f"two scenarios have the name `{twice}`, and each needs its own folder.")
+        raise OutputError(f"two scenarios have the name `{twice}`; rename one of them.")
     if out is None:
         return [claim_folder(f"compare-{name}", None, force, RUNS) for name in names]
     if len(names) == 1:
-        # One comparison alone is the folder that was given, and not a folder within it.
+        # A single comparison goes into `out` itself.
         return [claim_folder(names[0], out, force, RUNS)]
     return [claim_folder(name, out / name, force, RUNS) for name in names]
 
 
-def claim_design(out: Path | None, figures: Path | None, force: bool, read: Sequence[Path]) -> None:
+def claim_design(
+    out: Path | None, figures: Path | None, force: bool, inputs: Sequence[Path]
+) -> None:
     """Check that a design can write its gain and its figures without the loss of a file.
 
     Raises:
-        OutputError: the gain would replace a file that is `read` here, or another without `force`;
-            or the folder of the figures holds something, without `force`.
+        OutputError: as in `claim_file`; or the folder of the figures holds something, and `force`
+            was not given.
     """
-    if figures is not None and figures.exists() and not figures.is_dir():
-        raise OutputError(f"`{figures}` is a file, and the figures need a folder.")
-    if figures is not None and figures.is_dir() and any(figures.iterdir()) and not force:
-        raise OutputError(
-            f"the folder `{figures}` is not empty; choose another, or `--force` to replace "
-            "earlier figures."
-        )
-    if out is None or not out.exists():
-        return
-    if out.is_dir():
-        raise OutputError(f"`{out}` is a folder, and the output must be a file.")
-    if any(file.exists() and out.samefile(file) for file in read):
-        raise OutputError(f"`{out}` is what is read here, and would be lost; choose another file.")
+    if figures is not None and figures.exists():
+        _check_folder(figures)
+        if any(figures.iterdir()) and not force:
+            raise OutputError(
+                f"the folder `{figures}` is not empty; choose another, or `--force` to replace "
+                "earlier figures."
+            )
+    if out is not None:
+        claim_file(out, force, inputs)
+
+
+def claim_file(file: Path, force: bool, inputs: Sequence[Path] = ()) -> None:
+    """Check that a file can be written without the loss of another.
+
+    Raises:
+        OutputError: it is a folder, is among the `inputs` of the command, or exists and `force` was
+            not given; or its folder does not exist.
+    """
+    if file.is_dir():
+        raise OutputError(f"`{file}` is a folder; give a file.")
+    if any(path.exists() and file.exists() and file.samefile(path) for path in inputs):
+        raise OutputError(f"`{file}` is an input of this command; choose another file.")
     # A pipe or a device holds nothing that could be lost.
-    if out.is_file() and not force:
-        raise OutputError(f"the file `{out}` exists; choose another, or `--force` to replace it.")
+    if file.is_file() and not force:
+        raise OutputError(f"the file `{file}` exists; choose another, or `--force` to replace it.")
+    if not file.resolve().parent.is_dir():
+        raise OutputError(f"`{file.parent}` is not a folder; create it first to write `{file}`.")
+
+
+def claim_files(folder: Path, names: Sequence[str], force: bool) -> None:
+    """Check that files can be written into a folder without the loss of others.
+
+    Raises:
+        OutputError: the folder is a file, or one of the files exists and `force` was not given.
+    """
+    if folder.exists():
+        _check_folder(folder)
+    existing = [name for name in names if (folder / name).exists()]
+    if existing and not force:
+        raise OutputError(
+            f"the file `{folder / existing[0]}` exists; choose another folder, or `--force` to "
+            "replace it."
+        )
+
+
+def _check_folder(path: Path) -> None:
+    if not path.is_dir():
+        raise OutputError(f"`{path}` is a file; give a folder.")
 
 
 @contextlib.contextmanager
 def writing(folder: Path, by: str = CHUNKS) -> Iterator[None]:
-    """Keep others from writing into the folder of a run, for as long as this process lives.
+    """Lock the folder of a run as long as this process writes into it.
 
-    `by` is the folder in it by which it was taken.
+    `by` is the folder in it by which it was claimed.
 
     Raises:
-        OutputError: another process writes into it, or it is no folder of a run that goes on.
+        OutputError: another process writes into it, or it holds no run to continue.
     """
     try:
         import fcntl
-    except ImportError:  # Windows has no such lock; the chunks themselves bear two writers
+    except ImportError:  # Windows has no such lock; two writers do the chunks no harm
         yield
         return
+    with write_errors(folder):
+        descriptor = os.open(folder / by, os.O_RDONLY)
     try:
-        place = os.open(folder / by, os.O_RDONLY)
-    except OSError as error:
-        raise unwritable(folder, error) from error
+        # Released by the system however the process ends, as no file in the folder would be.
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise OutputError(f"another run is writing into the folder `{folder}`.") from None
+    except OSError:
+        pass  # a file system without locks
     try:
-        # Taken back by the system however the process ends, as no file in the folder would be.
-        with contextlib.suppress(OSError):
-            _lock(place, folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
-        os.close(place)
-
-
-def _lock(place: int, folder: Path, how: int) -> None:
-    import fcntl
-
-    try:
-        fcntl.flock(place, how)
-    except BlockingIOError:
-        raise OutputError(f"another run is writing into the folder `{folder}`.") from None
+        os.close(descriptor)
 
 
 def _new_folder(parent: Path, name: str) -> Path:
@@ -126,54 +153,60 @@ def _new_folder(parent: Path, name: str) -> Path:
     stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for attempt in range(1, 1000):
         folder = parent / (stem if attempt == 1 else f"{stem}-{attempt}")
-        # Made and not looked for: of two runs that start together only one can make it.
-        try:
+        # Not `exists`: of two runs that start together only one can create it.
+        with contextlib.suppress(FileExistsError):
             folder.mkdir()
-        except FileExistsError:
-            continue
-        return folder
-    raise OutputError(f"a thousand runs of `{name}` started in the same second; wait a second.")
+            return folder
+    raise OutputError(f"999 runs of `{name}` started in the same second; wait a second.")
 
 
 def _named_folder(out: Path, force: bool, by: str) -> Path:
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"`{out}` is a file, and the output must be a folder.")
+    if out.exists():
+        _check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    # A person's files before those that a run is just writing under hidden names.
+    # Files of the user come before the hidden ones that a run is just writing.
     present = sorted((path.name for path in out.iterdir()), key=lambda name: (name[0] == ".", name))
     if present and not force:
         raise OutputError(
             f"the folder `{out}` is not empty (it holds `{present[0]}`); choose another, "
             "or `--force` to replace an earlier run."
         )
-    # Only writing shows that a folder can be written: permission bits know nothing of a full disk.
+    # Permission bits do not show a full disk, so a file is written.
     probe = out / ".writable"
     probe.touch()
     probe.unlink()
-    _clear(out, present, _WANTED[by])
+    _clear(out, present, _FILES[by])
     return out
 
 
-def _clear(out: Path, present: Sequence[str], wanted: Sequence[str]) -> None:
-    """Remove an earlier run or comparison, so that the names `wanted` are free.
+def _clear(out: Path, present: Sequence[str], names: Sequence[str]) -> None:
+    """Remove an earlier run or comparison, so that `names` are free.
 
     Raises:
-        OutputError: one is being written, or what bears a name of ours was written by others.
+        OutputError: one is being written, or a file of such a name is not from echelon.
     """
-    earlier = {name for mark, names in _OURS.items() if mark in present for name in names}
-    foreign = [name for name in present if name in {*wanted} - earlier]
+    earlier = {name for mark, files in _MARKS.items() if mark in present for name in files}
+    foreign = [name for name in present if name in {*names} - earlier]
     if foreign:
         raise OutputError(
-            f"the folder `{out}` holds `{foreign[0]}`, which no run left there; choose another."
+            f"the folder `{out}` holds `{foreign[0]}`, which echelon did not write; choose another."
         )
     with contextlib.ExitStack() as stack:
         for by in {CHUNKS, BATCHES}.intersection(present):
             stack.enter_context(writing(out, by))
-        # By name, so that nothing goes that echelon did not write.
+        # By name, so that only files of echelon are removed.
         for path in (out / name for name in earlier):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def unwritable(folder: Path, error: OSError) -> OutputError:
-    """Return the error of a folder that cannot be written, with the reason."""
-    return OutputError(f"the folder `{folder}` cannot be written: {error.strerror or error}.")
+@contextlib.contextmanager
+def write_errors(place: Path) -> Iterator[None]:
+    """Report a failure to write in one sentence.
+
+    Raises:
+        OutputError: the file or folder could not be written, with the reason.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"`{place}` cannot be written: {error.strerror or error}.") from error

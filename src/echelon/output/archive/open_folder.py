@@ -1,4 +1,4 @@
-"""A run's folder, read again: the recording of its `run.nc`, or of what was computed of it."""
+"""Read a run's folder: its dataset, its partial results, or its gain."""
 
 import json
 from pathlib import Path
@@ -15,11 +15,11 @@ from echelon.output.archive.folder import DATA, GAIN, SUMMARY
 def open_run(place: PathLike) -> Recording:
     """Return the run in a folder, or in a netCDF file such as its `run.nc`.
 
-    Of a run that was ended from outside it is what was computed.
+    Of an unfinished run it is the part that was computed.
 
     Raises:
         OutputError: there is none, it is damaged, or of another version.
-        ScenarioError: the scenario of a run that was ended cannot be read.
+        ScenarioError: the scenario of an unfinished run cannot be read.
     """
     path = Path(place)
     if path.is_file():
@@ -27,7 +27,7 @@ def open_run(place: PathLike) -> Recording:
     if (path / DATA).is_file():
         return read_recording(path / DATA)
     if path.is_dir() and Chunks(path).exist:
-        # Here, since it builds the scenario's parts, which loads JAX.
+        # Here, since building the scenario's parts loads JAX.
         from echelon.experiments.results.dataset import dataset
         from echelon.experiments.results.recording import recording
         from echelon.output.archive.run_folder import load_run
@@ -37,30 +37,30 @@ def open_run(place: PathLike) -> Recording:
         raise OutputError(f"`{path}` does not exist; give the folder of a run, or its `{DATA}`.")
     if (path / "comparison.json").is_file():
         raise OutputError(f"`{path}` is a comparison; give one of its runs, `{path}/runs/NAME.nc`.")
-    raise OutputError(f"the folder `{path}` holds no `{DATA}`, and so no run.")
+    raise OutputError(f"the folder `{path}` holds no run: it has no `{DATA}`.")
 
 
 def promise_file(place: PathLike) -> Path:
-    """Return the file that holds what a run's gain, or its law, promises: what `verify` takes.
+    """Return the file with the claims about a run's gain or law, which `verify` reads.
 
     Args:
-        place: the folder of a run; or such a file itself, which is returned as it is.
+        place: the folder of a run; or such a file, which is returned as it is.
 
     Raises:
-        OutputError: nothing that its law promises is kept there.
+        OutputError: the folder holds no such file.
     """
     path = Path(place)
     if not path.is_dir():
         return path
-    # A law without a gain leaves its tube, where it has one, in the summary.
+    # A law without a gain has its tube, if any, in the summary.
     if (path / GAIN).is_file() or not (path / SUMMARY).is_file():
         return path / GAIN
     if read_tube(path / SUMMARY) is None:
         if _summary(path / SUMMARY).get("gain") is not None:
             raise OutputError(
-                f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` makes it again."
+                f"`{path}` has lost its `{GAIN}`; `echelon run {path} --out OTHER` creates it."
             )
-        raise OutputError(f"the law of `{path}` left neither a gain nor a tube to verify.")
+        raise OutputError(f"the law in `{path}` has neither a gain nor a tube to verify.")
     return path / SUMMARY
 
 
@@ -71,9 +71,9 @@ def _summary(file: Path) -> dict[str, Any]:
         OutputError: the file is damaged.
     """
     try:
-        told = json.loads(file.read_text("utf-8"))
+        summary = json.loads(file.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise OutputError(f"`{file}` cannot be read, or is damaged: {error}.") from error
-    if not isinstance(told, dict):
-        raise OutputError(f"`{file}` is damaged: it holds no mapping.")
-    return told
+    if not isinstance(summary, dict):
+        raise OutputError(f"`{file}` is damaged: it must hold a mapping.")
+    return summary

@@ -11,7 +11,7 @@ from echelon.experiments.results.recording import recording
 from echelon.experiments.scenario.build import build, note_origin
 from echelon.experiments.scenario.scenario import KEPT, load_scenario
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import DATA, GAIN, SUMMARY, claim_folder, unwritable
+from echelon.output.archive.folder import DATA, GAIN, SUMMARY, claim_folder, write_errors
 from echelon.output.reports.run_report import report
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import reassemble
@@ -36,58 +36,52 @@ def save_run(
     place = claim_folder(name, None if folder is None else Path(folder), force)
     # A run from Python has no scenario file.
     if "scenario_text" in result.provenance:
-        _write(place, KEPT, result.provenance["scenario_text"])
+        with write_errors(place):
+            write_atomic(place / KEPT, result.provenance["scenario_text"])
     write_findings(result, place, figures)
     Chunks(place).remove()
     return place
 
 
 def load_run(folder: PathLike) -> Result:
-    """Return what is kept of a run that was ended before its horizon: killed, or interrupted.
+    """Return what was computed of a run that was stopped before its horizon.
 
-    A run that is complete is in its `run.nc`, which `open_run` reads, and xarray.
+    A complete run is in its `run.nc`, which `open_run` and xarray read.
 
     Args:
-        folder: of the run, as `echelon run` made it.
+        folder: of the run, as `echelon run` created it.
 
     Raises:
-        OutputError: no part of a run is kept there.
+        OutputError: the folder holds no unfinished run.
         ScenarioError: its scenario cannot be read.
     """
     place = Path(folder)
     if not Chunks(place).exist:
-        raise OutputError(f"`{place}` keeps no part of a run; where one is complete, see `run.nc`.")
+        if (place / DATA).is_file():
+            raise OutputError(f"the run in `{place}` is complete; open its `{DATA}`.")
+        raise OutputError(f"`{place}` holds no unfinished run; give the folder of one.")
     scenario = load_scenario(place / KEPT)
     return note_origin(reassemble(*build(scenario), Chunks(place).read()), scenario)
 
 
 def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
-    """Write what is made of a run, the dataset first: then summary, report and figures.
+    """Write the dataset of a run, then summary, report and figures.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    try:
-        # The data first: a figure that fails then costs no run.
+    with write_errors(folder):
+        # The data first, so that a figure that fails loses nothing.
         data = labelled(result)
         save_dataset(data, folder / DATA)
-        # NaN is no JSON: whoever reads the file with another parser would stop there.
+        # NaN is not JSON, and other parsers refuse it.
         content = json.dumps(summary(result), indent=2, allow_nan=False)
         write_atomic(folder / SUMMARY, content + "\n")
         write_atomic(folder / "report.txt", report(result) + "\n")
         if result.drive.gain is not None:
             save_gain(result.drive.gain, result.model, result.graph, folder / GAIN)
         if figures and len(result.times):
-            # Here, since matplotlib takes long to load, and a run without figures needs none of it.
+            # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.run_figures import save_figures
 
             save_figures(recording(data.dataset()), folder)
-    except OSError as error:
-        raise unwritable(folder, error) from error
-
-
-def _write(folder: Path, name: str, text: str) -> None:
-    try:
-        write_atomic(folder / name, text)
-    except OSError as error:
-        raise unwritable(folder, error) from error

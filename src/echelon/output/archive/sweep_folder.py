@@ -1,4 +1,4 @@
-"""The folder of a sweep: the batches that are done, and in the end the dataset and its figures."""
+"""The folder of a sweep: batches while it is computed, then the dataset and figures."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from echelon.experiments.sweeps.axes import read_axes
 from echelon.experiments.sweeps.plan import Sweep
 from echelon.experiments.sweeps.workers import SweepBatch
 from echelon.output.archive.chunks import Chunks
-from echelon.output.archive.folder import BATCHES, INPUTS, unwritable
+from echelon.output.archive.folder import BATCHES, INPUTS, write_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,18 +20,18 @@ _OVER = "over.json"
 
 @final
 class Batches:
-    """What a sweep leaves in its folder while it lasts: a file a batch, named by its first run.
+    """The batches of a sweep in its folder, each in a file named by its first run.
 
     Args:
         folder: of the sweep.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Take the folder."""
+        """Use a folder, which may not exist yet."""
         self.folder, self.chunks = folder, Chunks(folder, BATCHES)
 
     def begin(self, plan: Sweep) -> None:
-        """Write the scenario and what varies, before anything is computed.
+        """Write the scenario and the axes, before anything is computed.
 
         Raises:
             OutputError: a file cannot be written.
@@ -43,25 +43,23 @@ class Batches:
         """Return the sweep that was begun here.
 
         Raises:
-            OutputError: there is none, or it cannot go on to the same bits.
+            OutputError: there is none, or its inputs or versions changed.
         """
         self.chunks.check()
         over = json.loads((self.folder / INPUTS / _OVER).read_text("utf-8"))
         return Sweep(load_scenario(self.folder / KEPT), read_axes(over))
 
     def write(self, batch: SweepBatch) -> None:
-        """Write a batch, whole or not at all.
+        """Write a batch completely or not at all.
 
         Raises:
             OutputError: it cannot be written.
         """
-        try:
+        with write_errors(self.folder):
             self.chunks.store(batch.first, batch.columns)
-        except OSError as error:
-            raise unwritable(self.folder, error) from error
 
     def read(self) -> list[SweepBatch]:
-        """Return the batches that are whole."""
+        """Return the batches that are stored completely."""
         names = (file.stem for file in self.chunks.place.glob("*.npz"))
         firsts = sorted(int(name) for name in names if name.isdigit())
         stored = ((first, self.chunks.stored(first)) for first in firsts)
@@ -69,19 +67,17 @@ class Batches:
 
 
 def write_sweep(data: "xr.Dataset", text: str, folder: Path, figures: bool = True) -> None:
-    """Write the dataset of a sweep, what it shows in words, and the figures.
+    """Write the dataset of a sweep, its report and the figures.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    try:
-        # In memory first: on a disk that is full the library under it ends the whole process.
+    with write_errors(folder):
+        # In memory first: on a full disk the HDF5 library would end the whole process.
         write_atomic(folder / "sweep.nc", bytes(data.to_netcdf(None, engine="h5netcdf")))
         write_atomic(folder / "sweep.txt", text + "\n")
         if figures:
-            # Here, since matplotlib takes long to load, and numbers alone need none of it.
+            # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.sweep_figures import save_sweep_figures
 
             save_sweep_figures(data, folder)
-    except OSError as error:
-        raise unwritable(folder, error) from error

@@ -14,8 +14,9 @@ from echelon.core.types import Array
 from echelon.simulation.engine.devices import advance_parted, mesh_of
 from echelon.simulation.native.varying import is_number
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, advance, begin
+from echelon.simulation.step.loop import Loop, Moment, WorldState
 from echelon.simulation.step.meter import Sums, on_host
+from echelon.simulation.step.sequence import advance, begin
 
 _AGENT_STEPS, _FEWEST = 100_000, 4
 """Steps of one agent each in a chunk, and the fewest of all agents.
@@ -67,6 +68,15 @@ class JaxStepper(Stepper):
         """Steps that take some tenths of a second, or a few of very many agents."""
         return _longest(len(self.states))
 
+    @property
+    def largest(self) -> float:
+        """The magnitude of states beyond which nothing is computed: none."""
+        return np.inf
+
+    def turn(self, loop: Loop) -> None:
+        """Continue in a loop that is like the one before but for its numbers."""
+        self.loop = loop
+
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
         return begin(self.loop, self.states)
@@ -74,7 +84,7 @@ class JaxStepper(Stepper):
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
-        now, (states, inputs), sums = step(self.loop, now, counts, reference)
+        now, (states, inputs), sums = step(self.loop, now, counts, reference, now.step)
         return Chunk(now, *on_host((states, inputs, sums)))
 
 
@@ -128,7 +138,7 @@ def _merged(array: Array, axis: int) -> Array:
     return array.reshape(*head, int(np.prod(array.shape[axis : axis + 2])), *tail)
 
 
-_ALL = Moment(None, 0, 0, 0, 0)  # type: ignore[arg-type]
+_ALL = Moment(None, 0, 0, 0, 0, WorldState(0, 0))  # type: ignore[arg-type]
 """All are at the same step."""
 _SUMS: Any = Sums(*[0] * len(Sums._fields))._replace(steps=None, errors=1, tracking=1)
 
@@ -140,9 +150,9 @@ def _begin_all(loop: Loop, axes: Any, states: jax.Array) -> Moment:
 
 @cached_jit
 def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, wanted: Any) -> Any:
-    each = (axes, _ALL, None, None)
+    each = (axes, _ALL, None, None, None)
     return eqx.filter_vmap(advance, in_axes=each, out_axes=(_ALL, 1, _SUMS))(
-        loop, now, counts, wanted
+        loop, now, counts, wanted, now.step
     )
 
 

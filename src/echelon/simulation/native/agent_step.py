@@ -16,7 +16,8 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.codegen import Body, factored
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
-from echelon.simulation.step.loop import Loop, act_alone, tell, what_limits_did
+from echelon.simulation.step.action import act, feedforward_of, limit_sides
+from echelon.simulation.step.loop import Loop
 
 
 class BlockRows(NamedTuple):
@@ -60,8 +61,10 @@ class BlockRows(NamedTuple):
         """Return the rows of a loop of which so many numbers differ between formations.
 
         Raises:
-            Unsupported: the memory of a law is not made of numbers.
+            Unsupported: the memory of a law is not made of numbers, or messages take time.
         """
+        if loop.channel is not None:
+            raise Unsupported("a network that is not ideal")
         n, m = len(loop.model.state_names), len(loop.model.input_names)
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None
@@ -104,7 +107,7 @@ def message_size(loop: Loop) -> int:
     # Of the message alone: a trace of all that a leader does takes as long as its code.
     def message(x: jax.Array, v: jax.Array) -> jax.Array:
         follower = loop.follower.facing(x[0]) if turning else loop.follower
-        return tell(follower, loop.model, x, v, loop.leader.init())
+        return feedforward_of(follower, loop.model, x, v, loop.leader.init())
 
     return jax.eval_shape(message, np.zeros(n), np.zeros(m)).shape[0] + turning
 
@@ -170,11 +173,11 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
     law = loop.leader if leads else loop.follower
     model, motion, meter = loop.model, loop.motion, loop.meter
 
-    def act(inputs: StepInputs) -> StepOutputs:
+    def step(inputs: StepInputs) -> StepOutputs:
         x, offset = inputs.x, inputs.offset
         view = LocalView(inputs.t, x, offset, inputs.z, inputs.message, motion.dt)
-        commanded, u, memory, message = act_alone(loop, law, view, inputs.memory, leads)
-        limited, cut = what_limits_did(u, commanded)
+        desired, u, memory, message = act(loop, law, view, inputs.memory, leads)
+        limited, cut = limit_sides(u, desired)
         metered = meter.of_agent(inputs.step, inputs.steady, x, offset, inputs.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
         if inputs.reference is not None:
@@ -198,7 +201,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
             next_signal=_signal_of(loop, law, state, offset, memory),
         )
 
-    return act
+    return step
 
 
 def body_of(
@@ -226,10 +229,10 @@ def body_of(
     law = loop.leader if leads else loop.follower
     inputs = step_inputs(loop, graph, rows, law, leads, follows)
 
-    def act(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
+    def step(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
         return agent_step(varying.filled(leaves), leads)(inputs)
 
-    results = lower(act, graph, [varying_leaves(varying, graph, rows, follows, in_table), inputs])
+    results = lower(step, graph, [varying_leaves(varying, graph, rows, follows, in_table), inputs])
     shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
     outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
     memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))

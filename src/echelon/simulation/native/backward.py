@@ -43,8 +43,9 @@ from echelon.simulation.native.transposed_graph import (
 )
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.loop import Loop, Moment, begin, signals
+from echelon.simulation.step.loop import Loop, Moment
 from echelon.simulation.step.meter import Sums
+from echelon.simulation.step.sequence import begin, signals
 
 BITS = 64
 _TAPE = 256 * 2**20

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
@@ -43,6 +44,7 @@ class Problem(NamedTuple):
         meter: what is measured at each step.
         settings: horizon, step and the like.
         states: (N, n) at the beginning.
+        channel: what the network does to messages; None for the ideal network.
     """
 
     model: ControlAffine
@@ -52,6 +54,7 @@ class Problem(NamedTuple):
     meter: Meter
     settings: Settings
     states: Array
+    channel: Channel | None = None
 
 
 class Chunk(NamedTuple):

@@ -15,6 +15,7 @@ import scipy.linalg
 
 from echelon.core.errors import GainError
 from echelon.core.linear import symmetric_basis
+from echelon.core.rational import bisect
 from echelon.core.types import Array
 
 _FAR = 1e6  # factors on the coupling beyond this count as infinite
@@ -277,11 +278,7 @@ def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -
         # ends.
         probe = 0.5 * (here + beyond)
         if not decays(probe):
-            outside = probe
-            for _ in range(60):
-                middle = 0.5 * (inside + outside)
-                inside, outside = (middle, outside) if decays(middle) else (inside, middle)
-            return inside
+            return bisect(decays, inside, probe, 60)
         inside = probe
     return end
 

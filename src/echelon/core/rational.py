@@ -1,0 +1,66 @@
+"""Bounds in exact rational arithmetic: rounding in a stated direction, roots, and bisection.
+
+The verifier has its own, since it shares nothing with what it checks.
+"""
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+from typing import TypeVar
+
+_ROOT_BITS = 96  # significant bits of a root that is irrational
+_FINE = 1 << 64
+_ZERO = Fraction(0)
+
+_Real = TypeVar("_Real", float, Fraction)
+
+
+def float_below(x: Fraction) -> float:
+    """Return the largest float that is not above x."""
+    near = float(x)
+    # `float` rounds to nearest, and a lower bound must not be rounded up.
+    return near if Fraction(near) <= x else math.nextafter(near, -math.inf)
+
+
+def float_above(x: Fraction) -> float:
+    """Return the smallest float that is not below x."""
+    return -float_below(-x)
+
+
+def round_up(x: Fraction) -> Fraction:
+    """Return a short rational that is not below x, and at most 2^-64 above it."""
+    return Fraction(math.ceil(x * _FINE), _FINE)
+
+
+def root_bounds(x: Fraction | int) -> tuple[Fraction, Fraction]:
+    """Return short rationals below and above the root of x >= 0; both are it where it is short."""
+    x = Fraction(x)
+    bits = x.denominator.bit_length() // 2 - x.numerator.bit_length() // 2
+    shift = max(0, _ROOT_BITS + bits)
+    square = x * (1 << (2 * shift))
+    # The root of a number lies between that of its floor, rounded down, and one more.
+    low = math.isqrt(math.floor(square))
+    high = low if low * low == square else low + 1
+    return Fraction(low, 1 << shift), Fraction(high, 1 << shift)
+
+
+def norm_above(first: Fraction, *others: Fraction) -> Fraction:
+    """Return a short rational that is not below the Euclidean norm of numbers >= 0."""
+    if not any(others):
+        return round_up(first)
+    return round_up(root_bounds(sum((x * x for x in others), first * first))[1])
+
+
+def bisect(holds: Callable[[_Real], bool], low: _Real, high: _Real, halvings: int) -> _Real:
+    """Return a number at which a condition holds, close to where it stops holding.
+
+    Args:
+        holds: the condition, assumed at `low`.
+        low: where the search begins.
+        high: beyond the number that is sought, above or below `low`.
+        halvings: of the interval; the result is within its 2^-halvings of the border.
+    """
+    for _ in range(halvings):
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
