@@ -1,7 +1,7 @@
 """Sums of angle differences by sums of plain differences, which are equal for small angles.
 
-A difference of angles is the shorter way round. Where neighbours read whole vectors of an agent, the
-last entry is a flag: 0 if all angles of the agent are small, NaN if one is not. The sum of its
+A difference of angles is the shorter way round. Where neighbours read whole vectors of an agent,
+the last entry is a flag: 0 if all angles of the agent are small, NaN if one is not. The sum of its
 differences then tells whether the sums of plain differences are correct.
 """
 
@@ -14,7 +14,7 @@ from echelon.simulation.scalars.scalar_graph import Node, rewritten
 
 
 def plain_limits(plan: Plan) -> dict[int, float]:
-    """Return for each entry up to which size of both numbers its difference is plain; 0 is never."""
+    """Return for each entry up to which size of both numbers its difference is plain."""
     return {k: _limit(k, node) for k, node in enumerate(plan.others.difference)}
 
 

@@ -24,8 +24,8 @@ def _ways(bits: int) -> list[tuple[int, bool]]:
 def copy_text(bits: int, lanes: int) -> str:
     """Return code as text for LLVM that copies rows of blocks into arrays, or back.
 
-    A block is read once, one cache line after the other, and each number goes to its agent: agent by
-    agent, each would read as many cache lines as it has rows.
+    A block is read once, one cache line after the other, and each number goes to its agent: agent
+    by agent, each would read as many cache lines as it has rows.
     """
     w, slots = Writer(bits, lanes), dict[str, str]()
     w.label("entry")

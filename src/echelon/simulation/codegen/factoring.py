@@ -2,14 +2,14 @@
 
 What users write as matrices and as stages of an integrator has the same factors many times. Here a
 sum is a list of terms, each a plain number times factors: terms of the same factors are merged, and
-a factor of several terms is multiplied once; uniform factors are multiplied first, so that stages of
-an integrator number the product. A sum within a sum is expanded only if the two have a common factor.
-Everything else is computed as it is written, and so are nodes marked as `verbatim`, the insides of
-elementary functions.
+a factor of several terms is multiplied once; uniform factors are multiplied first, so that stages
+of an integrator share the product. A sum within a sum is expanded only if the two have a common
+factor. Everything else is computed as it is written, and so are nodes marked as `verbatim`, the
+insides of elementary functions.
 
 Where a factor was taken out, results differ by the rounding of the terms, and numbers may overflow
-or underflow in other places: x a - x b is NaN at x = 10 and a = b = 1e308 as it is written, and 0 as
-x (a - b). NaN that has another cause stays NaN.
+or underflow in other places: x a - x b is NaN at x = 10 and a = b = 1e308 as it is written, and 0
+as x (a - b). NaN that has another cause stays NaN.
 """
 
 import math
@@ -220,7 +220,7 @@ def _most_common(terms: Sequence[Term]) -> Common | None:
 
 
 def _take_out(terms: Sequence[Term], common: Common) -> list[Term]:
-    """Return terms with those that have a common factor merged, at the place of the last of them."""
+    """Return terms with those that have a common factor merged, at the place of the last."""
     inner, others, place = list[Term](), list[Term](), 0
     for term in terms:
         rest = _without(term, common)

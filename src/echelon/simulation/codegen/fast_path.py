@@ -1,8 +1,8 @@
 """The fast path of a step, and the conditions under which it is correct.
 
 Much of a step is written for unlikely cases: an angle beyond 45 degrees, a motor at its limit. A
-truth marked as `unlikely` may always be assumed to hold, because what it then selects is correct for
-every number; while it does not hold, it may be assumed not to hold. So a step is written twice:
+truth marked as `unlikely` may always be assumed to hold, because what it then selects is correct
+for every number; while it does not hold, it may be assumed not to hold. So a step is written twice:
 without the unlikely cases, and in full. The first is tried, and left for the second if a lane needs
 it. Both compute the same bits.
 """
@@ -18,7 +18,8 @@ class FastPath(NamedTuple):
 
     Attributes:
         nodes: a node of the full step -> its node in the fast path.
-        levels: truths of which none may hold; each level depends on the assumptions of those before.
+        levels: truths of which none may hold; each level depends on the assumptions of those
+            before.
     """
 
     nodes: Mapping[Node, Node]

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from echelon.simulation.scalars import Node, needed
 
 NO_MINIMUM = 2**31 - 1
 """The minimum in a row that has none yet: no step has that number."""
+_Part: TypeAlias = Mapping[int, Node] | Sequence[Node]
 _NONE: Mapping[int, Node] = MappingProxyType({})
 
 
@@ -23,9 +24,11 @@ class Body(NamedTuple):
         sums: row -> what is added to it.
         maxima: row -> a value; the row keeps the largest so far.
         minima: row -> a value; the row keeps the smallest so far, beginning with `NO_MINIMUM`.
-        on_request: row -> its new value at the step `input_step` only, since every store costs time.
+        on_request: row -> its new value at the step `input_step` only, since every store costs
+            time.
         mirror: what neighbours read after the step, entry by entry.
-        to_sources: what is added to the contributions of the agent that sent the message, from 0 on.
+        to_sources: what is added to the contributions of the agent that sent the message, from 0
+            on.
         to_leaders: what is added to the contributions of the leader, behind the former.
         tape: row of the tape -> what is recorded there at each step, if a tape is given.
         totals: place -> what is added up there over all agents and steps.
@@ -63,17 +66,16 @@ class Body(NamedTuple):
 
     def map_nodes(self, after: Mapping[Node, Node]) -> "Body":
         """Return the body with some nodes replaced by others."""
-        return Body(
-            *(
-                {row: after.get(node, node) for row, node in part.items()}
-                if isinstance(part, Mapping)
-                else [after.get(node, node) for node in part]
-                for part in self
-            )
-        )
+
+        def mapped(part: _Part) -> _Part:
+            if isinstance(part, Mapping):
+                return {row: after.get(node, node) for row, node in part.items()}
+            return [after.get(node, node) for node in part]
+
+        return Body._make(map(mapped, self))
 
 
-def _nodes_in(parts: Sequence[Mapping[int, Node] | Sequence[Node]]) -> list[Node]:
+def _nodes_in(parts: Sequence[_Part]) -> list[Node]:
     lists = (part.values() if isinstance(part, Mapping) else part for part in parts)
     return [node for nodes in lists for node in nodes]
 
@@ -86,8 +88,8 @@ class Plan(NamedTuple):
         lanes: of a vector.
         batched: whether a vector holds one agent of several formations, all alike, and not several
             agents of one formation.
-        row_major: whether what neighbours read of a swarm is stored row by row, because most vectors
-            of neighbours are agents that follow each other: rings, paths, grids.
+        row_major: whether what neighbours read of a swarm is stored row by row, because most
+            vectors of neighbours are agents that follow each other: rings, paths, grids.
         rows: of a block.
         width: numbers that neighbours read of an agent, stored in whole vectors; with the flag of
             `angle_differences.has_flag`, if there is one.
@@ -98,14 +100,15 @@ class Plan(NamedTuple):
         one_source: whether one agent sends to all others, so that no sender is looked up.
         one_leader: whether all have the same leader.
         weighted: whether some weight of an edge is not 1.
-        edges: entries that neighbours read of which distances are computed; none if no distances are.
+        edges: entries that neighbours read of which distances are computed; none if no distances
+            are.
         table: numbers per step in the table.
         dt: s.
         leaders_ahead: whether the leaders may take many steps before the others take the first,
             because they receive nothing: what they send is stored for each step.
         tape_rows: rows per block and step on the tape.
-        backward: whether the steps run from the last to the first, the followers before the leaders,
-            the deepest level first: for derivatives.
+        backward: whether the steps run from the last to the first, the followers before the
+            leaders, the deepest level first: for derivatives.
     """
 
     bits: int
@@ -185,8 +188,9 @@ stored at the step `input_step`.
 
 `schedule` has `count` rows of `TASK`: blocks of one level and blocks of edges that take a step.
 Before a task a thread waits for the others: until each thread before it has finished as many tasks
-as `before` says, and each thread behind it as many as `after`. `progress` counts the tasks that each
-has finished, one cache line apart, and `yield_processor` is a function that yields the processor.
+as `before` says, and each thread behind it as many as `after`. `progress` counts the tasks that
+each has finished, one cache line apart, and `yield_processor` is a function that yields the
+processor.
 
 `tape` is 0 if nothing is recorded, and `tape_step` is how many numbers lie between its steps;
 `totals` has a vector for each total, and `contributions` what was added for each agent.

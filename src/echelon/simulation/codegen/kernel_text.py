@@ -2,10 +2,10 @@
 
 Agents are stored in blocks of as many as a vector has lanes. A block holds its numbers row by row,
 so that one address reaches all of them. What neighbours read of an agent is stored separately and
-twice, as it is and as it will be after the step, one agent after the other: a neighbour is anywhere,
-and its numbers are together. If a vector holds one agent of many formations, a neighbour is another
-vector: what it shows is stored row by row, and each group of formations takes all its steps before
-the next one, so that it stays in the nearest cache.
+twice, as it is and as it will be after the step, one agent after the other: a neighbour is
+anywhere, and its numbers are together. If a vector holds one agent of many formations, a neighbour
+is another vector: what it shows is stored row by row, and each group of formations takes all its
+steps before the next one, so that it stays in the nearest cache.
 """
 
 import contextlib

@@ -144,9 +144,7 @@ def _listed_entries(
         places = load_places(w, slots[which], first)
         addresses = ((k, mirror_row(w, context, k)) for k in entries)
         return {k: gather(w, a, _with_leaders(w, context, k, places), 0) for k, a in addresses}
-    others = [
-        _neighbour_at(w, context, at, lane, plan.leaders_ahead) for lane in range(w.lanes)
-    ]
+    others = [_neighbour_at(w, context, at, lane, plan.leaders_ahead) for lane in range(w.lanes)]
     vectors, four = dict[int, str](), f"<4 x {w.scalar}>"
     for piece in sorted({k // 4 for k in entries}):
         # A gather of one number a lane would cost more than transposing rows, four by four.
@@ -235,9 +233,7 @@ def _subtract_some(
         at_weights = w.at(w.scalar, context.slots["weights"], place)
         lanes = dict.fromkeys(lane for lane, _ in places)
         others = {lane: _neighbour_at(w, context, at, lane) for lane in lanes}
-        weights = {
-            lane: w.splat(w.load(w.scalar, at_weights, lane)) for lane in lanes if weighted
-        }
+        weights = {lane: w.splat(w.load(w.scalar, at_weights, lane)) for lane in lanes if weighted}
         for k, (lane, piece) in enumerate(places):
             their = w.load(w.vector, others[lane], piece * w.lanes)
             difference = w.operation("sub", [mine[k], their])

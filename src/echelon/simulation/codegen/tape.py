@@ -1,16 +1,16 @@
 """What a kernel for derivatives needs: a tape of each step, sums over agents, contributions.
 
 In the backward pass, the agents that received a message add a contribution for its sender: the
-transpose of a look-up is an addition. The agents of a vector add one after the other, so that no two
-write to one place at once, and the order, and with it every bit, is the same each time.
+transpose of a look-up is an addition. The agents of a vector add one after the other, so that no
+two write to one place at once, and the order, and with it every bit, is the same each time.
 """
 
 from collections.abc import Mapping, Sequence
 
+from echelon.simulation.codegen.emitter import Emitter
 from echelon.simulation.codegen.ir_blocks import Context, listed_block, only_if
 from echelon.simulation.codegen.kernel_plan import Body, Plan, stride
 from echelon.simulation.codegen.neighbours import transposed
-from echelon.simulation.codegen.emitter import Emitter
 from echelon.simulation.codegen.vector_ir import Writer
 from echelon.simulation.scalars.scalar_graph import Node, needed
 
@@ -30,7 +30,7 @@ def contribution_widths(plan: Plan) -> tuple[int, int]:
 
 
 def from_tape(body: Body, names: Mapping[str, str]) -> tuple[Body, list[tuple[str, int]]]:
-    """Return a body that reads from a tape what the forward step had, and the leaves recorded there.
+    """Return a body that reads from a tape, and the leaves that the forward step records there.
 
     Args:
         body: whose leaves are named as in the forward step.

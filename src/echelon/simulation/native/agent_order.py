@@ -22,8 +22,8 @@ def ordered(loop: Loop, lanes: int, near: Array, degrees: Array | None) -> tuple
     """Return the agents in the order in which they act, and the first block of each level.
 
     In a level they are in the order `near` of all agents, and within windows of it by their degrees
-    if these are given. A level fills its last block with copies of its last agent, which compute the
-    same and are not read.
+    if these are given. A level fills its last block with copies of its last agent, which compute
+    the same and are not read.
     """
     levels = [loop.followers]
     if loop.levels is not None:
@@ -51,8 +51,8 @@ def windows(degrees: Array) -> Array:
 def nearby(loop: Loop) -> Array:
     """Return the agents in an order in which neighbours are near each other.
 
-    It is their own order if that is as good, and for few agents. The numbers of a neighbour that was
-    stepped long ago come from main memory: a swarm in random order takes three times as long.
+    It is their own order if that is as good, and for few agents. The numbers of a neighbour that
+    was stepped long ago come from main memory: a swarm in random order takes three times as long.
     """
     agents = len(loop.offsets)
     original = np.arange(agents)
@@ -73,7 +73,8 @@ def nearby(loop: Loop) -> Array:
 def _from_an_end(links: sp.csr_array) -> Array:
     """Return connected agents by their distance from one at an end of the graph.
 
-    Neighbours are then at most about two layers apart, and layers are small if they begin at an end.
+    Neighbours are then at most about two layers apart, and layers are small if they begin at an
+    end.
     """
     reached = csgraph.breadth_first_order(links, 0, return_predecessors=False)
     return csgraph.breadth_first_order(links, reached[-1], return_predecessors=False)

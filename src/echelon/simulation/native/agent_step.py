@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, PyTree
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.codegen import Body, factored
 from echelon.simulation.native.varying import VaryingNumbers
@@ -69,11 +69,19 @@ class BlockRows(NamedTuple):
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None
         memory = max(memory_size(law) for law in (loop.leader, loop.follower))
-        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, message_size(loop), m, varying]
+        sizes = [
+            n,
+            n,
+            n if wind else 0,
+            m if noisy else 0,
+            memory,
+            m,
+            message_size(loop),
+            m,
+            varying,
+        ]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q]
-        ends = np.cumsum([0, *sizes]).tolist()
-        rows: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
-        return cls(*rows)
+        return cls(*row_ranges(sizes))
 
 
 def memory_size(law: Law) -> int:
@@ -89,14 +97,20 @@ def memory_size(law: Law) -> int:
     return sum(np.size(leaf) for leaf in leaves)
 
 
-def memories_of(like: Memory, flat: Array) -> Memory:
-    """Return memories of agents, of the structure of one, from their numbers (agents, numbers)."""
+def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
+    """Return a tree of the structure and shapes of another, or many, from numbers (..., k)."""
     leaves, tree = jax.tree.flatten(like)
     ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
     parts = zip(leaves, ends[:-1], ends[1:], strict=True)
     return tree.unflatten(
-        [flat[:, a:b].reshape(len(flat), *np.shape(leaf)) for leaf, a, b in parts]
+        [flat[..., a:b].reshape((*flat.shape[:-1], *np.shape(leaf))) for leaf, a, b in parts]
     )
+
+
+def row_ranges(sizes: Sequence[int]) -> list[Any]:
+    """Return the ranges of rows of so many numbers each, one after the other, and the last row."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
 
 
 def message_size(loop: Loop) -> int:
@@ -118,9 +132,7 @@ def signal_size(loop: Loop) -> int:
     return jax.eval_shape(lambda: _signal_of(loop, law, zero, zero, law.init())).shape[0]
 
 
-def _signal_of(
-    loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory
-) -> jax.Array:
+def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
     """Return the signal of an agent, of length 0 if it has none."""
     signal = law.signal(loop.model, x, offset, memory)
     return jnp.zeros(0, x.dtype) if signal is None else signal
@@ -251,8 +263,8 @@ def body_of(
         maxima=_placed(rows, {"unsettled": outputs.unsettled}),
         minima=_placed(rows, {"inside": outputs.inside}),
         on_request=_placed(rows, {"input": outputs.input}),
-        mirror=[*subtract(outputs.state, inputs.offset), *outputs.next_signal],
         mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],
+        mirror=[*subtract(outputs.state, inputs.offset), *outputs.next_signal],
         difference=_difference(loop, graph, len(inputs.x), len(outputs.signal)),
     )
     return body.map_nodes(factored(body.all()))
@@ -309,7 +321,7 @@ def step_inputs(
         message=np.zeros(len(rows.input))
         if leads
         else leaves_of(graph, "message", range(len(rows.message))),
-        memory=shaped(row(rows.memory[:size]), law.init()),
+        memory=unflatten(law.init(), row(rows.memory[:size])),
         leader=x - offset if leads else leaves_of(graph, "leader", range(n)),
         push=row(rows.push) if len(rows.push) else None,
         noise=row(rows.noise) if len(rows.noise) else None,
@@ -331,14 +343,6 @@ def single(node: Node) -> np.ndarray:
     array = np.empty((), object)
     array[()] = node
     return array
-
-
-def shaped(entries: np.ndarray, like: Memory) -> Memory:
-    """Return a memory with these entries, in the order of its tree."""
-    leaves, tree = jax.tree.flatten(like)
-    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
-    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
-    return tree.unflatten([entries[a:b].reshape(np.shape(leaf)) for leaf, a, b in parts])
 
 
 def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:

@@ -6,7 +6,6 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import PyTreeDef
 
 from echelon.simulation.native.varying import bare, is_number
 from echelon.simulation.step.loop import Loop
@@ -43,7 +42,7 @@ class ProgramKeys:
         return kind, tuple(_bytes(leaf) for leaf, fixed in pairs if fixed)
 
 
-def _fixed(leaves: Sequence[Any], tree: PyTreeDef) -> list[bool]:
+def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
     """Return which leaves must be equal in all loops."""
     numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
 

@@ -1,9 +1,9 @@
 """The order in which blocks of agents take their steps.
 
-Step by step, all of them; or, if all neighbours are near, tile by tile: so few blocks that they stay
-in a processor's cache take many steps before the next ones. Each step a tile moves back by as many
-blocks as neighbours are apart, so that what they show at this step is there: of blocks before the
-tile it was left by the previous tile, and blocks behind are in the tile itself.
+Step by step, all of them; or, if all neighbours are near, tile by tile: so few blocks that they
+stay in a processor's cache take many steps before the next ones. Each step a tile moves back by as
+many blocks as neighbours are apart, so that what they show at this step is there: of blocks before
+the tile it was left by the previous tile, and blocks behind are in the tile itself.
 """
 
 from typing import NamedTuple

@@ -51,7 +51,7 @@ class ThreadPool:
         """Begin with no thread running."""
         self.places, self.pool = places, pool
         large = len(places.agents) >= _SHARED
-        self.threads = 1 if places.together else threads or (processors() if large else 1)
+        self.threads = 1 if places.batched else threads or (processors() if large else 1)
         self._workers = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self._schedules: dict[tuple[int, int], Array] = {}
 
@@ -78,7 +78,7 @@ class ThreadPool:
             whole = len(some) == len(groups)
             arrays["uniform_values"] = uniform_values if whole else np.empty_like(uniform_values)
             numbers = {"groups": len(some), "threads": 1, "count": len(schedule)}
-            _call(code, values | numbers, arrays | {"schedule": schedule})
+            call(code, values | numbers, arrays | {"schedule": schedule})
 
         steps = values["steps"] * len(self.places.agents)
         if self.pool is None or len(groups) < 2 or steps < _WORTH:
@@ -122,7 +122,7 @@ class ThreadPool:
             numbers = {"groups": 1, "threads": self.threads, "thread": k}
             numbers |= {"yield_processor": yield_processor, "count": len(schedules[k])}
             arrays = {"uniform_values": uniform[k], "progress": progress, "schedule": schedules[k]}
-            _call(code, values | numbers, firsts | arrays)
+            call(code, values | numbers, firsts | arrays)
 
         # One part each, because they wait for each other.
         share(self._workers, run_thread, range(self.threads))
@@ -132,9 +132,9 @@ class ThreadPool:
         if (steps, thread) not in self._schedules:
             if len(self._schedules) > 8 * self.threads:
                 self._schedules.clear()
-            segments, near = self.places.segments, self.places.near
-            if near is not None and tiles_pay(segments, near, steps):
-                tasks = tile_by_tile(segments, near, steps, thread, self.threads)
+            segments, reach = self.places.segments, self.places.reach
+            if reach is not None and tiles_pay(segments, reach, steps):
+                tasks = tile_by_tile(segments, reach, steps, thread, self.threads)
             else:
                 edges = self.places.edge_blocks
                 tasks = step_by_step(segments, edges, steps, thread, self.threads)
@@ -167,7 +167,7 @@ def share(pool: Executor, act: Callable[[Any], None], parts: Iterable[Any]) -> N
         future.result()
 
 
-def _call(code: Code, values: dict[str, int], arrays: Mapping[str, Array]) -> None:
+def call(code: Code, values: dict[str, int], arrays: Mapping[str, Array]) -> None:
     """Call a kernel; its arrays exist until it returns."""
     slots = values | {name: array.ctypes.data for name, array in arrays.items()}
     code.call(np.array([slots.get(name, 0) for name in SLOTS], np.int64))

@@ -11,7 +11,6 @@ from typing import Any, final
 import equinox as eqx
 import jax
 import numpy as np
-from jax.tree_util import PyTreeDef
 
 from echelon.core.disk_cache import is_ours
 from echelon.core.memoize import bits_of
@@ -137,7 +136,9 @@ class VaryingNumbers:
             return self.loop
         new_leaves, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
         new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
-        return eqx.tree_at(_separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None)
+        return eqx.tree_at(
+            _separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None
+        )
 
 
 def alike(loop: Loop, other: Loop) -> bool:
@@ -145,7 +146,7 @@ def alike(loop: Loop, other: Loop) -> bool:
     return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
 
 
-def _forms(leaves: Sequence[Any], tree: PyTreeDef) -> tuple[Any, ...]:
+def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
     arrays = [np.asarray(leaf) for leaf in leaves]
     return tree, *((array.dtype, array.shape) for array in arrays)
 

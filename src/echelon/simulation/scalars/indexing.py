@@ -14,9 +14,11 @@ from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
     LONGEST,
-    Unsupported,
-    PrimitiveRule,
+    Arrays,
     Params,
+    PrimitiveRule,
+    Unsupported,
+    array_type,
     entry,
     number,
     select,
@@ -26,9 +28,7 @@ from echelon.simulation.scalars.traced_entries import (
 # ---- indices -------------------------------------------------------------------------------------
 
 
-def index_table(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return what is read or written at indices that differ between agents: each place is tried."""
     rows, ends = _rows(equation, operands), _ends(equation, operands)
     drops = _drops(equation)
@@ -57,15 +57,13 @@ _FIRST = {"dynamic_slice": 1, "dynamic_update_slice": 2}
 """The first operand that is an index, of primitives with one operand per index."""
 
 
-def _rows(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
+def _rows(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
     """Return the numbers of each place along the last axis."""
     first = _FIRST.get(equation.primitive.name)
     return operands[1] if first is None else np.stack(operands[first:], axis=-1)
 
 
-def _at(
-    algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray], rows: np.ndarray
-) -> np.ndarray:
+def _at(algebra: Algebra, equation: JaxprEqn, operands: Arrays, rows: np.ndarray) -> np.ndarray:
     """Return the result of an equation at constant indices."""
     first = _FIRST.get(equation.primitive.name)
     if first is None:
@@ -88,17 +86,17 @@ def _drops(equation: JaxprEqn) -> bool:
     return equation.params.get("mode") == GatherScatterMode.FILL_OR_DROP
 
 
-def _elsewhere(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
+def _elsewhere(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
     """Return the result for an index outside: what is not read is NaN."""
     if equation.primitive.name != "gather":
         return operands[0]
-    value, out = equation.params["fill_value"], equation.outvars[0].aval
+    value, out = equation.params["fill_value"], array_type(equation.outvars[0])
     if value is None and np.dtype(out.dtype).kind != "f":
         raise Unsupported(f"`gather` from outside of a table of {out.dtype}{where(equation)}")
     return np.full(out.shape, np.nan if value is None else value)
 
 
-def _ends(equation: JaxprEqn, operands: list[np.ndarray]) -> list[int]:
+def _ends(equation: JaxprEqn, operands: Arrays) -> list[int]:
     """Return the last place along each axis that is indexed."""
     name, params, shape = equation.primitive.name, equation.params, operands[0].shape
     if name == "dynamic_slice":
@@ -130,7 +128,7 @@ def _spread(equation: JaxprEqn, there: np.ndarray, axes: int) -> np.ndarray:
 # ---- cases ---------------------------------------------------------------------------------------
 
 
-def one_of(graph: ScalarGraph, which: Entry, *cases: Any) -> Any:
+def one_of(graph: ScalarGraph, which: "Entry | np.ndarray", *cases: Any) -> Any:
     """Return the case of a number; JAX counts from zero, and clips."""
     if not isinstance(which, Node):
         return cases[min(max(int(which), 0), len(cases) - 1)]
@@ -142,9 +140,7 @@ def one_of(graph: ScalarGraph, which: Entry, *cases: Any) -> Any:
     return result
 
 
-def cond(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def cond(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return the results of the branch that is taken, entry by entry; all are computed."""
     which, *rest = operands
     branches = equation.params["branches"]
@@ -176,9 +172,7 @@ def _only_first_is_nan(graph: ScalarGraph, a: Entry, b: Entry) -> Node:
 def extreme(before: Callable[[Entry, Entry], tuple[Entry, Entry]]) -> PrimitiveRule:
     """Return the rule of the index of the first largest or smallest entry; NaN wins."""
 
-    def find(
-        graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-    ) -> list[np.ndarray]:
+    def find(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
         [x] = operands
         [axis] = equation.params["axes"]
         if x.shape[axis] > LONGEST:
@@ -199,9 +193,7 @@ def extreme(before: Callable[[Entry, Entry], tuple[Entry, Entry]]) -> PrimitiveR
     return find
 
 
-def sort_columns(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def sorted_by(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return arrays in the order of the first of them, by bubble sort."""
     axis, n = equation.params["dimension"], operands[0].shape[equation.params["dimension"]]
     if n > LARGEST or equation.params["num_keys"] != 1:
@@ -224,12 +216,10 @@ def sort_columns(
 # ---- whole numbers -------------------------------------------------------------------------------
 
 
-def convert(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def convert(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return entries under another type; a whole number is a number without a fraction."""
     [x], [source] = operands, equation.invars
-    to, of = np.dtype(equation.params["new_dtype"]), np.dtype(source.aval.dtype)
+    to, of = np.dtype(equation.params["new_dtype"]), np.dtype(array_type(source).dtype)
     if to.kind not in "bfiu":
         raise Unsupported(f"`convert_element_type` to {to}{where(equation)}")
 
@@ -258,11 +248,9 @@ def _whole(graph: ScalarGraph, e: Entry, to: np.dtype, of: np.dtype, at: str) ->
     return e
 
 
-def divide(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def divide(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return quotients; those of whole numbers are truncated."""
-    whole = np.dtype(equation.outvars[0].aval.dtype).kind in "iu"
+    whole = np.dtype(array_type(equation.outvars[0]).dtype).kind in "iu"
 
     def quotient(a: Entry, b: Entry) -> Node:
         result = graph.make("exact_div" if whole else "div", entry(a), entry(b))
@@ -277,17 +265,15 @@ def divide(
 def logical(name: str) -> PrimitiveRule:
     """Return the rule of an operation on truths; there is none for the bits of whole numbers."""
 
-    def apply_to_truths(
-        graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-    ) -> list[np.ndarray]:
-        if np.dtype(equation.outvars[0].aval.dtype).kind != "b":
+    def rule(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+        if np.dtype(array_type(equation.outvars[0]).dtype).kind != "b":
             raise Unsupported(f"`{name}` of whole numbers{where(equation)}")
         return [map_entries(lambda *e: graph.make(name, *map(entry, e)), *operands)]
 
-    return apply_to_truths
+    return rule
 
 
-def cumulative(join: Callable[[Entry, Entry], Entry]) -> Callable[..., np.ndarray]:
+def cumulative(join: Callable[[Any, Any], Any]) -> Callable[..., np.ndarray]:
     """Return the rule of cumulative results along an axis."""
     joined = np.frompyfunc(join, 2, 1)
 
@@ -301,13 +287,13 @@ def cumulative(join: Callable[[Entry, Entry], Entry]) -> Callable[..., np.ndarra
 
 
 INDEXING: dict[str, PrimitiveRule] = {
-    **{name: index_table for name in ("gather", "dynamic_slice", "dynamic_update_slice")},
-    **{name: index_table for name in ("scatter", "scatter-add", "scatter_add")},
+    **{name: at_index for name in ("gather", "dynamic_slice", "dynamic_update_slice")},
+    **{name: at_index for name in ("scatter", "scatter-add", "scatter_add")},
     **{name: logical(name) for name in ("and", "or", "xor", "not")},
     "cond": cond,
     "argmax": extreme(lambda a, b: (a, b)),
     "argmin": extreme(lambda a, b: (b, a)),
-    "sort": sort_columns,
+    "sort": sorted_by,
     "convert_element_type": convert,
     "div": divide,
 }

@@ -20,12 +20,13 @@ from echelon.core.trace import error_summary
 from echelon.simulation.scalars import elementary
 from echelon.simulation.scalars.indexing import CUMULATIVE, INDEXING, less, one_of
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
-from echelon.simulation.scalars.small_linear_systems import cholesky, lu, solve, triangular
+from echelon.simulation.scalars.small_linear_systems import cholesky, lu, solve, triangle
 from echelon.simulation.scalars.traced_entries import (
     LONGEST,
-    Unsupported,
+    Arrays,
     Params,
     PrimitiveRule,
+    Unsupported,
     entry,
     is_truth,
     missing,
@@ -34,9 +35,7 @@ from echelon.simulation.scalars.traced_entries import (
 )
 
 
-def lower(
-    function: Callable[..., Any], graph: ScalarGraph, arguments: Sequence[Any]
-) -> list[np.ndarray]:
+def lower(function: Callable[..., Any], graph: ScalarGraph, arguments: Sequence[Any]) -> Arrays:
     """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
 
     Args:
@@ -80,7 +79,7 @@ def _within(equation: JaxprEqn) -> Iterator[None]:
 
 
 def _algebra(graph: ScalarGraph) -> Algebra:
-    def unknown(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+    def unknown(equation: JaxprEqn, operands: Arrays) -> Arrays:
         name = equation.primitive.name
         if name in _PRIMITIVES:
             return _PRIMITIVES[name](graph, algebra, equation, operands)
@@ -153,9 +152,7 @@ def _round(graph: ScalarGraph, params: Params, x: np.ndarray) -> np.ndarray:
 # ---- loops ---------------------------------------------------------------------------------------
 
 
-def _scan(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def _scan(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return the results of a loop of fixed length, unrolled."""
     params, body = equation.params, equation.params["jaxpr"]
     length, constant, carried = params["length"], params["num_consts"], params["num_carry"]
@@ -173,9 +170,7 @@ def _scan(
     return [*carry, *(np.stack(column) for column in zip(*columns, strict=True))]
 
 
-def _while(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def _while(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return the results of a loop whose end does not depend on the agents."""
     params = equation.params
     tests, bodies = params["cond_nconsts"], params["body_nconsts"]
@@ -188,7 +183,8 @@ def _while(
         if not more:
             return carry
         carry = walk(body.jaxpr, body.consts, [*body_consts, *carry], algebra)
-    raise Unsupported(f"a `while` loop whose end depends on the agent, or is more than {LONGEST} rounds away{where(equation)}")
+    reason = f"depends on the agent, or is more than {LONGEST} rounds away"
+    raise Unsupported(f"a `while` loop whose end {reason}{where(equation)}")
 
 
 _PRIMITIVES: dict[str, PrimitiveRule] = INDEXING | {
@@ -196,7 +192,7 @@ _PRIMITIVES: dict[str, PrimitiveRule] = INDEXING | {
     "while": _while,
     "custom_linear_solve": solve,
     "lu": lu,
-    "triangular_solve": triangular,
+    "triangular_solve": triangle,
 }
 _UNREAD = {"lu_pivots_to_permutation", "lu_solve"}
 """What JAX computes before it solves equations; `solve` does not read it."""

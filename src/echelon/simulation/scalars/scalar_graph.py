@@ -20,7 +20,7 @@ def _divide(a: float, b: float) -> float:
 
 
 # The result of each operation for plain numbers; each is an instruction of `codegen.vector_ir` too.
-OPERATIONS: dict[str, Callable[..., float | bool]] = {
+OPERATIONS: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
     # A difference that is not fused with a product, so that it is the same wherever it is computed.
@@ -84,7 +84,17 @@ class Node:
         verbatim: whether it is computed as it is written; otherwise sums may be rearranged.
     """
 
-    __slots__ = ("args", "at_least_0", "graph", "number", "op", "truth", "uniform", "value", "verbatim")
+    __slots__ = (
+        "args",
+        "at_least_0",
+        "graph",
+        "number",
+        "op",
+        "truth",
+        "uniform",
+        "value",
+        "verbatim",
+    )
     __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
 
     def __init__(
@@ -130,10 +140,10 @@ class Node:
 def _is_at_least_0(op: str, args: tuple[Node, ...], value: Any) -> bool:
     if op == "constant":
         return not math.isnan(value) and value >= 0.0
-    known = [a.at_least_0 for a in args]
+    signs = [a.at_least_0 for a in args]
     if op in ("add", "mul", "div", "min"):
-        return all(known) or op == "mul" and args[0] is args[1]
-    return op in ("sqrt", "abs", "pow2") or op == "max" and any(known)
+        return all(signs) or op == "mul" and args[0] is args[1]
+    return op in ("sqrt", "abs", "pow2") or op == "max" and any(signs)
 
 
 @final
@@ -160,7 +170,7 @@ class ScalarGraph:
         return self._once(("leaf", name), "leaf", (), name, uniform)
 
     def make(self, op: str, *operands: Entry) -> Node:
-        """Return the result of an operation, folded where it can be."""
+        """Return the result of an operation, simplified if possible."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in operands)
         if op not in _NEVER_FOLDED and all(a.op == "constant" for a in args):
             with np.errstate(all="ignore"):
@@ -193,7 +203,7 @@ class ScalarGraph:
 
 def needed(results: Iterable[Node]) -> list[Node]:
     """Return the nodes that results depend on, operands first."""
-    # A deterministic order, the same in every process: sets of nodes have none.
+    # Not a set: nodes of two graphs may have the same number, and their order must not vary.
     reached, todo = dict[Node, None](), list(results)
     while todo:
         node = todo.pop()
@@ -204,11 +214,11 @@ def needed(results: Iterable[Node]) -> list[Node]:
 
 
 Instead: TypeAlias = Callable[[Node, Sequence[Node]], Node | float | bool | None]
-"""(node, what its operands have become) -> what it becomes; None where it stays that operation."""
+"""(node, its new operands) -> its replacement; None if the operation stays."""
 
 
 def rewritten(results: Iterable[Node], instead: Instead) -> dict[Node, Node]:
-    """Return what each needed node becomes, folded again, where some are replaced."""
+    """Return each needed node with some nodes replaced, folded again."""
     after = dict[Node, Node]()
     for node in needed(results):
         args = [after[a] for a in node.args]
@@ -223,7 +233,7 @@ def rewritten(results: Iterable[Node], instead: Instead) -> dict[Node, Node]:
     return after
 
 
-# ---- what is simpler -----------------------------------------------------------------------------
+# ---- simplifications -----------------------------------------------------------------------------
 #
 # 0 x is 0 for every finite x. If x is NaN, this hides it in one entry of a sum; frames are checked
 # for NaN in all entries.

@@ -1,6 +1,5 @@
 """Small systems of linear equations as scalar operations: elimination, factors, triangles."""
 
-
 import numpy as np
 from jax.extend.core import JaxprEqn
 
@@ -8,19 +7,18 @@ from echelon.core.jaxpr import Algebra, walk
 from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
+    Arrays,
     Missing,
     Params,
     Unsupported,
-    select,
     missing,
     nodes,
+    select,
     where,
 )
 
 
-def solve(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def solve(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return the solution of linear equations; images of unit vectors are the matrix's columns."""
     jaxprs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
     matvec, count = jaxprs.matvec, lengths.matvec
@@ -105,9 +103,7 @@ def cholesky(graph: ScalarGraph, params: Params, matrix: np.ndarray) -> np.ndarr
     return L
 
 
-def triangular(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def triangle(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return the solution X of A X = B, or of X A = B, for a triangular A."""
     A, B = (np.asarray(x, object) for x in operands)
     if any(isinstance(e, Missing) for x in (A, B) for e in x.flat):
@@ -124,9 +120,7 @@ def triangular(
     return [np.array(solved, object).reshape(columns.shape).T if left else np.stack(solved)]
 
 
-def lu(
-    graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def lu(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return L and U in one matrix, the pivot row of each step, and the order of the rows.
 
     If they are computed for a system of equations, nothing reads them: `solve` eliminates itself.

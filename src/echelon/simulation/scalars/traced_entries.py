@@ -1,10 +1,11 @@
-"""Entries of a lowered function's arrays: nodes, plain numbers, and stand-ins for unread results."""
+"""Entries of a lowered function's arrays: nodes, plain numbers, stand-ins for unread results."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NoReturn, TypeAlias, final
+from typing import Any, NoReturn, TypeAlias, cast, final
 
 import numpy as np
-from jax.extend.core import JaxprEqn
+from jax.core import ShapedArray
+from jax.extend.core import JaxprEqn, Literal, Var
 
 from echelon.core.errors import EchelonError
 from echelon.core.jaxpr import Algebra
@@ -15,16 +16,16 @@ LONGEST = 64
 LARGEST = 6
 """The most unknowns of a system of equations, and entries to sort."""
 
+Arrays: TypeAlias = list[np.ndarray]
+"""The operands or results of an equation: arrays of entries, or of plain numbers."""
 Params: TypeAlias = Mapping[str, Any]
 """The parameters of a primitive; their types depend on it."""
-PrimitiveRule: TypeAlias = Callable[
-    [ScalarGraph, Algebra, JaxprEqn, list[np.ndarray]], list[np.ndarray]
-]
-"""(graph, algebra, equation, operands) -> results, for primitives that need more than parameters."""
+PrimitiveRule: TypeAlias = Callable[[ScalarGraph, Algebra, JaxprEqn, Arrays], Arrays]
+"""(graph, algebra, equation, operands) -> results, if these need more than parameters."""
 
 
 class Unsupported(EchelonError):
-    """A function has no scalar operations; the text names the primitive and the line in the code."""
+    """A function has no scalar operations; the text names the primitive and the line."""
 
 
 @final
@@ -43,10 +44,15 @@ class Missing:
     __truediv__ = __rtruediv__ = __neg__ = __float__ = __bool__ = _read
 
 
-def missing(equation: JaxprEqn) -> list[np.ndarray]:
+def missing(equation: JaxprEqn) -> Arrays:
     """Return results of an equation that nothing may read."""
     stand_in = Missing(equation.primitive.name, where(equation))
-    return [np.full(v.aval.shape, stand_in, object) for v in equation.outvars]
+    return [np.full(array_type(v).shape, stand_in, object) for v in equation.outvars]
+
+
+def array_type(variable: Var | Literal) -> ShapedArray:
+    """Return the shape and type of a variable, which is an array."""
+    return cast(ShapedArray, variable.aval)
 
 
 def where(equation: JaxprEqn) -> str:
