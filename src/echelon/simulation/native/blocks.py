@@ -46,8 +46,8 @@ class Neighbourhood(NamedTuple):
     leaders: Array
     edges: Array
     edge_ends: Array
-    smooth: Array
-    smooth_edges: Array
+    contiguous: Array
+    contiguous_edges: Array
 
 
 class Places(abc.ABC):
