@@ -9,7 +9,7 @@ import scipy.linalg
 
 import echelon as ech
 from echelon.agents.models.linearization import linearize
-from echelon.agents.models.model import wound
+from echelon.agents.models.model import wrap_angles
 from echelon.agents.network.eigenvalues import _least
 from echelon.agents.network.hearing import heard_along
 from echelon.core.errors import EchelonError
@@ -509,7 +509,7 @@ class Dial(ech.ControlAffine):
         return jnp.ones((1, 1), x.dtype)
 
     def difference(self, x, y):
-        return wound(x - y, 0)
+        return wrap_angles(x - y, 0)
 
 
 def test_of_angles_that_wind_no_start_half_a_turn_apart_is_promised():

@@ -215,7 +215,7 @@ def test_limits_that_floats_cannot_invert_are_refused(size):
         def input_map(self, x):
             return jnp.ones((1, 2), x.dtype)
 
-    with pytest.raises(ModelError, match="do not say what is delivered"):
+    with pytest.raises(ModelError, match="does not define the input that is delivered"):
         check_model(Tiny())
 
 

@@ -1,6 +1,6 @@
 """The 12-state quadrotor of the paper's example.
 
-It has the gravity and the thrust rotation that the paper's equations leave out.
+It includes gravity and the rotation of the thrust, which the paper's equations leave out.
 """
 
 from collections.abc import Callable
@@ -29,27 +29,27 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.types import Input, InputMap, State
 
 _IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
-"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015); no other propellers' is published."""
+"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015), the only one that is published."""
 
 
-def _flown(mass: float, motor_thrust: float, torque_per_thrust: float) -> dict[str, Any]:
+def _crazyflie(mass: float, motor_thrust: float, torque_per_thrust: float) -> dict[str, Any]:
     numbers = {"motor_thrust": motor_thrust, "torque_per_thrust": torque_per_thrust}
     return {"mass": mass, "inertia": _IDENTIFIED, **numbers}
 
 
-# What a motor gives is what the firmware holds at any charge of the battery. Fresh it gives more:
-# 0.16 N by Foerster, whose numbers the paper takes.
+# The motor thrust is the one that the firmware reaches at any charge of the battery. A full battery
+# gives more: 0.16 N by Foerster, whose numbers the paper takes.
 PARAMETERS: dict[str, dict[str, Any]] = {
-    "crazyflie": _flown(0.028, 0.15975, 0.005964552),
-    "crazyflie-2.1+": _flown(0.029, 0.12, 0.006993),
-    "crazyflie-legacy": _flown(0.029, 0.12, 0.00735),
-    "crazyflie-thrust-kit": _flown(0.0325, 0.18, 0.00516),
+    "crazyflie": _crazyflie(0.028, 0.15975, 0.005964552),
+    "crazyflie-2.1+": _crazyflie(0.029, 0.12, 0.006993),
+    "crazyflie-legacy": _crazyflie(0.029, 0.12, 0.00735),
+    "crazyflie-thrust-kit": _crazyflie(0.0325, 0.18, 0.00516),
     "paper": {"mass": 0.028, "inertia": (6.4893e-6, 16.4562e-6, 29.5435e-6)},
 }
 """Named parameter sets. `crazyflie` is the Crazyflie 2.1 that Foerster (2015) identified, with the
-calibration that its firmware had then, and `paper` the paper's Table I as printed. The others are
-of the firmware from 2025 on (Bitcraze, platform defaults of cf2), by its propellers: those of the
-2.1+, the older ones, and the thrust upgrade kit; their inertia is Foerster's."""
+calibration of its firmware at that time; `paper` is the paper's Table I as printed. The others are
+defaults of the firmware from 2025 on (Bitcraze, platform cf2) for the propellers of the 2.1+, the
+older ones and the thrust upgrade kit; their inertia is Foerster's."""
 
 
 def _with_rate(
@@ -84,7 +84,7 @@ class Quadrotor(RigidVehicle):
     mass: float = 0.028
     inertia: tuple[float, float, float] = (16.571710e-6, 16.655602e-6, 29.261652e-6)
     gravity: float = 9.81
-    # The motors stand 0.046 m from the hub, over sqrt 2 along each body axis; 0.639 N in all, a
+    # The motors are 0.046 m from the hub, over sqrt 2 along each body axis; 0.639 N in all, a
     # quarter each.
     arm: float = 0.0325
     motor_thrust: float = 0.15975
@@ -129,7 +129,7 @@ class Quadrotor(RigidVehicle):
         return cls.named("crazyflie")
 
     def __check_init__(self) -> None:
-        """Refuse parameters that no vehicle can have."""
+        """Reject parameters that no vehicle can have."""
         names = ("mass", "arm", "motor_thrust", "torque_per_thrust")
         check_positive(self, **{name: getattr(self, name) for name in names})
         check_moments(self, self.inertia)
@@ -143,7 +143,7 @@ class Quadrotor(RigidVehicle):
 
     @property
     def damping(self) -> Rows:
-        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw; position is left out."""
+        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw, but not position."""
         # A tilt accelerates by g times itself, so 1.6/g rad per m/s damp at 1.6 1/s. Poles of the
         # attitude: s^2 + 16 s + 60 = (s + 6) (s + 10); of the yaw: (s + 2)^2.
         tilt, stiff, damp = 1.6 / self.gravity, 60.0, 16.0
@@ -161,7 +161,7 @@ class Quadrotor(RigidVehicle):
 
     @property
     def input_limits(self) -> Limits:
-        """Each motor gives between 0 and `motor_thrust`."""
+        """Each motor delivers between 0 and `motor_thrust`."""
         # Thrust and torques mix the motors by orthogonal patterns of signs, with squares that sum
         # to 4: the inverse is the transpose over 4.
         rows = tuple(
@@ -177,7 +177,7 @@ class Quadrotor(RigidVehicle):
 
     @property
     def airframe(self) -> Airframe:
-        """What its motors move."""
+        """The rigid body under the motors."""
         numbers = self.gravity, self.arm, self.torque_per_thrust, self.motor_thrust
         return Airframe(self.mass, self.inertia, *numbers)
 
@@ -232,13 +232,13 @@ class Quadrotor(RigidVehicle):
         def invert(tops: jax.Array) -> Input:
             snap = tops[:3] @ axes
             (sr, sp), (cr, cp) = jnp.sin(x[6:8]), jnp.cos(x[6:8])
-            # One quotient for all, which take longest of what is done here.
+            # One quotient for all, since divisions take longest here.
             both = 1.0 / (a * cr)
             p_dot = q * r - (2.0 * rate * p + snap[1]) * (cr * both)
             q_dot = (snap[0] - 2.0 * rate * q) * (cr * both) - p * r
             # yaw' is (sin(roll) q + cos(roll) r) / cos(pitch), and tops[3] its rate.
-            known = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
-            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - known) * (a * both)])
+            drift = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
+            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - drift) * (a * both)])
             spin = spin - free_spin(self.inertia, x[9:12])
             return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
 
@@ -247,13 +247,13 @@ class Quadrotor(RigidVehicle):
     def limit(self, u: Input) -> Input:
         """Return what four motors within [0, motor_thrust] deliver.
 
-        What does not fit gives way in this order: the collective, then yaw, then roll and pitch.
+        Where they cannot deliver u, first the collective is reduced, then yaw, then roll and pitch.
         """
         left, front, spin = (jnp.asarray(sign, u.dtype) for sign in (_LEFT, _FRONT, _SPIN))
         # The same mixer as in `input_limits`, its part for yaw apart.
         tilt = (u[1] * left - u[2] * front) / (4.0 * self.arm)
         yaw = u[3] * spin / (4.0 * self.torque_per_thrust)
-        wanted = u[0] / 4.0 + tilt + yaw
+        commanded = u[0] / 4.0 + tilt + yaw
         f = attitude_priority(u[0] / 4.0, tilt, yaw, self.motor_thrust)
         torque = [
             self.arm * (left @ f),
@@ -261,5 +261,5 @@ class Quadrotor(RigidVehicle):
             self.torque_per_thrust * (spin @ f),
         ]
         delivered = jnp.stack([jnp.sum(f), *torque])
-        # u itself where it fits, since mixing there and back would round and count as saturation.
-        return jnp.where(fits(wanted, self.motor_thrust), u, delivered)
+        # u itself where it fits: rounding of the mixing would count as saturation.
+        return jnp.where(fits(commanded, self.motor_thrust), u, delivered)

@@ -12,7 +12,7 @@ from echelon.agents.models.model import (
     FlatChains,
     check_positive,
     default,
-    wound,
+    wrap_angles,
 )
 from echelon.core.types import Output, State
 
@@ -56,4 +56,4 @@ class RigidVehicle(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the angles the shorter way round."""
-        return wound(x - y, 6, 7, 8)
+        return wrap_angles(x - y, 6, 7, 8)

@@ -1,4 +1,4 @@
-"""The seam of the network: what an agent learns from the values that its neighbours sent."""
+"""The exchange over the network: an agent's disagreement with the values of its neighbours."""
 
 import operator
 from collections.abc import Callable
@@ -15,13 +15,13 @@ Difference: TypeAlias = Callable[[States, States], States]
 
 
 class Exchange(eqx.Module):
-    """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
+    """The disagreement of agents with their neighbours: directed edges as arrays for JAX.
 
     The agents' own values and the values that they received are separate arguments, since on a real
     network the second may be old or lost.
 
     Attributes:
-        receivers, senders: (K,) who hears whom.
+        receivers, senders: (K,) the ends of each directed edge.
         weights: (K,); of a graph that switches (S, K), a row for each stretch of time.
     """
 
@@ -34,24 +34,24 @@ class Exchange(eqx.Module):
         return Exchange(self.receivers, self.senders, jnp.asarray(self.weights)[row])
 
     def along_edges(self, values: Float[jax.Array, "N s"]) -> Float[jax.Array, "K s"]:
-        """Return what is sent along each edge, of values (N, s) that all agents send."""
+        """Return the value sent along each edge, of values (N, s) that all agents send."""
         return values[self.senders]
 
     def __call__(
         self,
-        own: Float[jax.Array, "N s"],
+        values: Float[jax.Array, "N s"],
         received: Float[jax.Array, "K s"],
         difference: Difference = operator.sub,
     ) -> Float[jax.Array, "N s"]:
-        """Return z (N, s), z_i = sum_j A_ij (own_i - received_ij).
+        """Return z (N, s), z_i = sum_j A_ij (values_i - received_ij).
 
         Args:
-            own: (N, s) values of the agents.
-            received: (K, s) what was received along each edge.
-            difference: of values (K, s) and (K, s); another one for angles, which wind.
+            values: (N, s) values of the agents.
+            received: (K, s) values that were received along each edge.
+            difference: of values (K, s) and (K, s), which for angles is not plain subtraction.
         """
-        weights = jnp.asarray(self.weights, own.dtype)[:, None]
+        weights = jnp.asarray(self.weights, values.dtype)[:, None]
         # Differences before sums: at consensus they vanish exactly, while sums of positions would
         # leave rounding.
-        differences = weights * difference(own[self.receivers], received)
-        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
+        differences = weights * difference(values[self.receivers], received)
+        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(values))

@@ -122,4 +122,6 @@ class GraphMatrices(abc.ABC):
     def disagreement(self, y: States, t: float = 0.0) -> States:
         """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n), at a time (s)."""
         exchange = self.exchange()
-        return (exchange if self.schedule is None else exchange.during(self.schedule.row(t)))(y, y)
+        if self.schedule is not None:
+            exchange = exchange.during(self.schedule.row(t))
+        return exchange(y, exchange.along_edges(y))

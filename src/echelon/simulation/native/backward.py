@@ -7,13 +7,13 @@ graph.
 """
 
 import math
-from collections.abc import Hashable
 from typing import NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array
 from echelon.laws.law import Memory
 from echelon.simulation.codegen import Body, aligned, contribution_widths
@@ -22,8 +22,8 @@ from echelon.simulation.native.blocks import SwarmBlocks
 from echelon.simulation.native.kernel_cache import (
     KERNELS,
     LANES,
+    MOST,
     Kernel,
-    add_to,
     compiled,
     follows,
     plan_of,
@@ -78,7 +78,7 @@ class _Pair(NamedTuple):
     rows: CotangentRows
 
 
-_pairs: dict[Hashable, _Pair] = {}
+_pairs = BoundedCache[_Pair](MOST)
 
 
 def _pair_of(varying: VaryingNumbers, row_major: tuple[bool, bool], needs: SlopeNeeds) -> _Pair:
@@ -86,12 +86,9 @@ def _pair_of(varying: VaryingNumbers, row_major: tuple[bool, bool], needs: Slope
     wind, signature = varying.loop.motion.wind, varying.signature
     # The signature leaves out the wind's numbers, which have rows if there is wind.
     key = (signature, wind is None, wind is None or wind.noise is None, row_major, needs)
-    pair = None if signature is None else _pairs.get(key)
-    if pair is None:
-        pair = _compiled_pair(varying, row_major, needs)
-        if signature is not None:
-            add_to(_pairs, key, pair)
-    return pair
+    return _pairs.get_or_make(
+        None if signature is None else key, lambda: _compiled_pair(varying, row_major, needs)
+    )
 
 
 def _compiled_pair(
@@ -245,7 +242,8 @@ class Backward:
             # The backward pass begins with the last stretch.
             self.stepper.record(self.tape if first + self.stretch >= self.steps else None, first)
             chunk = self._advance(now, first)
-            now, sums = chunk.now, chunk.sums if sums is None else sums.plus(chunk.sums)
+            now, more = chunk.now, chunk.sums.of(0)
+            sums = more if sums is None else sums.plus(more)
             if any_beyond(now.states, BITS):
                 self.moments.clear()
                 return None

@@ -1,12 +1,13 @@
 """Compiled kernels, shared by loops that differ only in their numbers."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias, final
 
 import jax
 import numpy as np
 
+from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, has_flag, program, shared
 from echelon.simulation.native.agent_step import BlockRows, body_of, signal_size
@@ -15,7 +16,7 @@ from echelon.simulation.step.loop import Loop
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
-_MOST = 8
+MOST = 8
 """Kernels, and codes, that are cached."""
 
 
@@ -81,15 +82,7 @@ def plan_of(
     return plan._replace(width=plan.width + has_flag(plan), leaders_ahead=ahead)
 
 
-def add_to(cache: dict[Any, Any], key: Hashable, value: Any) -> None:
-    """Add a value to a cache; the oldest is removed."""
-    # A sweep over models has one after the other.
-    for old in list(cache)[: 1 - _MOST]:
-        cache.pop(old, None)
-    cache[key] = value
-
-
-def compiled(rows: BlockRows, plan: Plan, codes: dict[str, Code]) -> Kernel:
+def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
     """Return the kernel of a plan.
 
     `codes` are those compiled before, by their texts: other graphs are other numbers in the same.
@@ -97,8 +90,7 @@ def compiled(rows: BlockRows, plan: Plan, codes: dict[str, Code]) -> Kernel:
     # In the folder where JAX keeps compiled code, so that one setting applies to both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     text = program(plan)
-    code = codes.pop(text, None) or Code(text, Path(cache) if cache else None)
-    add_to(codes, text, code)
+    code = codes.get_or_make(text, lambda: Code(text, Path(cache) if cache else None))
     return Kernel(code, rows, plan, len(shared(plan)))
 
 
@@ -119,8 +111,8 @@ class Kernels:
 
     def __init__(self) -> None:
         """Begin with an empty cache."""
-        self.codes: dict[str, Code] = {}
-        self._kernels: dict[Hashable, Kernel] = {}
+        # A sweep over models has one after the other.
+        self.codes, self._kernels = BoundedCache[Code](MOST), BoundedCache[Kernel](MOST)
 
     def of(
         self,
@@ -136,17 +128,15 @@ class Kernels:
             Unsupported: a law or the model has no scalar operations.
         """
         # Also by wind and noise, which have rows only if they exist.
-        wind = jax.tree.structure(varying.loop.motion.wind)
-        signature = varying.signature
+        wind, signature = jax.tree.structure(varying.loop.motion.wind), varying.signature
         key = (signature, wind, bits, LANES[bits], batched, row_major, weighted)
-        kernel = None if signature is None else self._kernels.get(key)
-        if kernel is None:
+
+        def make() -> Kernel:
             rows = BlockRows.of(varying.loop, varying.count)
             plan = plan_of(varying, rows, bits, batched, row_major, weighted, False)
-            kernel = compiled(rows, plan, self.codes)
-            if signature is not None:
-                add_to(self._kernels, key, kernel)
-        return kernel
+            return compiled(rows, plan, self.codes)
+
+        return self._kernels.get_or_make(None if signature is None else key, make)
 
 
 KERNELS = Kernels()

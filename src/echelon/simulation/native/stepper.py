@@ -393,7 +393,8 @@ class NativeStepper(Stepper):
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
         )
-        return Sums(*(np.asarray(part, np.float64) for part in sums))
+        sums = Sums(*(np.asarray(part, np.float64) for part in sums))
+        return sums.split(len(self.loops))
 
 
 def _total_and_window(sums: Array) -> Array:
