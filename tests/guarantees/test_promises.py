@@ -222,7 +222,7 @@ def test_the_printed_step_keeps_no_offset():
     assert ech.promise(parts, settings(integrator="printed", dt=1.0)).promised
     away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
     step = ech.promise(away, settings(integrator="printed", dt=1.0)).hypotheses[Hypothesis.SAMPLING]
-    assert step.fails and "forgets the goals" in step.text
+    assert step.fails and "ignores the goals" in step.text
 
 
 @pytest.mark.parametrize(
@@ -487,8 +487,8 @@ def test_plans_are_promised_nothing():
     goals = ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
     assert ech.promise(parts, settings()).sentence() == (
-        "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws, which "
-        "theorems speak of."
+        "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a "
+        "theorem covers."
     )
 
 
