@@ -181,24 +181,24 @@ GRAPHS = {
     ),
     "no edges": (
         lambda: Graph.from_edges([]),
-        "a graph needs at least 2 agents, and was given 1.",
+        "a graph needs at least 2 agents, and has 1.",
     ),
     "a path of one": (
         lambda: Graph.path(1),
-        "a path needs at least 2 agents, and was given 1.",
+        "a path needs at least 2 agents, and has 1.",
     ),
     "a ring of two": (
         lambda: Graph.ring(2),
-        "a ring needs at least 3 agents, and was given 2.",
+        "a ring needs at least 3 agents, and has 2.",
     ),
     "an empty grid": (
         lambda: Graph.grid(0, 5),
-        "a grid needs at least 2 agents, and was given 0.",
+        "a grid needs at least 2 agents, and has 0.",
     ),
     "points too far apart": (
         lambda: Graph.geometric(3, 1e-6),
         "the graph is disconnected: agents 1, 2 have no path to a leader (leader 0); a `radius` of "
-        "0.667 connects these places, and another `seed` draws others.",
+        "0.667 connects these points, and another `seed` draws others.",
     ),
     "a leader that is no list": (
         lambda: Graph.ring(4, leaders=0),
@@ -210,8 +210,8 @@ GRAPHS = {
     ),
     "weights that rounding cannot tell apart": (
         lambda: Graph.from_edges([(0, 1, 1e-300), (1, 2)]).spectrum(),
-        "the weights of the graph lie between 1e-300 and 1, too far apart to tell its smallest "
-        "eigenvalue from 0; bring them nearer to each other.",
+        "the weights of the graph range from 1e-300 to 1, too far apart to distinguish the "
+        "smallest eigenvalue from 0; choose weights of similar size.",
     ),
     "edges for a graph": (
         lambda: synthesize(CART, [(0, 1)], Riccati()),
@@ -220,7 +220,7 @@ GRAPHS = {
     "directed networkx graph that nobody leads": (
         lambda: Graph.from_networkx(nx.DiGraph([(1, 0), (1, 2)])),
         "the graph leaves agents behind: agents 1, 2 have no path to a leader (leader 0) along its "
-        "arrows; an edge [i, j] lets j hear i, so add one, or turn one round.",
+        "arrows; an edge [i, j] lets j receive from i, so add one, or reverse one.",
     ),
     "networkx graph with names": (
         lambda: Graph.from_networkx(nx.Graph([("a", "b")])),
@@ -265,7 +265,7 @@ FORMATIONS = {
     ),
     "drawn without a position": (
         lambda: Formation.wedge(VanDerPol(), PATH),
-        "`VanDerPol` has no position, so a drawn formation has no meaning; give `offsets`.",
+        "`VanDerPol` has no position, so a geometric formation has no meaning; give `offsets`.",
     ),
 }
 
@@ -564,7 +564,7 @@ LAWS = {
     ),
     "a flat map that returns a state alone": (
         lambda: run(HalfFlat(), leader=Tracking(Hover())),
-        "`flat` of `HalfFlat` must return two things, a state and an input.",
+        "`flat` of `HalfFlat` must return a pair, a state and an input.",
     ),
     "a flat map of another state": (
         lambda: run(LongFlat(), leader=Tracking(Hover())),
