@@ -348,4 +348,4 @@ def test_dev_refuses_a_verb_it_does_not_have():
     command = [sys.executable, str(ROOT / "dev.py"), "dmeo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr.startswith("dev.py: `dmeo` is no verb.")
+    assert done.stderr.startswith("dev.py: `dmeo` is not a command.")

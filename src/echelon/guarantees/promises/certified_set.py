@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.leaders import Leaders, excursion, own_paths
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -30,6 +30,11 @@ class CertifiedSet(NamedTuple):
     kind: Kind
     why: str
     remedy: str = ""
+
+    def as_mapping(self) -> dict[str, object]:
+        """Return it ready for JSON, where an infinite radius is None."""
+        radius = self.radius if self.radius < float("inf") else None
+        return {"radius": radius, "kind": str(self.kind), "why": self.why}
 
 
 def certified_set(
@@ -103,23 +108,31 @@ def size_of(parts: Parts, states: Array) -> float:
     return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
 
 
-def set_lines(
-    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
-) -> list[Statement]:
-    """Return the set as a line, and whether the starts (N, n) lie in it."""
+def set_line(region: RegionCertificate | None, found: CertifiedSet | None) -> Statement:
+    """Say which set of starts is certified."""
     if found is None:
-        local = region is not None and region.theorem is Theorem.T2
-        text = "T2 is local and certifies no set" if local else "needs a region"
-        return [
-            Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
-            for name in (Hypothesis.SET, Hypothesis.STARTS)
-        ]
-    size, radius, text, remedy = size_of(parts, states), found.radius, "", ""
-    shown, holds = f"radius {radius:.3g}" if radius else "empty", Verdict.of(radius > 0.0)
-    line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why, found.remedy)
-    text, holds = "from there no follower leaves the domain", Verdict.of(size <= radius)
-    if not size <= radius:
-        text, remedy = "what the set promises does not reach them", "start nearer to the goals"
-    shown = f"{size:.3g} of {radius:.3g}"
-    starts = Statement(Hypothesis.STARTS, holds, found.kind, size, shown, text, remedy)
-    return [line, starts]
+        return unneeded(Hypothesis.SET, Kind.PROOF, _no_set(region))
+    if found.radius > 0.0:
+        number = found.radius, f"radius {found.radius:.3g}"
+        return holds(Hypothesis.SET, found.kind, found.why, *number)
+    return fails(Hypothesis.SET, found.kind, found.why, found.radius, "empty", remedy=found.remedy)
+
+
+def starts_line(
+    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
+) -> Statement:
+    """Say whether starts (N, n) lie in the set."""
+    if found is None:
+        return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
+    size = size_of(parts, states)
+    number = size, f"{size:.3g} of {found.radius:.3g}"
+    if size <= found.radius:
+        text = "from there no follower leaves the domain"
+        return holds(Hypothesis.STARTS, found.kind, text, *number)
+    text, remedy = "what the set promises does not reach them", "start nearer to the goals"
+    return fails(Hypothesis.STARTS, found.kind, text, *number, remedy=remedy)
+
+
+def _no_set(region: RegionCertificate | None) -> str:
+    local = region is not None and region.theorem is Theorem.T2
+    return "T2 is local and certifies no set" if local else "needs a region"

@@ -12,6 +12,7 @@ from echelon.experiments.results.metrics import (
     LeaderMetrics,
     Metrics,
     metrics,
+    quantities,
     representatives,
     steady_error,
 )
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 # Above this many of a role the table shows the best, the median and the worst instead of all.
 _MANY = 12
+_COLUMNS = quantities(FollowerMetrics)
 
 
 def report(result: Result) -> str:
@@ -57,10 +59,12 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     from rich import box
     from rich.table import Table
 
-    unit = "" if result.unit == "state" else f", {result.unit}"
-    steady = f"steady{unit}\n(last {numbers.steady_window:.3g} s)"
-    settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
-    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
+    texts = {
+        "unit": "" if result.unit == "state" else f", {result.unit}",
+        "window": numbers.steady_window,
+        "settled": "1 cm" if result.unit == "m" else "0.01",
+    }
+    columns = ["agent", *(each.label.format(**texts) for each in _COLUMNS.values())]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
     title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
@@ -91,8 +95,8 @@ def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
     # One leader needs no number, and has its name from the paper's table.
     alone = ["leader"] if len(leaders) == 1 else None
-    rows = [_leader_row(label, each) for label, each in labelled("leader", leaders, alone)]
-    rows += [_follower_row(label, each) for label, each in labelled("follower", followers)]
+    agents = [*labelled("leader", leaders, alone), *labelled("follower", followers)]
+    rows = [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
     if printed:
         for k, row in enumerate(rows):
             row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
@@ -114,21 +118,17 @@ def labelled(
         yield (f"{kind}({name})" if kind else name), one
 
 
-def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:
-    errors = [_number(leader.rmse), _number(leader.steady_rmse)]
-    return [label, *errors, "", "", _percent(leader.saturated)]
-
-
-def _follower_row(label: str, each: FollowerMetrics) -> list[str]:
-    settled = "never" if each.settling_time is None else f"{each.settling_time:.4g}"
-    settled = "-" if each.rmse is None else settled
-    errors = [_number(each.rmse), _number(each.steady_rmse)]
-    return [label, *errors, settled, _number(each.effort), _percent(each.saturated)]
+def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
+    """Return a number of an agent as the table has it; empty where its role has none."""
+    if name == "saturated":
+        return f"{100.0 * agent.saturated:.3g}"
+    if not hasattr(agent, name):
+        return ""
+    value: float | None = getattr(agent, name)
+    if name == "settling_time" and value is None and agent.rmse is not None:
+        return "never"
+    return _number(value)
 
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
-
-
-def _percent(value: float) -> str:
-    return f"{100.0 * value:.3g}"

@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.sweeps.axes import SEED
+from echelon.experiments.sweeps.numbers import NUMBERS, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 
 if TYPE_CHECKING:
@@ -28,10 +29,7 @@ def sweep_mapping(data: "xr.Dataset") -> dict[str, Any]:
         "outcomes": {name: count for name, count in counts.items() if count},
         "settled": int(succeeded(data).sum()),
         "promised": int((data["promised"] == 1).sum()),
-        "quantiles": {
-            name: _quantiles(data[name].values)
-            for name in ("formation_rmse", "worst_final_error", "worst_settling_time")
-        },
+        "quantiles": {name: _quantiles(data[name].values) for name in SUMMARIZED},
     }
 
 
@@ -45,13 +43,12 @@ def sweep_report(data: "xr.Dataset") -> str:
     lines = [f"- {found['runs']} runs: {ended}."]
     lines += [f"- Settled within 1 cm for good: {_share(found['settled'], done)}."]
     lines += [f"- Something was promised of {found['promised']}."]
-    units = {"worst_settling_time": " s"}
     for name, values in found["quantiles"].items():
         if values is not None:
             low, middle, high = (f"{value:.3g}" for value in values)
-            what = name.replace("_", " ")
+            unit = " s" if NUMBERS[name].unit == "s" else ""
             lines.append(
-                f"- {what}: median {middle}{units.get(name, '')}, 5 to 95 %: {low} to {high}."
+                f"- {name.replace('_', ' ')}: median {middle}{unit}, 5 to 95 %: {low} to {high}."
             )
     return "\n".join([*lines, *_warned(data), *_cases(data)])
 

@@ -167,4 +167,4 @@ class _HeldChunk:
             np.array(rows).reshape(len(rows), *shape)
             for rows, shape in zip((self.states, self.inputs), shapes, strict=True)
         )
-        return Chunk(self.now, states, inputs, on_host(self.sums), stopped)
+        return Chunk(self.now, states, inputs, on_host(self.sums).split(1), stopped)

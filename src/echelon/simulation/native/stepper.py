@@ -391,7 +391,8 @@ class NativeStepper(Stepper):
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
         )
-        return Sums(*(np.asarray(part, np.float64) for part in found))
+        sums = Sums(*(np.asarray(part, np.float64) for part in found))
+        return sums.split(len(self.loops))
 
 
 def _whole(parted: Array) -> Array:

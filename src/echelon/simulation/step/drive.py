@@ -58,13 +58,13 @@ class Problem(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A stretch of a run.
+    """A stretch of a run, or of F formations whose agents follow each other.
 
     Attributes:
         now: where it ended.
-        states: (T, N, n) of the stored frames, float64.
-        inputs: (T, N, m) delivered from each of them on, float64.
-        sums: over its steps.
+        states: (T, F N, n) of the stored frames, float64.
+        inputs: (T, F N, m) delivered from each of them on, float64.
+        sums: over its steps, with an axis F in front; F is 1 for a run alone.
         stopped: why no further step can be taken, in words; None where one can.
     """
 
