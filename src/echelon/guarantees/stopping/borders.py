@@ -1,4 +1,4 @@
-"""How near to the borders of their flat coordinates the agents of a run may come (T5)."""
+"""Distance that agents keep from the borders of their flat coordinates (T5)."""
 
 import math
 from fractions import Fraction
@@ -219,9 +219,9 @@ def _distinct(starts: Array) -> Array:
     Raises:
         GainError: there are too many.
     """
-    found = np.unique(starts, axis=0)
-    if len(found) > _STARTS:
+    distinct = np.unique(starts, axis=0)
+    if len(distinct) > _STARTS:
         raise GainError(
-            f"{len(found)} starts differ in more than a speed, and {_STARTS} are tried."
+            f"{len(distinct)} starts differ in more than a speed, and {_STARTS} are tried."
         )
-    return found
+    return distinct
