@@ -1,4 +1,4 @@
-"""What a promise is asked of."""
+"""The data of a run from which its guarantee is computed."""
 
 from typing import NamedTuple
 

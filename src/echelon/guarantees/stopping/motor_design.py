@@ -1,7 +1,7 @@
 """Find roots and speeds of the law for which the motors are certified to suffice."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
@@ -55,7 +55,7 @@ class MotorDesign(NamedTuple):
         changes = " ".join(f'--set "{change}"' for change in shown)
         return f"Certified with motors: {changes}. {self.promise.sentence()}"
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
         numbers = {"rate": self.rate, "speed": list(self.speed), "leader": list(self.leader)}
         return {**numbers, "promise": self.promise.as_mapping()}

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class MotorLoad(NamedTuple):
     most: float
     tilt: float
     alone: Alone | None
-    data: dict[str, Any]
+    data: dict[str, object]
 
     def sentence(self) -> str:
         """Return what is promised of motors."""
@@ -97,7 +97,7 @@ class MotorLoad(NamedTuple):
         more = "" if self.alone is None else f"; they suffice from {self.alone.sentence()}"
         return f"{text}{more}."
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
         alone = None if self.alone is None else self.alone._asdict()
         numbers = {"least": self.least, "largest": self.largest, "tilt": self.tilt}
@@ -336,7 +336,7 @@ def _alone(
 
 def _data(
     case: _MotorCase, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return what the load was computed of, ready for JSON."""
     return {
         "airframe": case.frame._asdict(),
