@@ -139,7 +139,10 @@ def test_networkx_means_the_same_by_arrows():
         (lambda: ech.Graph([(0, 1), (0, 1)], directed=True), r"edge \[0, 1\] is given twice"),
         (lambda: ech.Graph([(0, 1, -1.0)], directed=True), "must be positive and finite"),
         (lambda: ech.Graph([(0, 1)], weights=[1.0, 2.0]), "1 edges and 2 weights"),
-        (lambda: ech.Graph([(0, 1, 1.0)], weights=[1.0]), "weights stand in a list of their own"),
+        (
+            lambda: ech.Graph([(0, 1, 1.0)], weights=[1.0]),
+            "must be .i, j. where `weights` are listed separately",
+        ),
         (
             lambda: ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (3.0, [(0, 1)])]),
             "agent 2 has no path to a leader .leader 0. from 3 s on, after the last switch",

@@ -143,7 +143,7 @@ def test_native_slopes_are_those_of_jax_for_vehicles_and_the_distances_between_t
     check_equal(parts, SHORT, with_distances, WRT)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_native_slopes_are_those_of_jax_for_a_law_that_remembers():
     parts = points(ech.Graph.ring(5), "relay", dimension=1)
     parts = parts.replace(drive=ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint()))

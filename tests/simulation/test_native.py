@@ -86,8 +86,15 @@ def test_a_scenario_steps_as_by_jax(name):
     check_alike(*ech.build(ech.load_scenario(name)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(ech.bundled_scenarios()))
+# A rotated flight, the law of stopping points and a model without positions; the rest is a study.
+DRAWN = {"line-10", "van-der-pol", "yaw-turn"}
+EVERY = [
+    pytest.param(name, marks=pytest.mark.slow if name in DRAWN else pytest.mark.study)
+    for name in sorted(ech.bundled_scenarios())
+]
+
+
+@pytest.mark.parametrize("name", EVERY)
 def test_every_scenario_steps_as_by_jax_for_a_thousand_steps(name):
     parts, chosen = ech.build(ech.load_scenario(name))
     # One that grows without bound makes any rounding large.
