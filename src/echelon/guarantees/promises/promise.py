@@ -28,6 +28,15 @@ from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
+REQUIRED = (
+    Hypothesis.SYMMETRY,
+    Hypothesis.SMOOTH,
+    Hypothesis.MATCHED_MOTION,
+    Hypothesis.DISAGREEMENT_DECAY,
+    Hypothesis.SAMPLING,
+    Hypothesis.CLAIMS,
+)
+"""Hypotheses that every guarantee has a line on, beside those on agents and leaders."""
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLING)
 
 
@@ -70,7 +79,8 @@ class Promise(abc.ABC):
 
     Attributes:
         loop: near the trim; what margins are taken of.
-        hypotheses: each with its verdict, its number and what would be needed.
+        hypotheses: each with its verdict, its number and what would be needed; those on agents and
+            leaders and the `REQUIRED` ones are always there.
         without: what acts on the agents that is left out, in words; empty without any.
         leader_mode: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         region: what is guaranteed on a domain; None without one.
