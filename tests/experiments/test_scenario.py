@@ -241,7 +241,7 @@ def test_a_method_takes_the_keys_that_its_class_takes(name):
     arguments = [field.name for field in dataclasses.fields(method)]
     assert sorted(key for key, mark in marks.items() if name in mark.choices) == sorted(arguments)
     assert {key for key, mark in marks.items() if name in mark.needed_by} == {*method.needs}
-    assert method.name == name and {*method.usual} <= {*method.needs}
+    assert method.name == name and {*method.defaults} <= {*method.needs}
 
 
 @pytest.mark.parametrize("role", ["leader", "follower"])

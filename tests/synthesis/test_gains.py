@@ -399,7 +399,7 @@ def test_a_file_with_two_equal_keys_is_refused_where_it_is_flown_and_where_it_is
     text = file.read_text()
     file.write_text(text.replace('"coupling":', '"coupling": 0.001, "coupling":', 1))
     for read in (lambda: ech.load_gain(file, model, graph), lambda: ech.verify(file)):
-        with pytest.raises(ech.errors.GainError, match="`coupling` stands there twice"):
+        with pytest.raises(ech.errors.GainError, match="it has the key `coupling` twice"):
             read()
 
 
@@ -415,7 +415,7 @@ def test_a_file_whose_coupling_was_raised_by_hand_is_refused_where_it_is_read(tm
     ech.save_gain(ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, file)
     stored = json.loads(file.read_text())
     file.write_text(json.dumps(stored | {"coupling": 1e200}))
-    with pytest.raises(ech.errors.GainError, match="the feedback is too strong to compute with"):
+    with pytest.raises(ech.errors.GainError, match="the feedback is too large for floats"):
         ech.load_gain(file, model, graph)
 
 

@@ -575,7 +575,7 @@ def test_a_gain_file_whose_numbers_are_none_is_refused(tmp_path, name, wrong):
     told = json.loads(file.read_text())
     told["certificate"][name] = wrong
     file.write_text(json.dumps(told))
-    assert "is no gain that echelon wrote" in sentence(lambda: ech.load_gain(file, model, LINE))
+    assert "is no gain file of echelon" in sentence(lambda: ech.load_gain(file, model, LINE))
 
 
 @pytest.mark.parametrize("name", ["rate", "radius", "strength"])

@@ -67,8 +67,9 @@ class TrackingOptions:
         Raises:
             PlanError: they do not fit the model.
         """
-        given, names = self.output_weight, model.output_names
-        return read_weights("output_weight", np.ones(len(names)) if given is None else given, names)
+        weights, names = self.output_weight, model.output_names
+        weights = np.ones(len(names)) if weights is None else weights
+        return read_weights("output_weight", weights, names)
 
 
 class PlanTimes(NamedTuple):
