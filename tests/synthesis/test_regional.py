@@ -230,7 +230,7 @@ DOMAINS = {
     ),
     "without the trim": (
         {"roll": (0.1, 0.2)},
-        "the domain of `roll` is [0.1, 0.2], and must hold the trim, 0.",
+        "the domain of `roll` is [0.1, 0.2], and must contain the trim, 0.",
     ),
 }
 

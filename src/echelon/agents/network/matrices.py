@@ -1,4 +1,4 @@
-"""The matrices of a graph, and who receives from whom: what every other property follows from."""
+"""The matrices of a graph and its directed links, from which all other properties follow."""
 
 import abc
 

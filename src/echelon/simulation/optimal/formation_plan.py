@@ -1,4 +1,4 @@
-"""Plans for a whole formation, made in the order of the graph: each knows those before it."""
+"""Plans for a whole formation: agents plan in the order of the graph, after their neighbours."""
 
 import time
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""How the optimization method poses an agent's problem: follow targets, spend little input.
+"""Objectives of the optimization method: follow targets or keep distances, with little input.
 
-A leader's targets are its reference; a follower's are what the plans of its neighbours leave it.
+The targets of a leader are its reference; those of a follower follow from its neighbours' plans.
 """
 
 import dataclasses

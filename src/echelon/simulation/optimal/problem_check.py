@@ -1,4 +1,4 @@
-"""The numbers and names that problems and solvers are given, checked alike."""
+"""Checks of the numbers and names in the arguments of problems and solvers."""
 
 import math
 import numbers

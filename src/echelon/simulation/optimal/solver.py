@@ -1,4 +1,4 @@
-"""Plans: what an optimal control problem's solver returns, and how it ended in words."""
+"""The solver of an optimal control problem: the plan, and its status in words."""
 
 import dataclasses
 import time

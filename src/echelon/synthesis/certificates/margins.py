@@ -1,4 +1,4 @@
-"""How far a stable linear loop is from losing what it promises.
+"""Robustness margins of a stable linear loop: gain, delay, input scaling, string stability.
 
 The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes
 A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda; those of a directed graph
