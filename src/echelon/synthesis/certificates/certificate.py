@@ -25,9 +25,9 @@ class RegionCertificate(eqx.Module):
         radius: r of the set {sum_i delta_i'P delta_i <= r^2} that cannot leave the domain while the
             leader stays at the trim; None where the domain bounds nothing, and for T2.
         strength: 2 c lambda_min, the weight of the feedback in the inequality; 0 for A5.
-        hull: (K, n, n), the matrices for which the rate was computed: by kind, the corners of a hull
-            of all Jacobians A, or samples of them. For T2, whose g varies, it is (K, n, 2n): each A
-            with its g S R^-1 (g S)' to the right.
+        hull: (K, n, n), the matrices for which the rate was computed: by kind, the corners of a
+            hull of all Jacobians A, or samples of them. For T2, whose g varies, it is (K, n, 2n):
+            each A with its g S R^-1 (g S)' to the right.
         error: one such matrix, a bound of the rounding of a corner, entry by entry.
         why: the reason for a weaker kind than a proof; empty without one, or if none was tried.
     """
@@ -87,7 +87,8 @@ def certify(
     """Return the certificate by linearization at the trim of gain P, R and coupling c.
 
     With constant g the disagreement splits over the eigenvectors of the grounded Laplacian, or of
-    the matrix that replaces it under a feed-forward, into modes A - c lambda B R^-1 B'P (theory page, T2).
+    the matrix that replaces it under a feed-forward, into modes A - c lambda B R^-1 B'P (theory
+    page, T2).
     """
     feedback = linear.B @ np.linalg.solve(R, linear.B.T @ P)
     return Certificate(
