@@ -1,4 +1,4 @@
-"""Runs a function of one agent's numbers as native code, an agent a lane."""
+"""Helper that runs a function of one agent's numbers as native code, one agent in each lane."""
 
 import numpy as np
 

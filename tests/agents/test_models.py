@@ -1,4 +1,4 @@
-"""Every bundled agent against equations written a second time, and the laws that they share."""
+"""Bundled models against equations written a second time, and properties that all of them share."""
 
 import importlib
 

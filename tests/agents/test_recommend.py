@@ -1,4 +1,4 @@
-"""Leaders and edges that shorten a formation's slowest disagreement."""
+"""Recommended leaders and edges: they shorten the slowest disagreement of a formation the most."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Compiled code between runs of the command line: where it is kept, and how that is ended."""
+"""Compiled code kept between runs of the command line: where, and how to switch it off."""
 
 import os
 import subprocess
