@@ -18,7 +18,7 @@ from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.check import check
 from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.agent import Agent
@@ -459,7 +459,7 @@ def worst(draw, count, states):
 def tube_left(parts, settings, x):
     from echelon.guarantees.stopping.tube import tube_of
 
-    tube = tube_of(stopping_of(parts, settings, x)).tube
+    tube = tube_of(stopping_run_of(parts, settings, x))[0]
     assert tube is not None
     return tube.left
 
