@@ -9,7 +9,7 @@ from echelon.experiments.results.recording import InputBounds, LoopPoles, Record
 
 PROMISE = {
     "promised": True,
-    "sentence": "Promised, by linearization: all is well.",
+    "sentence": "Local guarantee (linearization): all is well.",
     "reasons": [],
     "theorem": None,
     "kind": "linearization",
@@ -58,7 +58,7 @@ def recorded(states, inputs, times, offsets, leaders=(0,), names=NAMES, position
         "lyapunov": 0.5 * (errors**2).sum(axis=(1, 2)),
         "lyapunov_rate": None,
         "metric": None,
-        "limited": np.zeros(agents),
+        "saturated": np.zeros(agents),
         "tracking": None,
         "modes": LoopPoles(np.array([[-1.0 + 2.0j, -1.0 - 2.0j]]), np.array([1.0])),
         "promise": PROMISE,
@@ -117,7 +117,7 @@ def as_file(run, version):
             "error": (per_agent, run.errors),
             "inputs": (("time", "agent", "input"), run.inputs),
             "offset": (("agent", "state"), run.offsets),
-            "saturated": ("agent", run.limited),
+            "saturated": ("agent", run.saturated),
             "is_leader": ("agent", leads),
             "nearest_leader": ("agent", run.nearest),
             "edge_agents": (("edge", "end"), run.edges),

@@ -143,7 +143,7 @@ def test_the_wind_has_its_rms_and_neither_time_nor_agents_repeat_it():
 GUSTS = Disturbance(rms={"velocity": 1.0}, input_rms={"ax": 0.3}, hold=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
     run = drift(disturbance=GUSTS)
     assert np.array_equal(run.states, drift(disturbance=GUSTS).states)
@@ -233,7 +233,7 @@ def test_noise_enters_by_the_normalized_input_behind_the_limits():
     assert not run.states[..., 5].any(), "none on the torque"
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_integrator_keeps_its_order_in_wind():
     wind = Disturbance(constant={"rate": 1.0}, rms={"rate": 3.0}, hold=0.2)
 
@@ -362,7 +362,7 @@ def test_every_number_of_every_bundled_model_can_be_scaled(name):
         assert type(plant) is type(model) and plant.state_names == model.state_names
         assert differences(model, plant).startswith(f"`{field.name}` ") == bool(np.any(value))
         back = vary_parameters(plant, {field.name: value}, {})
-        assert differences(model, back).endswith("which is no different")
+        assert differences(model, back).endswith("which equals the model")
 
 
 # ---- what is told ----
@@ -529,7 +529,7 @@ def test_faults_of_plant_and_disturbance_are_told_with_their_place(section, plac
         ),
         (
             lambda: vary_parameters(Linear(np.eye(2), np.eye(2)), {}, {"names": 2.0}),
-            "`names` of `Linear` is ('x1', 'x2'), which no factor can scale.",
+            "`names` of `Linear` is ('x1', 'x2'), and only numbers can be scaled by a factor.",
         ),
     ],
 )

@@ -143,7 +143,7 @@ def test_native_slopes_are_those_of_jax_for_vehicles_and_the_distances_between_t
     check_equal(parts, SHORT, with_distances, WRT)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_native_slopes_are_those_of_jax_for_a_law_that_remembers():
     parts = points(ech.Graph.ring(5), "relay", dimension=1)
     parts = parts.replace(drive=ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint()))
@@ -260,7 +260,7 @@ def test_what_is_kept_has_a_bound_in_bytes_and_holds_no_moments(monkeypatch):
     ready = gradients._ready.pop(differentiate(0.7))
     assert not any(way.moments for way in ready._native._ways.values())
     way = next(iter(ready._native._ways.values()))
-    assert ready.size > way.tape.nbytes + way.felt.nbytes
+    assert ready.size > way.tape.nbytes + way.cotangents.nbytes
     monkeypatch.setattr(gradients, "_ready", ready_runs(2 * ready.size))
     for start in (0.8, 0.9, 0.6):
         differentiate(start)

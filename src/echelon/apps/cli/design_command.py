@@ -48,7 +48,7 @@ def design(
     from echelon.synthesis.gains.gain_file import save_gain
 
     report = study(loaded, method)
-    sentence, best, stopping = report.because, report.recommended, report.stopping
+    sentence, best, own = report.because, report.recommended, report.law_design
     summary: dict[str, Any] = {"recommended": None}
     if best is not None and best.gain is not None and best.parts is not None:
         summary = {"recommended": best.method, "because": sentence}
@@ -58,15 +58,15 @@ def design(
             radii = _draw(best.parts, report.settings, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             summary["radii"] = radii
-    if stopping is not None:
-        sentence += f"\n{stopping.sentence()}"
-        summary["stopping_point"] = stopping.as_mapping()
+    if own is not None:
+        sentence += f"\n{own.sentence()}"
+        summary[own.name] = own.as_mapping()
     summary["methods"] = [tables.design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
         tables.print_designs(summary["methods"], sentence)
-    raise typer.Exit(0 if best is not None or stopping is not None else 1)
+    raise typer.Exit(0 if best is not None or own is not None else 1)
 
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:

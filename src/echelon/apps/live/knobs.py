@@ -18,7 +18,7 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.override import named_files
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml
-from echelon.laws.stopping_point import StoppingPoint
+from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.gains.fixed import FixedGain
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.inner_loop import InnerLoop
@@ -378,8 +378,8 @@ def _coupling(built: Experiment) -> float | None:
     drive, dt = built.parts.drive, built.settings.dt
     if drive.gain is not None:
         return drive.gain.coupling
-    law = getattr(drive, "follower", None)
-    return float(law.strength(dt)) if isinstance(law, StoppingPoint) else None
+    coupling = drive.follower.strength(dt) if isinstance(drive, Laws) else None
+    return None if coupling is None else float(coupling)
 
 
 def check_choice(what: str, name: object, allowed: Iterable[str]) -> None:

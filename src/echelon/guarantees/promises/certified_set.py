@@ -31,6 +31,11 @@ class CertifiedSet(NamedTuple):
     why: str
     remedy: str = ""
 
+    def as_mapping(self) -> dict[str, object]:
+        """Return it ready for JSON, where an infinite radius is None."""
+        radius = self.radius if self.radius < float("inf") else None
+        return {"radius": radius, "kind": str(self.kind), "why": self.why}
+
 
 def certified_set(
     parts: Parts, settings: Settings, leaders: Leaders, region: RegionCertificate | None
@@ -45,13 +50,13 @@ def certified_set(
         return None
     kind, free = region.kind, region.theorem is Theorem.A5
     if free and not leaders.rest and not _constant(parts, region):
-        text = "g varies, and a leader that moves then adds to V"
+        text = "g varies, and a moving leader then adds to V"
         return CertifiedSet(0.0, kind, text, "use a model whose g is constant")
     trim = np.asarray(parts.model.trim[0], float)
     if leaders.rest and (leaders.starts == trim).all():
         return _less(parts, region, kind, np.zeros(len(trim)))
     if leaders.answer:
-        text = "the leader reacts, so its excursion is not its own"
+        text = "the leader reacts to followers, so its excursion depends on them"
         return CertifiedSet(0.0, kind, text, "set `leader.reacts: false`")
     paths = own_paths(parts, settings, leaders.starts)
     if paths is None:
@@ -103,22 +108,31 @@ def size_of(parts: Parts, states: Array) -> float:
     return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
 
 
-def set_lines(
-    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
-) -> list[Statement]:
-    """Return the set as a line, and whether the starts (N, n) lie in it."""
+def set_line(region: RegionCertificate | None, found: CertifiedSet | None) -> Statement:
+    """Say which set of starts is certified."""
     if found is None:
-        local = region is not None and region.theorem is Theorem.T2
-        text = "T2 is local and certifies no set" if local else "needs a region"
-        return [unneeded(each, Kind.PROOF, text) for each in (Hypothesis.SET, Hypothesis.STARTS)]
-    size, radius, kind = size_of(parts, states), found.radius, found.kind
-    if radius > 0.0:
-        line = holds(Hypothesis.SET, kind, found.why, radius, f"radius {radius:.3g}")
-    else:
-        line = fails(Hypothesis.SET, kind, found.why, radius, "empty", remedy=found.remedy)
-    number = size, f"{size:.3g} of {radius:.3g}"
-    if size <= radius:
-        text = "from there no follower leaves the domain"
-        return [line, holds(Hypothesis.STARTS, kind, text, *number)]
-    text, remedy = "what the set promises does not reach them", "start nearer to the goals"
-    return [line, fails(Hypothesis.STARTS, kind, text, *number, remedy=remedy)]
+        return unneeded(Hypothesis.SET, Kind.PROOF, _no_set(region))
+    if found.radius > 0.0:
+        number = found.radius, f"radius {found.radius:.3g}"
+        return holds(Hypothesis.SET, found.kind, found.why, *number)
+    return fails(Hypothesis.SET, found.kind, found.why, found.radius, "empty", remedy=found.remedy)
+
+
+def starts_line(
+    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
+) -> Statement:
+    """Say whether starts (N, n) lie in the set."""
+    if found is None:
+        return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
+    size = size_of(parts, states)
+    number = size, f"{size:.3g} of {found.radius:.3g}"
+    if size <= found.radius:
+        text = "no follower leaves the domain from these starts"
+        return holds(Hypothesis.STARTS, found.kind, text, *number)
+    text, remedy = "the starts are outside the certified set", "start nearer to the goals"
+    return fails(Hypothesis.STARTS, found.kind, text, *number, remedy=remedy)
+
+
+def _no_set(region: RegionCertificate | None) -> str:
+    local = region is not None and region.theorem is Theorem.T2
+    return "T2 is local and certifies no set" if local else "needs a region"

@@ -19,7 +19,7 @@ from echelon.core.linear import discretize, matrix_exponential, sampled_radius
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
-from echelon.guarantees.promises.leader_path import MOMENTS, LeaderPath, PathSamples, route_of
+from echelon.guarantees.promises.leader_path import MOMENTS, LeaderPath, PathSamples, leader_path_of
 from echelon.guarantees.promises.leaders import Leaders
 from echelon.laws.law import Law, LocalView, gain_of, without_certificates
 from echelon.simulation.engine.law_drive import Laws
@@ -135,44 +135,55 @@ class FrozenLaws(NamedTuple):
     """The laws frozen away from the trim.
 
     Attributes:
-        times: (K,) s; none where the leader rests at its trim or follows no known path.
+        path: the leader's; without any states where it rests at its trim or follows none that is
+            known.
         along: the followers' law along the leader's path.
         leader: the leader's own law there; None where it is not known.
         starts: the followers' law where agents start.
-        blamed: what takes the law out of where it stabilizes, in words; empty where nothing does.
-        turns: the least and the largest rate of the heading along the path, rad/s, in whose axes
-            all slopes are; none where it does not turn, or the law does not.
+        culprit: what takes the law out of where it stabilizes, in words; empty where nothing does.
     """
 
-    times: Array
+    path: LeaderPath
     along: ModeMatrices
     leader: ModeMatrices | None
     starts: ModeMatrices
-    blamed: str
-    turns: tuple[float, ...] = ()
+    culprit: str = ""
 
     @property
-    def travelled(self) -> tuple[ModeMatrices, ...]:
+    def times(self) -> Array:
+        """Of the path, (K,) s."""
+        return self.path.times
+
+    @property
+    def turns(self) -> tuple[float, ...]:
+        """The least and the largest rate of the heading along the path, rad/s.
+
+        All slopes are in its axes; none where it does not turn, or the law does not.
+        """
+        return self.path.extreme_rates()
+
+    @property
+    def on_path(self) -> tuple[ModeMatrices, ...]:
         """The laws along the path; none where there is no path."""
         both = (self.along, self.leader)
         return tuple(each for each in both if each is not None) if len(self.times) else ()
 
     def radii(self, settings: Settings) -> tuple[float, float]:
         """Return the largest spectral radius of a step along the path, and where agents start."""
-        along = (each.stable().radius(settings) for each in self.travelled)
+        along = (each.stable().radius(settings) for each in self.on_path)
         return max(along, default=0.0), self.starts.stable().radius(settings)
 
     def growth(self) -> Growth:
         """Return what errors do along the path, of those who do worse."""
         found = (
             each.along(self.times, who)
-            for each, who in zip(self.travelled, ("followers'", "leader's"))
+            for each, who in zip(self.on_path, ("followers'", "leader's"))
         )
         return max(found, key=lambda one: (one.lost, one.rate))
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which the laws decay wherever they are frozen."""
-        all_ = (*self.travelled, self.starts)
+        all_ = (*self.on_path, self.starts)
         return min(each.stable().longest_step(settings) for each in all_)
 
 
@@ -195,34 +206,28 @@ def frozen_of(
     trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
     if not isinstance(parts.drive, Laws):
         return None
-    path = route_of(parts, settings, leaders)
+    path = leader_path_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
-    few = starts[_few(starts)]
-    both = zip(path.rows, path.at_start(parts.model, few), strict=True)
-    rows = PathSamples._make(map(np.concatenate, both))
-    count, all_ = len(path.times), _followers(parts, loop, rows)
-    along, begun = (
-        ModeMatrices(*(x[part] for x in all_)) for part in (slice(count), slice(count, None))
-    )
-    turns = path.extreme_rates()
+    begun = frozen_starts(parts, loop, path, states[None])
+    if not len(path.times):
+        none = ModeMatrices(*(part[:0] for part in begun))
+        return FrozenLaws(path, none, None, begun)
+    along = _followers(parts, loop, path.rows)
     own = _leader(parts, path.own_headings(parts), along)
-    found = FrozenLaws(path.times, along, own, begun, "", turns)
-    if not count or not found.growth().lost:
+    found = FrozenLaws(path, along, own, begun)
+    if not found.growth().lost:
         return found
-    return found._replace(blamed=_blamed(parts, loop, path, found))
+    return found._replace(culprit=_culprit(parts, loop, path, found))
 
 
-def frozen_at(
-    parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders, states: Array
-) -> ModeMatrices:
+def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
     """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
 
-    They are those of `frozen_of`, the same number of each run after the other.
+    It is the same number of each run after the other.
     """
     starts = states - parts.formation.offsets
     starts = starts[:, _few(starts[0])]
-    path = route_of(parts, settings, leaders)
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
     found = [
@@ -298,7 +303,7 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
     return along._replace(gains=fed_back[:, None])
 
 
-def _blamed(parts: Parts, loop: LinearLoop, path: LeaderPath, found: FrozenLaws) -> str:
+def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, found: FrozenLaws) -> str:
     """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)

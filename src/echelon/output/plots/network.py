@@ -159,7 +159,7 @@ def _about_leaders(run: Recording) -> Recording:
     return dataclasses.replace(
         run,
         **{name: getattr(run, name)[:, kept] for name in ("states", "inputs", "errors")},
-        **{name: getattr(run, name)[kept] for name in ("offsets", "limited")},
+        **{name: getattr(run, name)[kept] for name in ("offsets", "saturated")},
         leaders=tuple(np.flatnonzero(np.isin(kept, run.leaders)).tolist()),
         nearest=np.zeros(len(kept), int),
         edges=np.searchsorted(kept, run.edges[there]),
