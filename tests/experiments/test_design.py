@@ -1,4 +1,4 @@
-"""`design`: the table of methods, what it recommends, and pictures that claim no more than seen."""
+"""`design`: the table of methods, the recommendation, and pictures that claim no more than it."""
 
 import json
 

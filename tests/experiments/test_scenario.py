@@ -1,4 +1,4 @@
-"""The scenario file: what is accepted, what every default is, and the sentence of every fault."""
+"""The scenario file: accepted input, defaults, and errors with their lines."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Gains and what their certificates say, against closed forms and eigenvalues."""
+"""Gains and their certificates, against closed forms and eigenvalues."""
 
 import dataclasses
 import json

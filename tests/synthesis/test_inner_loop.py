@@ -1,4 +1,4 @@
-"""The inner loop that makes the paper's Assumption 5 hold."""
+"""The inner loop with which the paper's Assumption 5 holds."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Gains with a promise on a domain, gain files, `check` and `design`."""
+"""Gains with a guarantee on a domain, gain files, `check` and `design`."""
 
 import json
 import sys
