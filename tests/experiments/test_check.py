@@ -1,4 +1,4 @@
-"""`check`: the finite condition, the region's lines, and a promise no larger than its argument."""
+"""`check`: the finite condition, lines about regions, guarantees no larger than their proofs."""
 
 import dataclasses
 import json

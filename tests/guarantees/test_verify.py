@@ -1,4 +1,4 @@
-"""The independent check of saved gains: what it accepts, what it refuses, and its own algebra."""
+"""The independent verifier of saved gains: accepted files, refused files, its own algebra."""
 
 import importlib.util
 import json
