@@ -128,7 +128,7 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
         _design(cls, _arguments(cls, spec, built.parts), built)
         for cls in methods
         # A method that needs a P, for example, does not compute a gain by itself.
-        if method is not None or {*cls.needs} <= {"domain", *cls.usual}
+        if method is not None or {*cls.needs} <= {"domain", *cls.defaults}
     )
     best, dt = recommended(designs, built.settings.dt), built.settings.dt
     reason = "No method gives a stable loop here." if best is None else because(best, designs, dt)
@@ -286,11 +286,11 @@ def _advice(gain: Gain, parts: Parts) -> str:
 def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dict[str, Any]:
     """Return the scenario's arguments of this method, and its domain if the method needs one."""
     if spec is not None and not spec.file and not spec.python and spec.method == method.name:
-        return {**method.usual, **spec.arguments}
+        return {**method.defaults, **spec.arguments}
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region
     domain = claim.domain if spec is None and claim is not None else None
     domain = spec.domain if spec is not None else domain
     if domain is None or "domain" not in method.needs:
-        return {**method.usual}
-    return {**method.usual, "domain": domain}
+        return {**method.defaults}
+    return {**method.defaults, "domain": domain}
