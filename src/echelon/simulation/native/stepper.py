@@ -7,6 +7,7 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, stride
@@ -54,7 +55,7 @@ class NativeStepper(Stepper):
 
     Args:
         loops: of the run, or of each formation.
-        states: (N, n) at its beginning, formation by formation.
+        states: at its beginning, formation by formation.
         bits: 64 or 32, the precision.
         fallback: continues if a state is beyond the range of the kernels' sines; None if the caller
             checks the range.
@@ -72,7 +73,7 @@ class NativeStepper(Stepper):
     def __init__(
         self,
         loops: Sequence[Loop],
-        states: Array,
+        states: Float[Array, "N n"],
         bits: int,
         fallback: Stepper | None,
         pool: Executor | None = None,
@@ -192,7 +193,7 @@ class NativeStepper(Stepper):
         return self.fallback.advance(now, counts, reference)
 
     def turn(self, loop: Loop) -> None:
-        """Go on in a loop of one formation that is like the one before, but for its numbers."""
+        """Continue with a loop of one formation that differs from this one only in numbers."""
         self.loop, self.loops = loop, [loop]
         self.varying.turn(loop)
         self.edge_weights[:] = neighbour_slots(loop, self.places)[2]
