@@ -167,8 +167,8 @@ def test_the_charts_tell_the_error_and_v_at_the_cursor(browser, run, file):
         told = page.evaluate("[...document.querySelectorAll('.chart')].map((c) => c.innerText)")
         assert [f"{errors[k]:.3g}" in told[0].replace("\n", " ") for k in (1, 2, 3)] == [True] * 3
         assert f"V {run.lyapunov[100]:.3g}" in told[1].replace("\n", " ")
-        assert "slope promised, \u22120.5 1/s" in told[0]
-        assert "slope promised, \u22121 1/s" in told[1]
+        assert "guaranteed slope, \u22120.5 1/s" in told[0]
+        assert "guaranteed slope, \u22121 1/s" in told[1]
 
 
 def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser, run, file):
@@ -267,7 +267,7 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
                 assert page.evaluate(f"echelon.position({agent})") == pytest.approx(place, abs=6e-5)
         seek(page, 120)
         chart = page.locator(".chart").nth(1).inner_text().replace("\n", " ")
-        assert f"V {run.lyapunov[120]:.3g}" in chart and "slope promised, −1 1/s" in chart
+        assert f"V {run.lyapunov[120]:.3g}" in chart and "guaranteed slope, −1 1/s" in chart
         with page.expect_navigation():
             growing.finish(run)
         # A time in between, so that the frame is rounded.

@@ -1,10 +1,10 @@
-"""What the live page is told before the first picture."""
+"""The header of the live page: agents, space and controls, before the first picture."""
 
 from typing import Any
 
 import numpy as np
 
-from echelon.apps.live.knobs import Panel
+from echelon.apps.live.panel import Panel
 from echelon.apps.live.swarm import LiveLoop
 from echelon.experiments.results.foreseen import foreseen
 from echelon.experiments.results.recording import InputBounds, Recording
@@ -14,7 +14,7 @@ from echelon.simulation.step.settings import Settings
 
 
 def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any]) -> dict[str, Any]:
-    """Return what the page is told of a loop: agents, space, knobs."""
+    """Return the header of a loop's page."""
     run = _foreseen(swarm, name, badge)
     space = space_of(run)
     loads = motor_loads(run, space)
@@ -22,7 +22,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any])
         **header(run, space),
         "promise": badge,
         "stream": True,
-        "knobs": panel.told(),
+        "knobs": panel.sliders(),
         "choices": panel.choices(),
         "lyapunov": swarm.potential is not None,
         "clock": {"start": 0.0, "step": swarm.span, "last": run.times[-1]},
@@ -37,17 +37,16 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any])
 
 def _foreseen(swarm: LiveLoop, name: str, badge: dict[str, Any]) -> Recording:
     parts, states = swarm.parts, np.asarray(swarm.states)
-    return foreseen(parts, swarm.settings, states, name, _silent(badge))
+    return foreseen(parts, swarm.settings, states, name, _empty_promise(badge))
 
 
-def _silent(badge: dict[str, Any]) -> dict[str, Any]:
-    """Return a promise of nothing, as what is promised stands in the badge."""
-    # How the coupling stands is told by its knob.
-    told = {"promised": False, "rate": None, "coupling": None, "theorem": None}
-    return {**told, "sentence": badge["whole"], "kind": "", "hypotheses": []}
+def _empty_promise(badge: dict[str, Any]) -> dict[str, Any]:
+    """Return an empty promise, since the badge states the guarantee."""
+    empty = {"promised": False, "rate": None, "coupling": None, "theorem": None}
+    return {**empty, "sentence": badge["whole"], "kind": "", "hypotheses": []}
 
 
 def drawn(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
-    """Return where agents are drawn, and what limits their inputs."""
+    """Return the space that agents are drawn in, and the bounds of their inputs."""
     run = _foreseen(swarm, "", {"whole": ""})
     return space_of(run), run.bounds if settings.limits else None

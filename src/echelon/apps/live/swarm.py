@@ -11,7 +11,7 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.world import World
-from echelon.apps.live.knobs import Knobs, Panel
+from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.apps.live.live_stepper import mover_of
 from echelon.core.errors import GraphError
 from echelon.core.numerics import precision
@@ -100,13 +100,13 @@ class LiveLoop:
     Args:
         parts: of a scenario.
         settings: of it.
-        panel: of its knobs.
+        panel: the numbers that its knobs set.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
 
-    def __init__(self, parts: Parts, settings: Settings, panel: Panel) -> None:
+    def __init__(self, parts: Parts, settings: Settings, panel: LiveParts) -> None:
         """Prepare what the steps need."""
         world = World(parts.world.plant, parts.world.disturbance or Disturbance())
         prepared = prepare(parts.replace(world=world), settings)

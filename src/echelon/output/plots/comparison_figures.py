@@ -1,4 +1,4 @@
-"""The figures of a comparison: one line a method."""
+"""Figures of a comparison, with one line per method."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,18 +20,18 @@ def comparison_figures(comparison: Comparison) -> "dict[str, Figure]":
     """Return the figures of a comparison, by name.
 
     `formation_error` is the worst follower's distance from its goal, `tracking_error` the leader's
-    from its reference, and `approach` one follower's way to its goal, all with one line a method.
+    from its reference, and `approach` the path of one follower to its goal.
     """
     flown = [(k, row) for k, row in enumerate(comparison.rows) if _frames(row)]
     if not flown:
         return {}
     with draw.style():
-        made = {
+        drawings = {
             "formation_error": _formation_error(flown),
             "tracking_error": _tracking_error(flown),
             "approach": _approach(flown),
         }
-    return {name: figure for name, figure in made.items() if figure is not None}
+    return {name: figure for name, figure in drawings.items() if figure is not None}
 
 
 def save_comparison_figures(comparison: Comparison, folder: Path) -> None:
@@ -62,12 +62,12 @@ def _formation_error(flown: _Flown) -> "Figure":
 
 
 def _tracking_error(flown: _Flown) -> "Figure | None":
-    found = {k: output_errors(_result(row)) for k, row in flown}
-    # The outputs begin with the position, so that a yaw is not added to metres.
+    tracking = {k: output_errors(_result(row)) for k, row in flown}
+    # Only the position, with which the outputs begin, since a yaw is not in metres.
     space = len(_result(flown[0][1]).measured)
     lines = {
         k: np.linalg.norm(errors[:, :space], axis=1)
-        for k, errors in found.items()
+        for k, errors in tracking.items()
         if errors is not None
     }
     if not lines:
@@ -77,45 +77,45 @@ def _tracking_error(flown: _Flown) -> "Figure | None":
     return _over_time([(k, row) for k, row in flown if k in lines], lines, text)
 
 
-def _count_alike(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
-    """Return how many lines each stands for: laws that share a leader draw one over the other."""
-    stands: dict[int, int] = {}
+def _count_equal(flown: _Flown, lines: dict[int, Array]) -> dict[int, int]:
+    """Return the number of equal lines that each drawn line represents."""
+    counts: dict[int, int] = {}
     for k, _ in flown:
-        # To the bit: laws that share a leader, who does not react to them, share its run.
-        same = [j for j in stands if np.array_equal(lines[j], lines[k])]
-        stands[same[0] if same else k] = stands.get(same[0], 0) + 1 if same else 1
-    return stands
+        # To the bit, as of laws with the same leader, which does not react to its followers.
+        same = [j for j in counts if np.array_equal(lines[j], lines[k])]
+        counts[same[0] if same else k] = counts.get(same[0], 0) + 1 if same else 1
+    return counts
 
 
 def _over_time(flown: _Flown, lines: dict[int, Array], text: str) -> "Figure":
     """Return errors on a logarithmic axis, with gaps where they are 0."""
-    stands = _count_alike(flown, lines)
-    # A run that ended early has fewer frames, and the axis is that of the others.
+    counts = _count_equal(flown, lines)
+    # The time axis of the longest run, since others may have ended early.
     longest = max((_result(row) for _, row in flown), key=lambda result: result.times[-1])
     figure, (ax,) = draw.panels(longest.times, longest.settings.horizon, 1, 3.4)
-    shown = []
+    curves = []
     for k, row in flown:
-        if k not in stands:
+        if k not in counts:
             continue
         values = draw.above_zero(lines[k])
         keep = draw.thin(len(values))
-        name = row.label if stands[k] == 1 else f"{row.label}, and {stands[k] - 1} alike"
+        name = row.label if counts[k] == 1 else f"{row.label} and {counts[k] - 1} equal"
         name = draw.say_zero(name, values)
         draw.plot(ax, _result(row).times[keep], values[keep], label=name, **_pen(k))
-        shown.append(values)
+        curves.append(values)
     ax.axhline(SETTLED, color="0.5", linewidth=0.8, linestyle=":", label="1 cm", zorder=1)
     ax.set_ylabel(text)
-    draw.logarithmic(ax, *shown, np.array([SETTLED]))
+    draw.logarithmic(ax, *curves, np.array([SETTLED]))
     return draw.finish(figure)
 
 
 def _approach(flown: _Flown) -> "Figure | None":
-    """Return how the follower that starts worst comes to its goal, seen from its leader."""
+    """Return the path of the follower with the largest initial error, relative to its goal."""
     first = _result(flown[0][1])
     axes = list(first.model.position_indices()[:2])
     if len(axes) < 2:
         return None
-    # All methods begin from the same deviations, so that the first can choose.
+    # All methods have the same starts, so that the first gives the follower.
     follower = int(np.argmax(formation_errors(first)[0]))
     names, units = first.model.state_names, first.model.state_units
     figure, ax = draw.canvas([draw.label(f"{names[k]} error", units[k]) for k in axes])
@@ -123,7 +123,7 @@ def _approach(flown: _Flown) -> "Figure | None":
     drawn, cut = [start, goal], False
     for k, row in flown:
         path, over = draw.drop_runaways(_result(row).errors[:, follower][:, axes], start, goal)
-        # One that leaves would shrink the others' ways to a dot.
+        # A path that leaves would shrink the others to a dot.
         inside = np.abs(path).max(axis=1) <= 1.3 * np.abs(start).max()
         path, over = np.where(inside[:, None], path, np.nan), over or not inside.all()
         draw.plot(ax, path[draw.thin(len(path))], label=row.label, **_pen(k))

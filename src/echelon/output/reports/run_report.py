@@ -1,7 +1,4 @@
-"""The report of a run on the screen.
-
-A table like the paper's Table II, and what it shows, in sentences.
-"""
+"""The report of a run: a table like the paper's Table II, and sentences that explain it."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -23,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-# Above this many of a role the table shows the best, the median and the worst instead of all.
+# With more agents of a role the table shows the best, the median and the worst.
 _MANY = 12
 
 
@@ -32,7 +29,7 @@ def report(result: Result) -> str:
     from rich.console import Console
 
     text = io.StringIO()
-    # Called a terminal so that sentences wrap; without colours it is plain text all the same.
+    # A forced terminal, so that sentences wrap; without colours the text stays plain.
     console = Console(file=text, width=100, color_system=None, force_terminal=True)
     print_report(console, result, metrics(result))
     return text.getvalue().rstrip("\n")
@@ -60,7 +57,7 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     unit = "" if result.unit == "state" else f", {result.unit}"
     steady = f"steady{unit}\n(last {numbers.steady_window:.3g} s)"
     settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
-    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "limited,\n% steps"]
+    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "saturated,\n% steps"]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
     title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
@@ -73,7 +70,7 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
 
 
 def _length(result: Result) -> str:
-    """Return how long the run was, and how long it should have been where that is not the same."""
+    """Return the duration of the run, and the horizon if the run did not reach it."""
     horizon = f"{result.settings.horizon:g} s"
     if result.outcome.reached:
         return horizon
@@ -89,10 +86,10 @@ def _title(result: Result) -> str:
 
 def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
-    # One leader needs no number, and has its name from the paper's table.
-    alone = ["leader"] if len(leaders) == 1 else None
-    rows = [_leader_row(label, each) for label, each in labelled("leader", leaders, alone)]
-    rows += [_follower_row(label, each) for label, each in labelled("follower", followers)]
+    # A single leader needs no number, as in the paper's table.
+    names = ["leader"] if len(leaders) == 1 else None
+    rows = [_leader_row(label, row) for label, row in labelled("leader", leaders, names)]
+    rows += [_follower_row(label, row) for label, row in labelled("follower", followers)]
     if printed:
         for k, row in enumerate(rows):
             row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
@@ -103,15 +100,15 @@ _Row = TypeVar("_Row", LeaderMetrics, FollowerMetrics)
 
 
 def labelled(
-    role: str, each: Sequence[_Row], labels: list[str] | None = None
+    role: str, agents: Sequence[_Row], labels: list[str] | None = None
 ) -> Iterator[tuple[str, _Row]]:
-    """Yield all of a role, or of many the best, the median and the worst, each with its label."""
-    kinds, chosen = [""] * len(each), each
-    if len(each) > _MANY:
-        kinds, chosen = ["best ", "median ", "worst "], representatives(each, steady_error)
-    names = labels or [f"{role} {one.agent}" for one in chosen]
-    for kind, name, one in zip(kinds, names, chosen, strict=True):
-        yield (f"{kind}({name})" if kind else name), one
+    """Yield all agents of a role, or the best, the median and the worst, with their labels."""
+    kinds, rows = [""] * len(agents), agents
+    if len(agents) > _MANY:
+        kinds, rows = ["best ", "median ", "worst "], representatives(agents, steady_error)
+    names = labels or [f"{role} {row.agent}" for row in rows]
+    for kind, name, row in zip(kinds, names, rows, strict=True):
+        yield (f"{kind}({name})" if kind else name), row
 
 
 def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:
@@ -119,11 +116,11 @@ def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:
     return [label, *errors, "", "", _percent(leader.saturated)]
 
 
-def _follower_row(label: str, each: FollowerMetrics) -> list[str]:
-    settled = "never" if each.settling_time is None else f"{each.settling_time:.4g}"
-    settled = "-" if each.rmse is None else settled
-    errors = [_number(each.rmse), _number(each.steady_rmse)]
-    return [label, *errors, settled, _number(each.effort), _percent(each.saturated)]
+def _follower_row(label: str, follower: FollowerMetrics) -> list[str]:
+    settled = "never" if follower.settling_time is None else f"{follower.settling_time:.4g}"
+    settled = "-" if follower.rmse is None else settled
+    errors = [_number(follower.rmse), _number(follower.steady_rmse)]
+    return [label, *errors, settled, _number(follower.effort), _percent(follower.saturated)]
 
 
 def _number(value: float | None) -> str:

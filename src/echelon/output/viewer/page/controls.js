@@ -25,7 +25,7 @@ function icon(name) {
 
 function tellPromise({ state, short, whole }) {
   const badge = $(".promise");
-  badge.classList.remove("holds", "edge", "lost", "asking");
+  badge.classList.remove("holds", "edge", "lost", "pending");
   badge.classList.add(state);
   badge.querySelector("b").textContent = short;
   badge.querySelector(".whole").replaceChildren(...prose(whole));
