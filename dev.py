@@ -1,7 +1,7 @@
-"""Set up the working environment in `.venv` and run things in it: `python3 dev.py demo`, for one.
+"""Set up the working environment in `.venv` and run commands in it, such as `python3 dev.py demo`.
 
-Needs Python 3.11 or later and nothing else. Uses uv when it is on the PATH, else venv and pip. The
-versions come from constraints.txt. What stands after the verb goes on to the program that it runs.
+Needs Python 3.11 or later and nothing else. Uses uv where it is on the PATH, else venv and pip. The
+versions are those of constraints.txt. Arguments after the command are passed on to the program.
 """
 
 import hashlib
@@ -23,44 +23,50 @@ VENV = ROOT / ".venv"
 STAMP = VENV / "echelon-setup.txt"
 BUILD = ROOT / "build"
 PINNED = ["--constraint", "constraints.txt"]
-HELP = """usage: python3 dev.py VERB [ARGUMENT ...]
+HELP = """usage: python3 dev.py COMMAND [ARGUMENT ...]
 
-  setup   set up .venv with all extras and build what the page draws with (three.js, from npm);
-          does nothing when nothing changed
-  browser find Chromium for the tests, or install Debian's, where this may be done
-  demo    run the paper's experiment: echelon run paper [ARGUMENT ...]
-  test    run the tests: pytest [ARGUMENT ...], on all cores
-  lint    check style, layout and who imports whom: ruff, import-linter
-  types   check types: pyright
-  docs    build the documentation into site/, with warnings as errors: zensical
-  fuzz    feed the command line nonsense for [SECONDS], and tell what it does not bear
-  mutate  change the code in small ways and see which of them no test notices
-  results make the published numbers of docs/ again: results (3 minutes on two free cores),
-          comparison (10) and certificates (30), or [PAGE ...] of them
-  wheel   build the wheel into build/, install it alone and without extras, and try it"""
+  demo       run the paper's experiment: echelon run paper [ARGUMENT ...]
+  test       run the tests on all cores: pytest [ARGUMENT ...]; --quick leaves the slow tests out;
+             installs Chromium for the tests of the web page where it is missing
+  setup      create .venv with all extras (2.5 GB) and build three.js for the web page; does nothing
+             where it is up to date; --minimal installs what `echelon run` needs (1.1 GB)
+  browser    find or install Chromium
+  lint       check style, layout and imports between packages: ruff, import-linter
+  types      check types: pyright
+  docs       build the documentation into site/, with warnings as errors: zensical
+  sentences  write the messages of errors again: tests/sentences.txt
+  fuzz       run the command line with random input for [SECONDS] and report what fails
+  mutate     change the code in small ways and report the changes that no test notices
+  results    compute the published numbers of docs/ again: results (3 minutes on two free cores),
+             comparison (10) and certificates (30), or [PAGE ...] of them
+  wheel      build the wheel into build/, install it without extras, and try it
+  bare       run demo, wheel and page tests in a minimal Debian; needs root and apt; for a release
+
+Every command except `bare` sets up .venv first. After `setup --minimal`, `demo` uses what is there;
+the other commands install the rest."""
 NO_PIP = (
-    "This Python cannot make an environment, since it has neither `ensurepip` nor `pip`"
-    " 22.3 or later; install one of them (on Debian or Ubuntu: `apt install python3-venv`), or uv,"
-    " and run this again."
+    "this Python cannot create an environment: it has neither `ensurepip` nor `pip` 22.3 or later."
+    " Install one of them (on Debian or Ubuntu: `apt install python3-venv`) or uv, then try again."
 )
 
 
 class SetupError(Exception):
-    """The environment cannot be set up; the message is what a person reads."""
+    """The environment cannot be set up; the message says why and what to do."""
 
 
 def main(arguments: list[str]) -> int:
-    """Run the verb and return the exit code of what it ran."""
+    """Run the command and return its exit code."""
     verb, rest = (arguments[0], arguments[1:]) if arguments else ("help", [])
     if verb in ("help", "-h", "--help"):
         print(HELP)
         return 0
     if verb not in VERBS:
-        print(f"dev.py: `{verb}` is no verb.\n\n{HELP}", file=sys.stderr)
+        print(f"dev.py: `{verb}` is not a command.\n\n{HELP}", file=sys.stderr)
         return 2
     try:
-        setup()
-        folder = Path.cwd() if verb == "demo" else ROOT  # a demo's `--out` is the caller's
+        if verb != "bare":
+            setup(minimal=is_minimal(verb, rest))
+        folder = Path.cwd() if verb == "demo" else ROOT  # `--out` is relative to where one stands
         return max((run(command, folder) for command in VERBS[verb](rest)), default=0)
     except (SetupError, OSError) as error:
         print(f"dev.py: {error}", file=sys.stderr)
@@ -70,7 +76,7 @@ def main(arguments: list[str]) -> int:
 
 
 def program(name: str, venv: Path = VENV) -> Path:
-    """Return where a program of an environment stands, or would."""
+    """Return the path of a program of an environment, whether it exists or not."""
     return venv / "Scripts" / f"{name}.exe" if os.name == "nt" else venv / "bin" / name
 
 
@@ -80,9 +86,14 @@ def tool(name: str, *arguments: str) -> list[str]:
 
 
 def tests(rest: list[str]) -> list[list[str]]:
-    """Return the command that runs the tests, spread over the cores where there are several."""
-    spread = ["-n", "auto", "--dist", "worksteal"] if cores() > 1 else []
-    return [tool("pytest", *spread, *rest)]
+    """Return the command that runs the tests, in parallel where there are several cores."""
+    if chromium() is None:
+        install_browser()
+    chosen = [word for word in rest if word != "--quick"]
+    if not any(word.startswith("-m") for word in chosen):
+        chosen += ["-m", "not slow and not study" if "--quick" in rest else "not study"]
+    parallel = ["-n", str(cores()), "--dist", "loadgroup"] if cores() > 1 else []
+    return [tool("pytest", *parallel, *chosen)]
 
 
 def cores() -> int:
@@ -93,18 +104,18 @@ def cores() -> int:
 
 
 def wheel(rest: list[str]) -> list[list[str]]:
-    """Build the wheel, install it where nothing else is, and return the commands that try it.
+    """Build the wheel, install it into an empty environment, and return the commands that try it.
 
-    They see what an editable install hides: a file that is not shipped, a dependency that only an
-    extra or a tool brings.
+    They find what an editable install hides: a file that is not shipped, a dependency that only an
+    extra or a development tool installs.
     """
     wheels, alone = BUILD / "wheels", BUILD / "alone"
     clear(wheels)
     clear(alone)
     install = installer(alone)
-    step(builder(alone, wheels), "The wheel could not be built; what stands above says why.")
+    step(builder(alone, wheels), "the wheel could not be built; see the messages above.")
     [built] = wheels.glob("*.whl")
-    step([*install, str(built), *PINNED], "The wheel could not be installed.")
+    step([*install, str(built), *PINNED], "the wheel could not be installed; see above.")
     echelon = str(program("echelon", alone))
     every_name = "import echelon; [getattr(echelon, name) for name in echelon.__all__]"
     return [
@@ -117,21 +128,42 @@ def wheel(rest: list[str]) -> list[list[str]]:
 
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+NO_BROWSER = """dev.py: Chromium is missing and could not be installed: the page tests will fail.
+  Install it (on Debian or Ubuntu: `sudo apt install chromium`; elsewhere Chromium or Chrome, on the
+  PATH) and try again. The other tests alone: `python3 dev.py test -m "not study and not page"`."""
 
 
 def browser(rest: list[str]) -> list[list[str]]:
-    """Return the command that tells Chromium's version, installed first where there is none."""
-    if not any(map(shutil.which, BROWSERS)) and shutil.which("apt-get"):
-        # As root as it is, else only where that takes no password.
+    """Return the command that prints Chromium's version; install Chromium first where missing."""
+    if chromium() is None and not install_browser():
+        raise SetupError("there is no Chromium.")
+    return [[str(chromium()), "--version"]]
+
+
+def chromium() -> str | None:
+    """Return the browser that the tests use: one on the PATH, or Playwright's own."""
+    code = "import browser; print(browser.executable() or '')"
+    command = [str(program("python")), "-c", code]
+    done = subprocess.run(command, cwd=ROOT / "tests", capture_output=True, text=True)
+    return done.stdout.strip() or None
+
+
+def install_browser() -> bool:
+    """Install Debian's Chromium as root, or else Playwright's; return whether there is one then."""
+    print("Installing Chromium for the tests of the web page.", flush=True)
+    if shutil.which("apt-get"):
+        # Where sudo asks for a password, `-n` makes it fail instead.
         sudo = [] if os.geteuid() == 0 else ["sudo", "-n"]
         apt = [*sudo, "apt-get", "-qq", "-o", "DPkg::Lock::Timeout=300"]
         for command in (["update"], ["install", "-y", "--no-install-recommends", "chromium"]):
             if not works([*apt, *command]):
                 break
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        raise SetupError("there is no Chromium on the PATH for the tests of the page; install it.")
-    return [[found, "--version"]]
+    if chromium() is None:
+        works([str(program("python")), "-c", "import browser; browser.install()"], ROOT / "tests")
+    if chromium() is None:
+        print(NO_BROWSER, file=sys.stderr)
+        return False
+    return True
 
 
 PAGES = {"results": [], "comparison": [], "certificates": ["--all"]}
@@ -139,10 +171,10 @@ PAGES = {"results": [], "comparison": [], "certificates": ["--all"]}
 
 
 def results(rest: list[str]) -> list[list[str]]:
-    """Return the commands that make the published numbers again."""
+    """Return the commands that compute the published numbers again."""
     unknown = [name for name in rest if name not in PAGES]
     if unknown:
-        raise SetupError(f"`{unknown[0]}` is no page of numbers; there are {', '.join(PAGES)}.")
+        raise SetupError(f"`{unknown[0]}` is not one of the pages {', '.join(PAGES)}.")
     # The times that are published are those of one thread.
     os.environ["OMP_NUM_THREADS"] = "1"
     python = str(program("python"))
@@ -161,18 +193,20 @@ VERBS = {
     ],
     "types": lambda rest: [tool("pyright", *rest)],
     "docs": lambda rest: [tool("zensical", "build", "--strict", "--clean", *rest)],
+    "sentences": lambda rest: [[str(program("python")), "tests/sentences.py", *rest]],
     "fuzz": lambda rest: [[str(program("python")), "benchmarks/fuzz.py", *rest]],
     "mutate": lambda rest: [[str(program("python")), "benchmarks/mutate.py", *rest]],
     "results": results,
     "wheel": wheel,
+    "bare": lambda rest: [["bash", str(ROOT / ".ci" / "bare"), *rest]],
 }
 
 
 def run(command: list[str], folder: Path = ROOT) -> int:
     """Run a command in the foreground and return its exit code, 128 + n for one ended by signal n.
 
-    Ctrl-C reaches the command as well. It is left to end in its own way, and only then, unless it
-    ended well, is the interruption passed on.
+    Ctrl-C reaches the command as well. It ends in its own way; the interruption is passed on unless
+    it ended successfully.
     """
     process = subprocess.Popen(command, cwd=folder)
     interrupted = False
@@ -187,28 +221,39 @@ def run(command: list[str], folder: Path = ROOT) -> int:
         return code if code >= 0 else 128 - code
 
 
-def setup() -> None:
-    """Make .venv what pyproject.toml and constraints.txt ask for, and build the page's three.js."""
-    wanted = fingerprint()
-    if not (program("python").exists() and STAMP.is_file() and STAMP.read_text("utf-8") == wanted):
-        install_all(wanted)
-    if run([str(program("python")), str(ROOT / "web" / "build.py")]) != 0:
-        print("dev.py: all but `echelon view` and `echelon live` works without.", file=sys.stderr)
+def is_minimal(verb: str, rest: list[str]) -> bool:
+    """Tell whether a small environment is asked for, or is there and suffices."""
+    if verb == "setup":
+        return "--minimal" in rest
+    return verb == "demo" and STAMP.is_file() and STAMP.read_text("utf-8").startswith("minimal\n")
 
 
-def install_all(wanted: str) -> None:
-    """Install what is needed into .venv, and note of what."""
-    print(f"Setting up {VENV}; the first time, this takes a few minutes.", flush=True)
+def setup(minimal: bool) -> None:
+    """Install what pyproject.toml and constraints.txt state; build three.js unless minimal."""
+    accepted = [fingerprint("all,dev"), *([fingerprint("minimal")] if minimal else [])]
+    if not (program("python").exists() and STAMP.is_file()) or STAMP.read_text() not in accepted:
+        install_all(accepted[-1])
+    build = [str(program("python")), str(ROOT / "web" / "build.py")]
+    if not minimal:
+        step(build, "three.js could not be built; see above. `setup --minimal` does without it.")
+
+
+def install_all(stamp: str) -> None:
+    """Install the packages into .venv, and write the stamp that says which."""
+    minimal = stamp.startswith("minimal")
+    size = "1.1 GB" if minimal else "2.5 GB, or 1.1 GB with `python3 dev.py setup --minimal`"
+    print(f"Setting up {VENV}: a few minutes, once. It takes {size}.", flush=True)
     STAMP.unlink(missing_ok=True)
-    install = [*installer(VENV), "--editable", ".[all,dev]", *PINNED]
-    step(install, "The packages could not be installed; what stands above says why.")
-    STAMP.write_text(wanted, "utf-8")
+    extras = "fast" if minimal else "all,dev"
+    install = [*installer(VENV), "--editable", f".[{extras}]", *PINNED]
+    step(install, "the packages could not be installed; see the messages above.")
+    STAMP.write_text(stamp, "utf-8")
 
 
-def fingerprint() -> str:
-    """Return what .venv depends on: a hash of the two files, the Python version, this folder."""
+def fingerprint(extras: str) -> str:
+    """Return what .venv depends on: extras, hash of two files, version of Python, this folder."""
     files = b"".join((ROOT / name).read_bytes() for name in ("pyproject.toml", "constraints.txt"))
-    return "\n".join([hashlib.sha256(files).hexdigest(), version(), str(ROOT), ""])
+    return "\n".join([extras, hashlib.sha256(files).hexdigest(), version(), str(ROOT), ""])
 
 
 def version() -> str:
@@ -217,7 +262,7 @@ def version() -> str:
 
 
 def installer(venv: Path) -> list[str]:
-    """Make sure that an environment exists and return the command that installs into it."""
+    """Create an environment where it is missing; return the command that installs into it."""
     return with_uv(venv) if shutil.which("uv") else with_pip(venv)
 
 
@@ -229,15 +274,15 @@ def builder(venv: Path, folder: Path) -> list[str]:
 
 
 def with_uv(venv: Path) -> list[str]:
-    """Make sure that an environment exists and return how uv installs into it."""
+    """Create an environment by uv where it is missing; return how uv installs into it."""
     if not fits(venv):
         clear(venv)
-        step(["uv", "venv", "--python", sys.executable, str(venv)], f"uv could not make {venv}.")
+        step(["uv", "venv", "--python", sys.executable, str(venv)], f"uv could not create {venv}.")
     return ["uv", "pip", "install", "--python", str(program("python", venv))]
 
 
 def with_pip(venv: Path) -> list[str]:
-    """Make sure that an environment exists and return how pip installs into it."""
+    """Create an environment by venv where it is missing; return how pip installs into it."""
     if not (fits(venv) and pip(venv)):
         clear(venv)
         make = [sys.executable, "-m", "venv", str(venv)]
@@ -252,8 +297,8 @@ def with_pip(venv: Path) -> list[str]:
 def pip(venv: Path) -> list[str]:
     """Return a pip that installs into an environment, or nothing where there is none.
 
-    Debian takes `ensurepip` out of its Python, and then an environment is born without pip; a pip
-    outside the environment can install into it all the same (from pip 22.3 on).
+    Debian's Python has no `ensurepip`, so that an environment may lack pip; a pip outside the
+    environment can install into it (from pip 22.3 on).
     """
     python = str(program("python", venv))
     inner, outer = [python, "-m", "pip"], [sys.executable, "-m", "pip", "--python", python]
@@ -261,40 +306,40 @@ def pip(venv: Path) -> list[str]:
 
 
 def quiet() -> list[str]:
-    """Return pip's option for few lines where nobody watches its progress bars."""
+    """Return pip's option against progress bars where the output is not a terminal."""
     return [] if sys.stdout.isatty() else ["--quiet"]
 
 
 def fits(venv: Path) -> bool:
-    """Tell whether an environment exists and is for this version of Python, whoever made it."""
+    """Tell whether an environment exists and is for this version of Python."""
     config = venv / "pyvenv.cfg"
     if not (program("python", venv).exists() and config.is_file()):
         return False
     pairs = (line.partition("=") for line in config.read_text().splitlines())
     settings = {key.strip(): value.strip() for key, _, value in pairs}
-    made_for = settings.get("version") or settings.get("version_info") or ""
-    return made_for.startswith(f"{version()}.")
+    python = settings.get("version") or settings.get("version_info") or ""
+    return python.startswith(f"{version()}.")
 
 
 def clear(folder: Path) -> None:
-    """Remove what stands where a folder will be made: what does not fit, or is half made."""
+    """Remove a folder, or a link to one, where it exists."""
     if folder.is_symlink():
         folder.unlink()
     elif folder.exists():
         shutil.rmtree(folder)
 
 
-def works(command: list[str]) -> bool:
-    """Tell whether a command exists and ends well; what it says is not shown."""
+def works(command: list[str], folder: Path = ROOT) -> bool:
+    """Tell whether a command exists and succeeds; its output is not shown."""
     silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     try:
-        return subprocess.run(command, check=False, **silent).returncode == 0
+        return subprocess.run(command, check=False, cwd=folder, **silent).returncode == 0
     except OSError:
         return False
 
 
 def step(command: list[str], sentence: str) -> None:
-    """Run one step of the set-up, and raise `SetupError` with the sentence when it fails."""
+    """Run one step of the set-up; raise `SetupError` with the sentence where it fails."""
     if run(command) != 0:
         raise SetupError(sentence)
 

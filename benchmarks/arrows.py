@@ -30,7 +30,8 @@ from echelon.guarantees.stopping.stopping_run import stopping_of
 from echelon.guarantees.stopping.tube import tube_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble, begin, control, step
+from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.sequence import begin, step
 
 AGENTS, DT, SPAN, BATCH, AGAIN = 5, 0.0005, 0.7, 50, 6
 ALL = [(i, j) for i in range(AGENTS) for j in range(1, AGENTS) if i != j]
@@ -76,7 +77,7 @@ def fly(loop: Any, weights: jax.Array, starts: jax.Array, dt: float) -> tuple[ja
         def on(_: jax.Array, done: Any) -> Any:
             now, least, size, rose = done
             lift, away = flat(now)
-            after = step(mine, now, control(mine, now))
+            after = step(mine, now)
             return (
                 after,
                 jnp.minimum(least, lift.min()),

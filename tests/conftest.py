@@ -40,6 +40,13 @@ def pytest_configure(config):
         os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)  # which JAX reads when it first runs
 
 
+def pytest_collection_modifyitems(items):
+    """Mark the tests that need a browser, so that a machine without one can leave them out."""
+    for item in items:
+        if "browser" in item.fixturenames:
+            item.add_marker("page")
+
+
 check_shapes()
 
 # The first example compiles, so none has a deadline.

@@ -1,6 +1,9 @@
 """Runs that nobody simulated: recordings of chosen numbers, for tests of what draws them."""
 
+import json
+
 import numpy as np
+import xarray as xr
 
 from echelon.experiments.results.recording import InputBounds, LoopPoles, Recording, TrackingErrors
 
@@ -85,3 +88,59 @@ def tracked(run):
     """A tracking error that shrinks, for the leaders of a recording."""
     shrinks = np.exp(-run.times)[:, None, None] * np.ones((1, len(run.leaders), 2))
     return TrackingErrors(shrinks, ("x", "yaw"), ("m", "rad"))
+
+
+def swinging(names, position, agents=3, n=2):
+    """Agents whose states swing, and settle, for spaces without three axes."""
+    times = np.linspace(0.0, 4.0, 101)
+    states = np.exp(-times)[:, None, None] * np.ones((1, agents, n))
+    states = states * np.arange(1, agents + 1)[None, :, None] + np.sin(times)[:, None, None]
+    return recorded(
+        states,
+        np.zeros((101, agents, 1)),
+        times,
+        np.zeros((agents, n)),
+        names=names,
+        position=position,
+        bounds=None,
+        model="Own",
+    )
+
+
+def as_file(run, version):
+    """A file of a recording, without V, limits and modes."""
+    per_agent = ("time", "agent", "state")
+    leads = np.isin(np.arange(run.agents), run.leaders).astype(np.int8)
+    data = xr.Dataset(
+        {
+            "states": (per_agent, run.states),
+            "error": (per_agent, run.errors),
+            "inputs": (("time", "agent", "input"), run.inputs),
+            "offset": (("agent", "state"), run.offsets),
+            "saturated": ("agent", run.limited),
+            "is_leader": ("agent", leads),
+            "nearest_leader": ("agent", run.nearest),
+            "edge_agents": (("edge", "end"), run.edges),
+            "edge_weight": ("edge", run.weights),
+            "edge_heard": (("edge", "end"), run.heard.astype(np.int8)),
+        },
+        {
+            "time": run.times,
+            "state": list(run.state_names),
+            "state_unit": ("state", list(run.state_units)),
+            "input": list(run.input_names),
+            "input_unit": ("input", list(run.input_units)),
+        },
+        {
+            "model": "Own",
+            "position": " ".join(run.state_names[k] for k in run.position),
+            "format": version,
+            "leader_needs": "nothing",
+            "promise": json.dumps(run.promise),
+            "horizon": run.horizon,
+            "dt": run.dt,
+            "outcome": "completed",
+            "message": "The run reached its horizon.",
+        },
+    )
+    return bytes(data.to_netcdf(None, engine="h5netcdf"))

@@ -48,6 +48,7 @@ def is_folder(module: str) -> bool:
 
 def statements(node: ast.AST):
     """Yield the import statements that can run, those inside functions included."""
+    # Those under TYPE_CHECKING are for annotations alone.
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             for other in child.orelse:
@@ -93,6 +94,14 @@ def imports(module: str) -> dict[str, int]:
         for name in targets(module, node)
     ]
     return {target: line for target, line in pairs if target is not None}
+
+
+@cache
+def mentions(module: str) -> set[str]:
+    """The modules of echelon that a module imports at all, for annotations alone too."""
+    nodes = [n for n in ast.walk(tree(module)) if isinstance(n, ast.Import | ast.ImportFrom)]
+    found = {inside(name) for node in nodes for name in targets(module, node)}
+    return {target for target in found if target is not None} - {module}
 
 
 def loads(module: str) -> set[str]:
@@ -168,6 +177,21 @@ def test_nothing_stands_at_the_top_but_the_door():
 def test_no_import_cycle():
     sorter = graphlib.TopologicalSorter({module: loads(module) for module in PATHS})
     assert set(sorter.static_order()) == set(PATHS)
+
+
+def test_no_cycle_even_among_imports_for_annotations():
+    sorter = graphlib.TopologicalSorter({module: mentions(module) for module in PATHS})
+    assert set(sorter.static_order()) == set(PATHS)
+
+
+def test_no_import_goes_up_not_even_for_annotations():
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]
+    [layers] = [c["layers"] for c in contracts["contracts"] if c.get("containers") == ["echelon"]]
+    rank = {layer: -number for number, layer in enumerate(layers)}
+    edges = [(module, target) for module in PATHS for target in mentions(module)]
+    ranks = [(rank.get(module.split(".")[0]), rank.get(t.split(".")[0])) for module, t in edges]
+    up = [e for e, (a, b) in zip(edges, ranks, strict=True) if None not in (a, b) and a < b]
+    assert len(rank) > 8 and not up
 
 
 def test_folders_are_layers_and_packages():
@@ -324,4 +348,4 @@ def test_dev_refuses_a_verb_it_does_not_have():
     command = [sys.executable, str(ROOT / "dev.py"), "dmeo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
-    assert done.stderr.startswith("dev.py: `dmeo` is no verb.")
+    assert done.stderr.startswith("dev.py: `dmeo` is not a command.")

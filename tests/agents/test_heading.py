@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 import echelon as ech
-from echelon.agents.models.heading import Heading, heading_gap, input_turn, state_turn, turned
+from echelon.agents.models.heading import Heading
+from echelon.agents.models.heading_symmetry import (
+    heading_gap,
+    input_turn,
+    rotate_state,
+    state_turn,
+)
 from echelon.core.errors import LawError, ModelError
 from echelon.experiments.results.lyapunov import lyapunov
 from echelon.guarantees.promises.turning import steady_turn
@@ -108,7 +114,7 @@ def test_a_heading_that_is_none_is_refused():
     class Misnamed(Hovercraft):
         heading = Heading("yaw", (("x", "z"),))
 
-    for model, why in ((Anchored(), "its motion turns with `yaw`"), (Misnamed(), "names `z`")):
+    for model, why in ((Anchored(), "the motion turns with `yaw`"), (Misnamed(), "names `z`")):
         with pytest.raises(ModelError, match=why):
             ech.synthesize(model, ech.Graph.path(2), ech.gains.Riccati())
     gain = ech.synthesize(Hovercraft(), ech.Graph.path(2), ech.gains.Riccati())
@@ -143,7 +149,8 @@ def test_a_law_does_at_any_heading_what_it_does_at_the_trim(name):
             told = D(sent, angle) if name == "velocity" else E(sent, angle)
             nothing = jnp.zeros(n)
             view = LocalView(jnp.zeros(()), x, nothing, z, sent)
-            there = LocalView(jnp.zeros(()), turned(model, x, angle), nothing, D(z, angle), told)
+            there = rotate_state(model, x, angle)
+            there = LocalView(jnp.zeros(()), there, nothing, D(z, angle), told)
             wanted = model.normalized(law.update(model, view, None)[0])
             found = model.normalized(law.facing(angle).update(model, there, None)[0])
             assert np.abs(E(wanted, angle) - found).max() < 1e-10 * np.abs(found).max()

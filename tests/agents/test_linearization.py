@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_models import FAMILY
+from model_family import MODELS
 
 from echelon.agents.models import ControlAffine, Linear, Pendulum, PlanarQuadrotor, Quadrotor
 from echelon.agents.models.linearization import Linearization, linearize, trim_slopes
@@ -52,7 +52,7 @@ def slopes(model):
     return jax.jacrev(velocity, (0, 1))(x, jnp.zeros(len(u)))
 
 
-@pytest.mark.parametrize("model", FAMILY.values(), ids=FAMILY)
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_it_is_the_slope_of_the_motion_whatever_the_caller_s_precision(model):
     # In float32 first: what a caller without 64 bits keeps must serve the others.
     with precision("float32"):

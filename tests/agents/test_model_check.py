@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model_family import MODELS
 from runs import simulate
-from test_models import FAMILY
 
 from echelon.agents.models import ControlAffine, SingleIntegrator
 from echelon.agents.models.linearization import at_trim
@@ -56,7 +56,7 @@ def told(model):
     return sentence
 
 
-@pytest.mark.parametrize("model", [*FAMILY.values(), Tank()], ids=[*FAMILY, "tank"])
+@pytest.mark.parametrize("model", [*MODELS.values(), Tank()], ids=[*MODELS, "tank"])
 def test_sound_agents_pass_without_a_word(model):
     assert checked(model) == ()
 
@@ -240,18 +240,18 @@ FALSE = {
     ),
     "limits that do not say what is delivered": (
         limits(matrix=((1.0,), (2.0,)), low=(-1.0, -1.0), high=(1.0, 1.0)),
-        "`input_limits` of `Tank` has 2 rows for 1 inputs, which do not say what is delivered of "
-        "an input beyond them; add `limit`.",
+        "`input_limits` of `Tank` has 2 rows for 1 inputs, which does not define the input that "
+        "is delivered beyond the limits; add the method `limit`.",
     ),
     "limits that nothing keeps to": (
         limits(high=(1.0,)) | {"limit": lambda self, u: u},
-        "`limit` of `Tank` makes [-1.2] of [-1.2], which `input_limits` do not allow; let "
-        "both say the same.",
+        "`limit` of `Tank` returns [-1.2] for [-1.2], which `input_limits` do not allow; make "
+        "`limit` and `input_limits` agree.",
     ),
     "a limit that cuts what is allowed": (
         limits(high=(1.0,)) | {"limit": lambda self, u: jnp.clip(u, -0.2, 0.2)},
-        "`limit` of `Tank` makes [0.2] of [0.4], which `input_limits` allow; let both say "
-        "the same.",
+        "`limit` of `Tank` returns [0.2] for [0.4], which `input_limits` allow; make `limit` "
+        "and `input_limits` agree.",
     ),
     "numbers for names": (
         {"state_names": (1, 2)},
@@ -303,8 +303,8 @@ def test_constant_draws_and_open_limits_pass():
 
 def test_several_agents_for_one_are_refused():
     assert told([Tank(), Tank()]) == (
-        "the model is a list of 2, and all agents share one model; agents that differ from it "
-        "together are a `plant`."
+        "the model is a list of 2, and must be one model, which all agents share; agents that all "
+        "differ from it are described by a `plant`."
     )
 
 
@@ -371,7 +371,7 @@ class Tuned(Tank):
 def test_parameters_that_jax_has_rounded_are_warned_of_and_others_are_not():
     (warning,) = checked(Tuned(outflow=jnp.asarray(0.1, jnp.float32)))
     assert warning == (
-        "`outflow` of `Tuned` is a float32 array, so its values carry only 7 digits; keep "
+        "`outflow` of `Tuned` is a float32 array, so its values have only 7 digits; keep "
         "parameters as Python numbers or float64 NumPy arrays."
     )
     assert checked(Tuned(outflow=np.array(0.1))) == () == checked(Tuned(outflow=0.1))
@@ -402,7 +402,7 @@ def test_an_agent_without_a_flat_map_says_how_to_go_on():
     with pytest.raises(ModelError) as caught:
         Tank().flat(jnp.zeros((1, 1)))
     assert str(caught.value) == (
-        "model `Tank` cannot track a reference since it defines no `flat`; use the law `passive` "
+        "model `Tank` cannot track a reference, since it defines no `flat`; use the law `passive` "
         "for its leader, or add `flat_outputs`, `flat_order` and `flat`."
     )
 
@@ -449,8 +449,8 @@ lying.defjvp(lambda primals, tangents: (lying(*primals), -tangents[0]))
 def test_a_derivative_that_is_none_is_refused(drift, said, seen):
     with pytest.raises(ModelError) as caught:
         check_model(scalar(drift))
-    assert f"the derivative {said} in `x` of `drift` for `x`" in str(caught.value)
-    assert f"its values show {seen};" in str(caught.value)
+    assert "the derivative of `drift` for `x` of `Scalar` in `x` at the trim" in str(caught.value)
+    assert f"is {said} by JAX and {seen} by its values;" in str(caught.value)
 
 
 def test_so_is_one_of_the_input_map():
@@ -462,7 +462,7 @@ def test_what_cannot_be_derived_is_one_sentence():
     def called_back(x):
         return jax.pure_callback(lambda v: -v, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
-    with pytest.raises(ModelError, match="`Scalar` has no derivative at its trim, by"):
+    with pytest.raises(ModelError, match="`Scalar` has no derivative at its trim"):
         check_model(scalar(called_back))
 
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from model_family import FLAT_MODELS, MODELS
 from oracles import newton_euler, quadrotor_input_map, rotation
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -40,33 +41,11 @@ from echelon.core.numerics import precision
 from echelon.experiments.scenario import registry
 
 rng = np.random.default_rng(7)
-A, B, C = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=(1, 3))
-
-FAMILY = {
-    "line": SingleIntegrator(1),
-    "plane": SingleIntegrator(),
-    "five axes": SingleIntegrator(5),
-    "double": DoubleIntegrator(3),
-    "drag": DoubleIntegrator(2, drag=0.7),
-    "linear": Linear(A, B, C),
-    "van der pol": VanDerPol(1.5),
-    "pendulum": Pendulum(damping=0.3, stiffness=4.0),
-    "unicycle": Unicycle(),
-    "point": UnicyclePoint(ahead=0.3),
-    "planar": PlanarQuadrotor(mass=0.5, inertia=0.002, arm=0.1, motor_thrust=4.0),
-    "planar crazyflie": PlanarQuadrotor(),
-    "crazyflie": Quadrotor.crazyflie(),
-    "big": Quadrotor(mass=1.2, inertia=(0.011, 0.013, 0.02), arm=0.17, motor_thrust=6.0),
-    "printed": PrintedQuadrotor(),
-    "euler": QuadrotorEuler(gravity=3.7),
-    "thrust": QuadrotorThrust(),
-}
-FLAT = {name: model for name, model in FAMILY.items() if model.flat_outputs}
 
 SPACE = ["crazyflie", "big"]
 
-every_model = pytest.mark.parametrize("model", FAMILY.values(), ids=FAMILY)
-every_flat_model = pytest.mark.parametrize("model", FLAT.values(), ids=FLAT)
+every_model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+every_flat_model = pytest.mark.parametrize("model", FLAT_MODELS.values(), ids=FLAT_MODELS)
 
 
 def numpy(function, *arguments):
@@ -103,7 +82,7 @@ EQUATIONS = {
         *x[m.dimension :],
         *(u[k] - m.drag * x[m.dimension + k] for k in range(m.dimension)),
     ],
-    Linear: lambda m, x, u: A @ x + B @ u,
+    Linear: lambda m, x, u: m.A @ x + m.B @ u,
     VanDerPol: lambda m, x, u: [x[1], m.damping * (1 - x[0] * x[0]) * x[1] - x[0] + u[0]],
     Pendulum: lambda m, x, u: [x[1], u[0] - m.stiffness * np.sin(x[0]) - m.damping * x[1]],
     Unicycle: lambda m, x, u: [u[0] * np.cos(x[2]), u[0] * np.sin(x[2]), u[1]],
@@ -144,7 +123,7 @@ def test_drift_and_input_map_are_the_textbook_equations(model, seed):
 def test_the_family_of_these_tests_is_the_whole_family():
     members = {getattr(echelon.agents.models, name) for name in echelon.agents.models.__all__}
     members -= {Limits, Heading}
-    assert {type(model) for model in FAMILY.values()} == members - {ControlAffine}
+    assert {type(model) for model in MODELS.values()} == members - {ControlAffine}
     registered = set()
     for entry in registry.MODELS.values():
         module, _, name = entry.target.partition(":")
@@ -236,7 +215,7 @@ def test_limits_that_floats_cannot_invert_are_refused(size):
         def input_map(self, x):
             return jnp.ones((1, 2), x.dtype)
 
-    with pytest.raises(ModelError, match="do not say what is delivered"):
+    with pytest.raises(ModelError, match="does not define the input that is delivered"):
         check_model(Tiny())
 
 
@@ -417,7 +396,7 @@ def test_the_flat_state_contains_the_path_and_its_speed(model):
 
 @pytest.mark.parametrize("name", [*SPACE, "planar", "planar crazyflie", "euler", "thrust"])
 def test_standing_still_is_flown_by_the_trim(name):
-    model = FAMILY[name]
+    model = MODELS[name]
     rows = np.zeros((model.flat_order + 1, len(model.flat_outputs)))
     rows[0] = 1.0 + np.arange(len(model.flat_outputs))
     with numerics.precision("float64"):
@@ -449,7 +428,7 @@ def attitude_by_rotations(path, gravity, t):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_under_computed_torque_quadrotors_fly_what_rotations_and_differences_say(seed):
-    euler, thrust, t = FAMILY["euler"], QuadrotorThrust(gravity=3.7), 0.4
+    euler, thrust, t = MODELS["euler"], QuadrotorThrust(gravity=3.7), 0.4
     # A yaw that keeps below half a turn, where a rotation has one name.
     path = Smooth(4, seed, drift=0.3)
     with precision("float64"):
@@ -478,7 +457,7 @@ def mechanical_energy(model, x):
 @pytest.mark.parametrize("name", ["crazyflie", "big"])
 @pytest.mark.parametrize("seed", range(3))
 def test_power_is_thrust_times_climb_and_torque_times_spin(name, seed):
-    model = FAMILY[name]
+    model = MODELS[name]
     x, u = state_and_input(model, seed)
 
     def power(x, u):
@@ -489,7 +468,7 @@ def test_power_is_thrust_times_climb_and_torque_times_spin(name, seed):
 
 
 def test_a_tumbling_body_keeps_energy_and_angular_momentum_in_free_fall():
-    model = FAMILY["big"]
+    model = MODELS["big"]
     x0, _ = state_and_input(model, 3)
     x0[9:12] = [0.9, 2.0, -1.1]
     with numerics.precision("float64"):
@@ -515,7 +494,7 @@ def test_a_tumbling_body_keeps_energy_and_angular_momentum_in_free_fall():
 
 
 def test_a_damped_pendulum_loses_energy_by_damping_and_gains_it_by_torque():
-    model = FAMILY["pendulum"]
+    model = MODELS["pendulum"]
     x, u = state_and_input(model, 2)
 
     def energy(x):
@@ -692,7 +671,7 @@ def computed_torque(model, x, v):
 
 
 def test_computed_torque_turns_the_quadrotor_into_its_euler_form():
-    model, euler = FAMILY["big"], QuadrotorEuler()
+    model, euler = MODELS["big"], QuadrotorEuler()
     for _ in range(20):
         x = rng.uniform(-1.0, 1.0, 12)
         v = rng.uniform(-3.0, 3.0, 4)

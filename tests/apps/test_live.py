@@ -11,7 +11,6 @@ import pytest
 from browser import chromium, opened, until
 
 import echelon as ech
-from echelon.apps.live import live_stepper
 from echelon.apps.live import server as served
 from echelon.apps.live import swarm as looked
 from echelon.apps.live.guarantee_status import GuaranteeStatus
@@ -27,6 +26,7 @@ from echelon.experiments.scenario.scenario import scenario_from_mapping
 from echelon.experiments.scenario.yaml import dump_yaml, read_yaml
 from echelon.output.viewer.serve import serving
 from echelon.simulation.native import kernel_cache
+from echelon.simulation.step import sequence
 
 GIVEN = {
     "name": "own",
@@ -134,7 +134,7 @@ def test_no_knob_compiles_anything_again(panel, swarm, native, monkeypatch):
         each.turn(panel.start)
         each.advance()
         traced = []
-        monkeypatch.setattr(live_stepper, "control", lambda *_: traced.append(1))
+        monkeypatch.setattr(sequence, "control", lambda *_: traced.append(1))
         monkeypatch.setattr(kernel_cache, "program", lambda *_: traced.append(1))
         for change in KNOBS.values():
             each.turn(panel.start._replace(**change))
@@ -202,7 +202,7 @@ def test_another_method_brings_its_gain_and_its_coupling(session):
     session.ask({"name": "method", "value": "inner-loop"})
     session.settle()
     found = build(scenario(follower={"gain": {"method": "inner-loop"}})).parts.drive.gain
-    own = session.swarm.loop.follower.law.gain
+    own = session.swarm.loop.follower.gain
     np.testing.assert_array_equal(own.P, found.P)
     np.testing.assert_array_equal(own.inner, found.inner)
     assert session.knobs.coupling == pytest.approx(found.coupling, abs=1e-9)

@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 import pytest
 from browser import chromium, opened, until
-from recordings import flown, recorded
+from recordings import flown, swinging
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
@@ -278,29 +278,12 @@ def test_a_page_is_fed_while_a_run_is_computed_and_shows_the_whole_run_at_its_en
 # ---- other models -----------------------------------------------------------------------------
 
 
-def line(names, position, agents=3, n=2):
-    """Agents whose states swing, and settle, for spaces without three axes."""
-    times = np.linspace(0.0, 4.0, 101)
-    states = np.exp(-times)[:, None, None] * np.ones((1, agents, n))
-    states = states * np.arange(1, agents + 1)[None, :, None] + np.sin(times)[:, None, None]
-    return recorded(
-        states,
-        np.zeros((101, agents, 1)),
-        times,
-        np.zeros((agents, n)),
-        names=names,
-        position=position,
-        bounds=None,
-        model="Own",
-    )
-
-
 OTHERS = {
-    "plane": (line(("x", "y", "heading"), (0, 1), n=3), "plane", "car"),
-    "side": (line(("y", "z", "roll"), (0, 1), n=3), "plane", "birotor"),
-    "phase": (line(("angle", "rate"), ()), "phase", "dot"),
-    "time": (line(("x", "vx"), (0,)), "time", "dot"),
-    "point": (line(("x", "y", "z"), (0, 1, 2), n=3), "space", "ball"),
+    "plane": (swinging(("x", "y", "heading"), (0, 1), n=3), "plane", "car"),
+    "side": (swinging(("y", "z", "roll"), (0, 1), n=3), "plane", "birotor"),
+    "phase": (swinging(("angle", "rate"), ()), "phase", "dot"),
+    "time": (swinging(("x", "vx"), (0,)), "time", "dot"),
+    "point": (swinging(("x", "y", "z"), (0, 1, 2), n=3), "space", "ball"),
 }
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sentences import LINES
 
 import echelon.experiments.scenario.scenario
 from echelon.core.errors import ScenarioError, listing
@@ -31,22 +32,6 @@ from echelon.experiments.scenario.yaml import read_yaml
 
 FOLDER = Path(echelon.experiments.scenario.scenario.__file__).parent
 
-# Each line of this file stands alone, so that a test replaces one and knows its number.
-LINES = {
-    "name": "name: paper",
-    "model": "model: {name: quadrotor, parameters: crazyflie}",
-    "graph": "graph: {edges: [[0, 1], [1, 2], [1, 3]], leaders: [0]}",
-    "formation": "formation: {offsets: {1: [1, 0, 0], 2: [1, 0.8, 0], 3: [1, -0.8, 0]}}",
-    "reference": "reference: {name: lemniscate, center: [0.25, 0.25, 1.0], amplitude: [1.25, 3.54],"
-    " rate: 0.646}",
-    "leader": "leader: {law: tracking, reacts: false, start_error: {x: -1.344, y: 0.530}}",
-    "follower": "follower: {law: consensus, gain: {method: riccati}, feedforward: relay}",
-    "initial": "initial: {spread: {position: 1.0, attitude: 0.3}}",
-    "simulation": "simulation: {horizon: 60.0, dt: 0.005, integrator: rk4, limits: true,"
-    " store_every: 10}",
-    "report": "report: {steady_window: 10.0}",
-    "seed": "seed: 0",
-}
 FOLDER_NAME = "text of up to 100 letters, digits, `.`, `_` and `-`, first a letter or a digit"
 NUMBER = {name: number for number, name in enumerate(LINES, start=1)}
 
@@ -275,24 +260,6 @@ def test_yaml_1_2_decides_what_a_word_is(load, refused):
     assert refused("simulation.limits=no") == [
         "--set simulation.limits=no: got `no`, allowed is `true` or `false`."
     ]
-
-
-def planted():
-    """Pairs of a faulty line and its sentence."""
-    text = (Path(__file__).parents[1] / "scenario_faults.txt").read_text("utf-8")
-    tables = vars(registry) | {"GAIN_KEYS": list(GainSpec.model_fields)}
-    text = re.sub("<([A-Z_]+)>", lambda table: listing(tables[table[1]]), text)
-    blocks = [block.splitlines() for block in text.split("\n\n") if not block.startswith("#")]
-    assert len(blocks) > 90
-    return [pytest.param(line, fault, id=line) for line, fault in blocks]
-
-
-@pytest.mark.parametrize(("line", "fault"), planted())
-def test_every_fault_is_one_sentence_with_its_line(refused, line, fault):
-    key = line.partition(":")[0]
-    # a reference that is gone is told at the law that needs it, and so the other way round
-    at = {"reference:": "leader", "leader: {law: passive}": "reference"}.get(line, key)
-    assert refused(**{key: line}) == [f"s.yaml:{NUMBER[at]}: {fault}"]
 
 
 @pytest.mark.parametrize("key", ["name", "model", "graph", "simulation"])

@@ -285,7 +285,7 @@ def test_bounds_of_chains_that_differ_are_refused():
         def input_map(self, x):
             return jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
-    with pytest.raises(EchelonError, match="chains of 2 and 1 integrators, which must be alike"):
+    with pytest.raises(EchelonError, match="chains of 2 and 1 integrators, which must be equal"):
         StoppingPoint().prepared(Mixed(), TREE)
 
 

@@ -26,7 +26,8 @@ from echelon.guarantees.stopping.tube import tube_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import assemble, begin, control, step
+from echelon.simulation.step.loop import assemble
+from echelon.simulation.step.sequence import begin, step
 
 SLOW_ROOTS, FAST_ROOTS = (2.0, 2.5, 3.0), (4.0, 4.5, 5.0)
 QUADROTOR = ech.models.Quadrotor()
@@ -701,7 +702,7 @@ def least_lift(loop, starts, steps):
             now, least = done
             x, e = now.states[loop.followers], now.follower_memory.chain
             lift = jax.vmap(lambda x, e: flatten(QUADROTOR, chains, x, e).values[2, 2])(x, e)
-            return step(loop, now, control(loop, now)), jnp.minimum(least, lift)
+            return step(loop, now), jnp.minimum(least, lift)
 
         start = begin(loop, x), jnp.full(len(loop.followers), jnp.inf)
         return jax.lax.fori_loop(0, steps, on, start)[1]

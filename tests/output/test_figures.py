@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from recordings import PROMISE, flown, tracked
+from recordings import PROMISE, as_file, flown, swinging, tracked
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
@@ -281,11 +281,9 @@ def test_a_figure_that_is_none_is_refused_with_a_guess(run):
 
 
 def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, here):
-    from test_view import line
-
     from echelon.experiments.results.recording import FORMAT
 
-    (here / "run.nc").write_bytes(stored(line(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
+    (here / "run.nc").write_bytes(as_file(swinging(("x", "y", "z"), (0, 1, 2), n=3), FORMAT))
     code, told, _ = echelon("plot", "run.nc", "--what", "formation,network", "--dpi", "60")
     assert code == 0
     assert told == ("- Written to figures: formation, network, each as PNG, PDF, SVG.\n")
@@ -301,46 +299,3 @@ def test_plot_draws_png_pdf_and_svg_from_the_file_and_loses_no_other(echelon, he
     assert code == 2 and fault == "echelon: `--dpi` is 9, and must be from 30 to 1200.\n"
     code, _, fault = echelon("plot", "run.nc", "--what", "netwrk")
     assert code == 2 and "(did you mean `network`?)" in fault
-
-
-def stored(run, version):
-    """A file of a recording, without V, limits and modes."""
-    import json
-
-    import xarray as xr
-
-    per_agent = ("time", "agent", "state")
-    leads = np.isin(np.arange(run.agents), run.leaders).astype(np.int8)
-    data = xr.Dataset(
-        {
-            "states": (per_agent, run.states),
-            "error": (per_agent, run.errors),
-            "inputs": (("time", "agent", "input"), run.inputs),
-            "offset": (("agent", "state"), run.offsets),
-            "saturated": ("agent", run.limited),
-            "is_leader": ("agent", leads),
-            "nearest_leader": ("agent", run.nearest),
-            "edge_agents": (("edge", "end"), run.edges),
-            "edge_weight": ("edge", run.weights),
-            "edge_heard": (("edge", "end"), run.heard.astype(np.int8)),
-        },
-        {
-            "time": run.times,
-            "state": list(run.state_names),
-            "state_unit": ("state", list(run.state_units)),
-            "input": list(run.input_names),
-            "input_unit": ("input", list(run.input_units)),
-        },
-        {
-            "model": "Own",
-            "position": " ".join(run.state_names[k] for k in run.position),
-            "format": version,
-            "leader_needs": "nothing",
-            "promise": json.dumps(run.promise),
-            "horizon": run.horizon,
-            "dt": run.dt,
-            "outcome": "completed",
-            "message": "The run reached its horizon.",
-        },
-    )
-    return bytes(data.to_netcdf(None, engine="h5netcdf"))

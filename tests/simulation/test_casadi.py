@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_models import FAMILY, FLAT
+from model_family import FLAT_MODELS, MODELS
 
 import echelon as ech
 from echelon.core.errors import MissingExtraError, ModelError
@@ -59,7 +59,7 @@ def control(model, rng):
     return size * rng.uniform(-2.0, 2.0, len(size))
 
 
-every_model = pytest.mark.parametrize("model", FAMILY.values(), ids=FAMILY)
+every_model = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 
 
 @every_model
@@ -92,7 +92,7 @@ def test_what_else_a_model_says_is_jax_s_with_its_slopes(model):
     check()
 
 
-@pytest.mark.parametrize("model", FLAT.values(), ids=FLAT)
+@pytest.mark.parametrize("model", FLAT_MODELS.values(), ids=FLAT_MODELS)
 def test_the_flat_state_and_input_are_jax_s_with_their_slopes(model):
     rows, columns = model.flat_order + 1, len(model.flat_outputs)
 

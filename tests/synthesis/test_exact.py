@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from test_hull import NO_INPUTS, euler_rate_quadrotor, quadrotor_box
+from quadrotor_hulls import NO_INPUTS, euler_rate_quadrotor, quadrotor_box
 
 from echelon.core.enclosure.hull import value_hull
 from echelon.core.errors import GainError

@@ -1,7 +1,7 @@
 """One statement that was looked at: its verdict, by which kind of argument, and what would help."""
 
 import dataclasses
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 from echelon.core.words import Kind, Verdict, Word
 
@@ -57,6 +57,10 @@ class Topic(Word):
     STRING = "string gain"
 
 
+Line: TypeAlias = Hypothesis | Topic
+"""What a line of a check is about."""
+
+
 class Cause(NamedTuple):
     """Why something is not as it should be, and what to do about it; neither is ever empty."""
 
@@ -84,7 +88,7 @@ class Statement:
         reason: what the failure says against any promise; empty where it leaves one.
     """
 
-    statement: Hypothesis | Topic
+    statement: Line
     verdict: Verdict
     kind: Kind
     number: float | None = None
@@ -129,3 +133,38 @@ class Statement:
             "text": self.text,
             "remedy": self.remedy,
         }
+
+
+def holds(
+    statement: Line, kind: Kind, text: str, number: float | None = None, number_text: str = ""
+) -> Statement:
+    """Return the line of what was found true."""
+    return Statement(statement, Verdict.HOLDS, kind, number, number_text, text)
+
+
+def fails(
+    statement: Line,
+    kind: Kind,
+    text: str,
+    number: float | None = None,
+    number_text: str = "",
+    *,
+    remedy: str,
+    reason: str = "",
+) -> Statement:
+    """Return the line of what was found false; with a `reason` it rules out any guarantee."""
+    return Statement(statement, Verdict.FAILS, kind, number, number_text, text, remedy, reason)
+
+
+def unneeded(
+    statement: Line, kind: Kind, text: str, number: float | None = None, number_text: str = ""
+) -> Statement:
+    """Return the line of what nothing else here rests on."""
+    return Statement(statement, Verdict.NOT_NEEDED, kind, number, number_text, text)
+
+
+def vacuous(
+    statement: Line, kind: Kind, text: str, number: float | None = None, number_text: str = ""
+) -> Statement:
+    """Return the line of what has no meaning here."""
+    return Statement(statement, Verdict.VACUOUS, kind, number, number_text, text)

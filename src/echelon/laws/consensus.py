@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from echelon.agents.models.heading import state_turn
+from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import LawError, did_you_mean, listing

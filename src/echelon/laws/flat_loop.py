@@ -129,7 +129,7 @@ class FlatLoop(eqx.Module):
     def _integrate(self, e: jax.Array, w: Input, period: Scalar | float) -> tuple[jax.Array, Input]:
         """Return the integrators after a hold, and the mean (m,) of what they give during it."""
         after, mean = list[jax.Array](), list[jax.Array]()
-        for k, at in enumerate(self.chains.places):
+        for k, at in enumerate(self.chains.indices):
             tower = [*(e[i] for i in at), w[k]]
             # Polynomials of time; the actuator holds one value, and their mean moves as far.
             mean.append(_moved(tower, period, 1))
@@ -149,7 +149,7 @@ class FlatLoop(eqx.Module):
         v = model.normalized(got)
         # An integrator that goes on where an actuator stopped would wind up.
         missed = jnp.where(got == wanted, 0.0, v - model.normalized(wanted))
-        first = [(at[0], k) for k, at in enumerate(self.chains.places) if at]
+        first = [(at[0], k) for k, at in enumerate(self.chains.indices) if at]
         chain = held.chain
         for place, k in first:
             chain = chain.at[place].add(missed[k])

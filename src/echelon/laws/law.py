@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
-from echelon.agents.models.heading import heading_index, rest_heading
+from echelon.agents.models.heading_symmetry import heading_index, rest_heading
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.references.guide import Guide

@@ -1,4 +1,4 @@
-"""The linear system that a model is near its trim, in normalized inputs."""
+"""The linearization of a model at its trim, in normalized inputs."""
 
 from typing import NamedTuple
 
@@ -35,11 +35,11 @@ class AtTrim(NamedTuple):
     Attributes:
         drift, input_map, output: f (n,), g (n, m), h (q,).
         drift_slope, input_slope, output_slope: their Jacobians, with n as the last dimension more.
-        delivered: what the actuators make of u*, (m,).
-        bends: (n, n) whether the slope of f + g u*, by its values on either side, jumps with a
-            state; or where g does, for all inputs.
-        gap: the entry of the drift or the input map whose derivative by JAX is most clearly not
-            what its values show; None where there is none.
+        delivered: the input that the actuators deliver for u*, (m,).
+        bends: (n, n) whether f + g u* has a kink in a state, by its values on both sides, or g
+            jumps there.
+        gap: the entry of the drift or the input map whose derivative by JAX differs most clearly
+            from the slope of its values; None where none does.
     """
 
     drift: Array
@@ -55,18 +55,17 @@ class AtTrim(NamedTuple):
 
 @memoize
 def at_trim(model: ControlAffine) -> AtTrim:
-    """Return all that is asked of a model at its trim, compiled together.
+    """Return the functions of a model at its trim, compiled together and computed once.
 
-    Compiling is most of the cost. It is computed once for a model, in float64 whatever the caller's
-    precision.
+    Compiling is most of the cost. The precision is float64, whatever that of the caller.
     """
     x, u = (np.asarray(part, float) for part in model.trim)
-    # Gains are kept in files, so they must not depend on the precision of the run that needs them.
+    # Gains are stored in files, so they must not depend on the precision of the run that uses them.
     with precision("float64"):
-        found = _evaluate(model, x, u, stencil(x))
-    *there, around = map(_freeze, found)
-    said, seen = np.concatenate([there[3], there[4].reshape(-1, len(x))]), sides(x, around)
-    return AtTrim(*there, bends=_bends(seen, u), gap=seen.gap(said))  # pyright: ignore
+        *values, around = map(_freeze, _evaluate(model, x, u, stencil(x)))
+    derivatives = np.concatenate([values[3], values[4].reshape(-1, len(x))])
+    slopes = sides(x, around)
+    return AtTrim(*values, bends=_bends(slopes, u), gap=slopes.gap(derivatives))  # pyright: ignore
 
 
 @cached_jit
@@ -77,42 +76,41 @@ def _evaluate(model: ControlAffine, x: State, u: Input, points: States) -> list[
     def entries(x: State) -> jax.Array:
         return jnp.concatenate([model.drift(x), model.input_map(x).reshape(-1)])
 
-    # Values around the trim, which know what derivatives of a trace do not.
+    # Values around the trim show kinks and jumps, which the derivatives of a trace do not.
     around = jax.vmap(entries)(points)
     return [*(function(x) for function in functions), *slopes, model.limit(u), around]
 
 
-def _bends(seen: Sides, u: Array) -> Array:
-    """Return (n, n) where f + g u* bends, or g jumps, with which state."""
-    n = seen.forward.shape[-1]
-    below, above = (np.split(side, [n], axis=1) for side in seen)
+def _bends(slopes: Sides, u: Array) -> Array:
+    """Return (n, n) whether an entry of f + g u* has a kink, or one of g a jump, in each state."""
+    n = slopes.forward.shape[-1]
+    below, above = (np.split(side, [n], axis=1) for side in slopes)
     velocity = (
         side[0] + np.einsum("hikn,k->hin", side[1].reshape(2, n, -1, n), u)
         for side in (below, above)
     )
-    bent = Sides(*velocity).bends()
     jumps = Sides(below[1], above[1]).jumps().reshape(n, -1, n).any(axis=1)
-    return bent | jumps
+    return Sides(*velocity).bends() | jumps
 
 
 @memoize
 def linearize(model: ControlAffine) -> Linearization:
     """Return A = d(f + g u*)/dx and B = g S at the trim, read-only; computed once for a model."""
-    there = at_trim(model)
-    B = there.input_map @ np.asarray(model.input_scale, float)
-    return Linearization(_freeze(there.drift_slope + trim_slopes(model).sum(0)), _freeze(B))
+    trim = at_trim(model)
+    B = trim.input_map @ np.asarray(model.input_scale, float)
+    return Linearization(_freeze(trim.drift_slope + trim_slopes(model).sum(0)), _freeze(B))
 
 
 @memoize
 def trim_slopes(model: ControlAffine) -> Array:
-    """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: what each trim input puts into A."""
+    """Return u*_k dg_k/dx at the trim, (m, n, n), read-only: the term of each trim input in A."""
     # d(g u*)/dx = sum_k u*_k dg_k/dx: an input scaled by s scales its own term alone.
     u = np.asarray(model.trim[1], float)
     return _freeze(u[:, None, None] * np.moveaxis(at_trim(model).input_slope, 1, 0))
 
 
 def _freeze(values: jax.Array | Array) -> Array:
-    """Return a float64 copy that nobody can write to, since many callers share it."""
+    """Return a read-only float64 copy, which many callers share."""
     array = np.array(values, np.float64)
     array.setflags(write=False)
     return array

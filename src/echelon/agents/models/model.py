@@ -1,8 +1,8 @@
 """The interface of an agent: a control-affine system xdot = f(x) + g(x) u, y = h(x).
 
-It is the agent of the paper's Definition 1. A model of one's own is two methods and two tuples
-of names; everything else has a default that may be replaced by a class attribute, a property or a
-method of the same name.
+It is the agent of the paper's Definition 1. A user's model needs two methods and two tuples of
+names; everything else has a default, which a class attribute, a property or a method of the same
+name replaces.
 """
 
 import abc
@@ -56,7 +56,7 @@ def diagonal(*entries: float) -> Rows:
 
 
 class Limits(NamedTuple):
-    """What actuators can deliver: low <= G u <= high, row by row.
+    """The inputs that actuators can deliver: low <= G u <= high, row by row.
 
     Attributes:
         matrix: G, (k, m).
@@ -69,11 +69,11 @@ class Limits(NamedTuple):
 
 
 class FlatChains(NamedTuple):
-    """Which derivatives of its flat outputs a model's inputs reach first, and behind what.
+    """The lengths of a model's chains of integrators.
 
     Attributes:
-        degrees: of each flat output.
-        integrators: to be put before each input for that.
+        degrees: for each flat output, the first derivative that the inputs reach.
+        integrators: for each input, how many integrators are put before it.
     """
 
     degrees: tuple[int, ...]
@@ -83,13 +83,13 @@ class FlatChains(NamedTuple):
 class FlatBound(NamedTuple):
     """A border of the flat coordinates: a derivative of flat outputs stays above a value.
 
-    Of one output it is the derivative itself, of several the length of their vector.
+    For one output it is the derivative itself, for several the length of the vector of derivatives.
 
     Attributes:
-        outputs: whose derivative it is.
-        derivative: its order.
-        above: what it stays above.
-        within: what else of the state that bounds, in words.
+        outputs: names of the flat outputs.
+        derivative: order of the derivative.
+        above: lower limit of the derivative.
+        within: the bounds of the state that follow, in words.
     """
 
     outputs: tuple[str, ...]
@@ -102,8 +102,9 @@ class Flattened(NamedTuple):
     """A state in flat coordinates.
 
     Attributes:
-        values: (r, m), the flat outputs and their derivatives below the inputs', else zero.
-        invert: wanted highest derivatives (m,) -> the normalized inputs (m,) behind integrators.
+        values: (r, m), the flat outputs and their derivatives below those that the inputs reach,
+            else zero.
+        invert: commanded highest derivatives (m,) -> the normalized inputs (m,) of the integrators.
     """
 
     values: jax.Array
@@ -118,13 +119,13 @@ class ControlAffine(eqx.Module):
     """
 
     state_names: ClassVar[tuple[str, ...]] = ()
-    """Names of the n states; every model must say them."""
+    """Names of the n states; required of every model."""
 
     input_names: ClassVar[tuple[str, ...]] = ()
-    """Names of the m inputs; every model must say them."""
+    """Names of the m inputs; required of every model."""
 
     output_names: ClassVar[tuple[str, ...]] = default(lambda self: self.state_names)
-    """Names of the entries of h(x); to be replaced together with `output`."""
+    """Names of the entries of h(x); replace them together with `output`."""
 
     state_units: ClassVar[tuple[str, ...]] = default(lambda self: ("",) * len(self.state_names))
     """SI units of the states, as text; empty where unknown."""
@@ -136,12 +137,12 @@ class ControlAffine(eqx.Module):
     """Named groups of states, such as `position` or `attitude`, for spreads and start errors."""
 
     position: ClassVar[tuple[str, ...]] = ()
-    """Names of the coordinates that a picture shows, in metres; none for an abstract agent."""
+    """Names of the position coordinates, in metres; none for an agent without a position."""
 
     trim: ClassVar[Pair] = default(
         lambda self: (_repeat(0.0, self.state_names), _repeat(0.0, self.input_names))
     )
-    """Equilibrium (x*, u*) about which gains are made; the origin unless replaced."""
+    """Equilibrium (x*, u*) about which gains are computed; the origin unless replaced."""
 
     input_scale: ClassVar[Rows] = default(lambda self: diagonal(*_repeat(1.0, self.input_names)))
     """Matrix S (m, m) of the normalized input v in u = u* + S v; the identity unless replaced."""
@@ -152,45 +153,45 @@ class ControlAffine(eqx.Module):
     """Diagonals of the default Riccati weights (Q, R), R on normalized inputs; all ones."""
 
     damping: ClassVar[Rows | None] = None
-    """Feedback K (m, n) of an inner loop v = -K (x - x*) that leaves symmetric states alone."""
+    """Feedback K (m, n) of an inner loop v = -K (x - x*) that does not use symmetric states."""
 
     symmetry_weights: ClassVar[tuple[float, ...] | None] = None
     """Weights of the symmetric states in the P that goes with `damping`, one each."""
 
     symmetry_inputs: ClassVar[tuple[float, ...] | None] = None
-    """Weights R of the normalized inputs in the law above `damping`, one each; ones without."""
+    """Weights R of the normalized inputs in the law around `damping`, one each; ones if None."""
 
     input_limits: ClassVar[Limits | None] = None
-    """The inputs that actuators deliver, low <= G u <= high; None where nothing limits them.
+    """The inputs that actuators deliver, low <= G u <= high; None without limits.
 
-    Where G is square and invertible, `limit` clips row by row unless it is replaced; else it must
-    be.
+    Where G is square and invertible, `limit` clips row by row unless it is replaced; for any other
+    G a model must replace it.
     """
 
     heading: ClassVar[Heading | None] = None
-    """How the agent turns, if it is the same in every heading; None where it is not, or has none.
+    """How states and inputs turn with the heading, if the dynamics are the same in every heading.
 
-    Gains of such a model turn with the heading that the leader follows.
+    The gains of such a model turn with the heading that the leader follows. None for other models.
     """
 
     chart: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Open bounds of states outside which the equations do not hold, such as a pitch of 90 deg."""
 
     flat_outputs: ClassVar[tuple[str, ...]] = ()
-    """Which of a reference's coordinates (x, y, z, yaw) the model can follow."""
+    """The coordinates of a reference, of (x, y, z, yaw), that the model can follow."""
 
     flat_order: ClassVar[int] = 0
-    """How many time derivatives of the reference `flat` needs."""
+    """Number of time derivatives of the reference that `flat` needs."""
 
     flat_chains: ClassVar[FlatChains | None] = None
-    """The chains of integrators that feedback makes of the agent; found at samples where None."""
+    """The chains of integrators that feedback makes of the agent; computed at samples if None."""
 
     flat_bounds: ClassVar[tuple[FlatBound, ...] | None] = None
-    """Where the flat coordinates of `flat_chains` end: nowhere where there are none, by the model's
-    own word; None where it does not say."""
+    """Borders of the flat coordinates of `flat_chains`, as the model states them; an empty tuple
+    states that there are none, None states nothing."""
 
     airframe: ClassVar[Airframe | None] = None
-    """The body that `thrust` and three torques move by four motors; None where it is none."""
+    """The rigid body that four motors move by `thrust` and three torques; None for other agents."""
 
     @abc.abstractmethod
     def drift(self, x: State) -> State:
@@ -204,52 +205,52 @@ class ControlAffine(eqx.Module):
         """Return h(x); the whole state unless replaced."""
         return x
 
-    def flat(self, derivatives: jnp.ndarray) -> tuple[State, Input]:
+    def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input (x, u) that produce a flat output.
 
         Args:
             derivatives: (flat_order + 1, len(flat_outputs)), the output and its time derivatives.
 
         Raises:
-            ModelError: the model does not say how.
+            ModelError: the model does not define it.
         """
         raise ModelError(
-            f"model `{type(self).__name__}` cannot track a reference since it defines no `flat`; "
+            f"model `{type(self).__name__}` cannot track a reference, since it defines no `flat`; "
             "use the law `passive` for its leader, or add `flat_outputs`, `flat_order` and `flat`."
         )
 
     def flatten(self, x: State, e: jax.Array) -> Flattened | None:
-        """Return the flat coordinates of a state whose `flat_chains` hold e; None for none known.
+        """Return the flat coordinates of a state, e being the integrator states of `flat_chains`.
 
-        What is not known is found by automatic differentiation.
+        Where it returns None they are computed by automatic differentiation.
         """
         return None
 
     def switch_on(self, x: State, ahead: jax.Array) -> jax.Array | None:
-        """Return what integrators before inputs hold first at a state (n,); None leaves it open.
+        """Return the initial states of the integrators before inputs; None leaves them open.
 
-        `ahead` (r, m) are the flat outputs of what the agent follows, and their derivatives.
+        `ahead` (r, m) are the flat outputs, with derivatives, of the path that the agent follows.
         """
         return None
 
     def difference(self, x: State, y: State) -> State:
-        """Return x - y; to be replaced where a coordinate is an angle that winds."""
+        """Return x - y; replaced where a coordinate is an angle."""
         return x - y
 
     def limit(self, u: Input) -> Input:
         """Return the input that the actuators deliver for a requested u.
 
         Each row of G u is clipped to its limits unless replaced. An input within the limits must be
-        returned unchanged, to the bit: that is how saturation is counted.
+        returned unchanged, to the bit: saturation is counted as any change.
         """
         if self.input_limits is None:
             return u
         G, low, high = (jnp.asarray(part, u.dtype) for part in self.input_limits)
         rows = G @ u
-        held = jnp.clip(rows, low, high)
-        back = jnp.asarray(np.linalg.inv(np.asarray(self.input_limits.matrix)), u.dtype)
-        # There and back would round, and count as saturation.
-        return jnp.where(jnp.all(rows == held), u, back @ held)
+        clipped = jnp.clip(rows, low, high)
+        inverse = jnp.asarray(np.linalg.inv(np.asarray(self.input_limits.matrix)), u.dtype)
+        # Multiplying by G and its inverse rounds, which would count as saturation.
+        return jnp.where(jnp.all(rows == clipped), u, inverse @ clipped)
 
     def velocity(self, x: State, u: Input) -> State:
         """Return f(x) + g(x) u."""
@@ -266,30 +267,30 @@ class ControlAffine(eqx.Module):
     def physical(self, v: _Inputs, trim: bool = True) -> _Inputs:
         """Return u = u* + S v of normalized inputs (..., m), NumPy's or JAX's, in their precision.
 
-        Without the trim it is S v, what an input is changed by.
+        Without the trim it is S v, the change of the input.
         """
         xp = v.__array_namespace__()
         # One input a row: (S v)' = v'S'.
         u = v @ xp.asarray(self.input_scale, v.dtype).T
-        return u + _rest(self, u) if trim else u
+        return u + _trim_input(self, u) if trim else u
 
     def normalized(self, u: _Inputs) -> _Inputs:
         """Return v = S^-1 (u - u*) of physical inputs (..., m), NumPy's or JAX's."""
         xp = u.__array_namespace__()
         # A constant wherever S is one, so that neither a step nor a solver's expression inverts it.
-        # By NumPy, since a program for it takes longer than the rest of a trace.
+        # By NumPy, since compiling an inverse takes longer than the rest of a trace.
         if any(isinstance(entry, Tracer) for entry in jax.tree.leaves(self.input_scale)):
             inverse = xp.linalg.inv(xp.asarray(self.input_scale, u.dtype))
         else:
             inverse = xp.asarray(np.linalg.inv(np.asarray(self.input_scale, u.dtype)))
-        return (u - _rest(self, u)) @ inverse.T
+        return (u - _trim_input(self, u)) @ inverse.T
 
     def position_indices(self) -> tuple[int, ...]:
-        """Return the places of `position` in the state."""
+        """Return the indices of `position` in the state."""
         return tuple(self.state_names.index(name) for name in self.position)
 
     def states_called(self, name: str) -> tuple[int, ...]:
-        """Return the indices of the states meant by a state's or a group's name.
+        """Return the indices of a state or of a group of states.
 
         Raises:
             ModelError: the model has neither a state nor a group of that name.
@@ -307,31 +308,30 @@ class ControlAffine(eqx.Module):
     def per_state(self, named: Mapping[str, float], otherwise: float = 0.0) -> np.ndarray:
         """Return a number for each state, (n,), from numbers by state or group of states.
 
-        A state's own number wins over its group's. States that are not named have `otherwise`.
+        The number of a state overrides that of its group. States without one get `otherwise`.
 
         Raises:
-            ModelError: the model has neither a state nor a group of a name.
+            ModelError: a name is neither a state nor a group.
         """
         values = np.full(len(self.state_names), float(otherwise))
-        # Groups come first, whatever the order of the mapping, and states write over them.
+        # Groups come first, whatever the order of the mapping, and states override them.
         for name in sorted(named, key=lambda name: name in self.state_names):
             values[list(self.states_called(name))] = named[name]
         return values
 
 
-def _rest(model: ControlAffine, u: _Inputs) -> _Inputs:
+def _trim_input(model: ControlAffine, u: _Inputs) -> _Inputs:
     """Return u* in the shape (..., m) and precision of u."""
     xp = u.__array_namespace__()
     return xp.broadcast_to(xp.asarray(model.trim[1], u.dtype), u.shape)
 
 
-def wound(difference: State, *angles: int) -> State:
-    """Return a difference of states with the angles (rad) at these places the shorter way round."""
-    # Agents that differ by a whole turn agree. Without a turn to take off nothing changes, to the
-    # bit.
-    places = np.array(angles)
-    turns = jnp.round(difference[places] / (2.0 * jnp.pi))
-    return difference.at[places].add(-2.0 * jnp.pi * turns)
+def wrap_angles(difference: State, *angles: int) -> State:
+    """Return a difference of states with the angles (rad) at these indices within half a turn."""
+    # Agents that differ by a whole turn agree. Without a turn to subtract no bit changes.
+    indices = np.array(angles)
+    turns = jnp.round(difference[indices] / (2.0 * jnp.pi))
+    return difference.at[indices].add(-2.0 * jnp.pi * turns)
 
 
 def check_positive(owner: object, **values: float) -> None:
@@ -340,7 +340,7 @@ def check_positive(owner: object, **values: float) -> None:
     Raises:
         ModelError: one is not.
     """
-    # A chain of comparisons is false for NaN, which is refused with the rest.
+    # The comparisons are false for NaN, which is rejected too.
     for name, value in values.items():
         if not (isinstance(value, numbers.Real) and 0.0 < value < float("inf")):
             raise ModelError(

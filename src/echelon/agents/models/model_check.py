@@ -1,11 +1,12 @@
-"""The checks that a model passes once, when it enters `synthesize` or `simulate`."""
+"""The checks of a model, run once for each model in `synthesize` and `simulate`."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
-from echelon.agents.models.heading import check_heading
+from echelon.agents.models.heading_symmetry import check_heading
 from echelon.agents.models.linearization import AtTrim, at_trim
 from echelon.agents.models.model import ControlAffine, Limits
 from echelon.core.compiled import cached_jit
@@ -13,27 +14,28 @@ from echelon.core.errors import ModelError, did_you_mean, listing
 from echelon.core.memoize import memoize
 from echelon.core.numerics import precision
 from echelon.core.trace import check_function, error_summary
+from echelon.core.types import Array
 
-# Far above the rounding of T/m - g, far below what a trim typed with a few digits misses by.
+# Far above the rounding of T/m - g, far below the error of a trim typed with a few digits.
 _TRIM_TOLERANCE = 1e-9
-_REACH = np.array([0.05, 0.05, 0.2, 0.2, 0.6, 0.6, 3.0, 3.0, 3.0, 100.0])
-"""How far from the trim limits are tried, in widths of what they allow."""
-_LITTLE = 1e-6
-"""A change of the normalized input: where limits leave no room for it, nothing linear holds."""
+_DISTANCES = np.array([0.05, 0.05, 0.2, 0.2, 0.6, 0.6, 3.0, 3.0, 3.0, 100.0])
+"""How far from the trim limits are tested, in widths of the range that they allow."""
+_SMALL = 1e-6
+"""A change of the normalized input; an input that cannot change by it has no linear response."""
 
 
 class Shortfall(NamedTuple):
-    """What the actuators deliver of an input, and what is asked of them."""
+    """An input that the actuators do not deliver in full: the delivered and the requested value."""
 
     delivered: float
-    asked: float
+    requested: float
 
 
 def check_model(model: ControlAffine) -> tuple[str, ...]:
     """Check shapes, finite values and Jacobians at the trim, and that the trim is an equilibrium.
 
     Returns:
-        Warnings, one sentence each, about what is allowed but probably not meant.
+        Warnings, one sentence each, about what is allowed but probably a mistake.
 
     Raises:
         ModelError: the first fault found, as one sentence.
@@ -43,7 +45,7 @@ def check_model(model: ControlAffine) -> tuple[str, ...]:
 
 @memoize
 def _warnings_of(model: ControlAffine, name: str) -> tuple[str, ...]:
-    """Return the warnings of a model after all checks; once for a model."""
+    """Return the warnings of a model after all checks; computed once for a model."""
     with precision("float64"):
         _check_names(model, name)
         x, u = _check_constants(model, name)
@@ -55,11 +57,11 @@ def _warnings_of(model: ControlAffine, name: str) -> tuple[str, ...]:
 
 
 def _check_kind(model: ControlAffine) -> str:
-    """Return the name of the model's class, after checking that it is one."""
+    """Return the name of the model's class, after checking that it is a model."""
     if isinstance(model, list | tuple | dict):
         raise ModelError(
-            f"the model is a {type(model).__name__} of {len(model)}, and all agents share one "
-            "model; agents that differ from it together are a `plant`."
+            f"the model is a {type(model).__name__} of {len(model)}, and must be one model, which "
+            "all agents share; agents that all differ from it are described by a `plant`."
         )
     if not isinstance(model, ControlAffine):
         raise ModelError(
@@ -69,10 +71,9 @@ def _check_kind(model: ControlAffine) -> str:
 
 
 def _check_words(model: ControlAffine, name: str) -> None:
-    """Check that states and inputs have names, which are text."""
+    """Check that the names of states and inputs are tuples of text, and not empty."""
     for what, names in (("state_names", model.state_names), ("input_names", model.input_names)):
-        # A text is a sequence too, of letters: ("x") without its comma would name one state by
-        # luck.
+        # A text is a sequence of letters, so ("x") without its comma would be accepted by accident.
         if isinstance(names, str):
             raise ModelError(
                 f"`{what}` of `{name}` is the text `{names}`, and must be a tuple of names; "
@@ -88,22 +89,22 @@ def _check_words(model: ControlAffine, name: str) -> None:
 
 
 def _check_names(model: ControlAffine, name: str) -> None:
-    """Check the names, and that groups, position and units speak of states that exist."""
+    """Check the names, and that groups, position and units refer to states that exist."""
     _check_words(model, name)
-    known = model.state_names
-    if len(set(known)) < len(known):
-        raise ModelError(f"`state_names` of `{name}` repeats a name: {listing(known)}.")
-    named = {"position": model.position}
-    named |= {f"state_groups[{key!r}]": members for key, members in model.state_groups.items()}
-    for where, members in named.items():
+    states = model.state_names
+    if len(set(states)) < len(states):
+        raise ModelError(f"`state_names` of `{name}` repeats a name: {listing(states)}.")
+    groups = {"position": model.position}
+    groups |= {f"state_groups[{key!r}]": members for key, members in model.state_groups.items()}
+    for where, members in groups.items():
         for member in members:
-            if member not in known:
+            if member not in states:
                 raise ModelError(
                     f"`{where}` of `{name}` names `{member}`, which is no state; the states are "
-                    f"{listing(known)}{did_you_mean(member, known)}."
+                    f"{listing(states)}{did_you_mean(member, states)}."
                 )
     for where, units, names in (
-        ("state_units", model.state_units, known),
+        ("state_units", model.state_units, states),
         ("input_units", model.input_units, model.input_names),
     ):
         if len(units) != len(names):
@@ -118,7 +119,7 @@ def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.nd
     x, u = _pair(name, "trim", model.trim, n, m)
     _pair(name, "weights", model.weights, n, m)
     scale = _numbers(name, "input_scale", model.input_scale, (m, m))
-    # Near a condition of 1/eps = 4.5e15 no digit of the inverse is right.
+    # At a condition number near 1/eps = 4.5e15 no digit of the inverse is right.
     if np.linalg.cond(scale) > 1e15:
         raise ModelError(f"`input_scale` of `{name}` is singular, and must be invertible.")
     _check_limits(model, name, m)
@@ -126,7 +127,7 @@ def _check_constants(model: ControlAffine, name: str) -> tuple[np.ndarray, np.nd
 
 
 def _check_limits(model: ControlAffine, name: str, m: int) -> None:
-    """Check that the actuators' inequalities low <= G u <= high fit each other and the inputs."""
+    """Check shapes and order of the actuators' inequalities low <= G u <= high."""
     limits = model.input_limits
     if limits is None:
         return
@@ -143,13 +144,13 @@ def _check_limits(model: ControlAffine, name: str, m: int) -> None:
     if type(model).limit is ControlAffine.limit:
         if k != m or not _has_inverse(np.asarray(limits.matrix, float)):
             raise ModelError(
-                f"`input_limits` of `{name}` has {k} rows for {m} inputs, which do not say what is "
-                "delivered of an input beyond them; add `limit`."
+                f"`input_limits` of `{name}` has {k} rows for {m} inputs, which does not define "
+                "the input that is delivered beyond the limits; add the method `limit`."
             )
 
 
 def _has_inverse(G: np.ndarray) -> bool:
-    """Tell whether floats can invert a matrix: of numbers too small they can tell a rank alone."""
+    """Tell whether a matrix has a finite inverse in floats; full rank does not imply it."""
     if np.linalg.matrix_rank(G) < len(G):
         return False
     try:
@@ -159,28 +160,28 @@ def _has_inverse(G: np.ndarray) -> bool:
 
 
 def _check_limit(model: ControlAffine, name: str, u: np.ndarray) -> None:
-    """Check that `limit` leaves what `input_limits` allow, and brings the rest in."""
+    """Check that `limit` keeps inputs within `input_limits` unchanged and clips all others."""
     if model.input_limits is None:
         return
     G, low, high = (np.asarray(part, float) for part in model.input_limits)
     width = np.where(np.isfinite(high - low), high - low, 1.0 + np.abs(G @ u))
-    away = np.random.default_rng(0).normal(size=(len(_REACH), len(u)))
-    away *= (_REACH / np.abs(away @ G.T / width).max(axis=1))[:, None]
-    for asked, delivered in zip(u + away, limited(model, u + away), strict=True):
-        rows, brought = G @ asked, G @ delivered
+    away = np.random.default_rng(0).normal(size=(len(_DISTANCES), len(u)))
+    away *= (_DISTANCES / np.abs(away @ G.T / width).max(axis=1))[:, None]
+    for requested, delivered in zip(u + away, limited(model, u + away), strict=True):
+        rows, clipped = G @ requested, G @ delivered
         allowed = ((low <= rows) & (rows <= high)).all()
-        # NaN is within nothing, and an input that is allowed must come back to the bit.
-        within = np.abs(brought - np.clip(brought, low, high)) <= 1e-9 * width
-        if not within.all() or allowed and (delivered != asked).any():
+        # NaN is within no limits, and an allowed input must come back to the bit.
+        within = np.abs(clipped - np.clip(clipped, low, high)) <= 1e-9 * width
+        if not within.all() or allowed and (delivered != requested).any():
             raise ModelError(
-                f"`limit` of `{name}` makes {np.round(delivered, 6).tolist()} of "
-                f"{np.round(asked, 6).tolist()}, which `input_limits` "
-                f"{'allow' if allowed else 'do not allow'}; let both say the same."
+                f"`limit` of `{name}` returns {np.round(delivered, 6).tolist()} for "
+                f"{np.round(requested, 6).tolist()}, which `input_limits` "
+                f"{'allow' if allowed else 'do not allow'}; make `limit` and `input_limits` agree."
             )
 
 
-def _pair(name: str, what: str, pair: Any, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return data given as (state, input), after checking both."""
+def _pair(name: str, what: str, pair: object, n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a pair (state, input) as arrays, after checking both."""
     if not isinstance(pair, (tuple, list)) or len(pair) != 2:
         raise ModelError(f"`{what}` of `{name}` is {pair}, and must be a pair (state, input).")
     return (
@@ -190,11 +191,11 @@ def _pair(name: str, what: str, pair: Any, n: int, m: int) -> tuple[np.ndarray, 
 
 
 def _numbers(
-    name: str, what: str, value: Any, shape: tuple[int, ...], most: float = np.finfo(float).max
+    name: str, what: str, value: object, shape: tuple[int, ...], most: float = np.finfo(float).max
 ) -> np.ndarray:
-    """Return constant data as an array of the given shape, finite unless `most` is not."""
+    """Return constant data as an array of a shape, finite unless `most` is infinite."""
     try:
-        array = np.asarray(value, float)
+        array = np.asarray(value, float)  # pyright: ignore
     except (TypeError, ValueError):
         raise ModelError(f"`{what}` of `{name}` is {value}, and must be numbers.") from None
     if len(shape) == 1:
@@ -211,7 +212,7 @@ _ADVICE = "it must be written with `jax.numpy` and take one agent's state"
 
 
 def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarray) -> None:
-    """Check what f, g, h and the limits return, and that f, g and h are finite at the trim."""
+    """Check the shapes of f, g, h and limits, and that f, g and h are finite at the trim."""
     n, m, q = len(x), len(u), len(model.output_names)
     functions = {"drift": model.drift, "input_map": model.input_map, "output": model.output}
     shapes = ((n,), (n, m), (q,), (m,))
@@ -222,25 +223,25 @@ def _check_functions(model: ControlAffine, name: str, x: np.ndarray, u: np.ndarr
         check_function(
             ModelError, f"`{what}` of `{name}`", function, at, shape=shape, advice=_ADVICE
         )
-    there = _differentiate(model, name)
-    slopes = (there.drift_slope, there.input_slope, there.output_slope)
-    for what, value, slope in zip(functions, there[:3], slopes, strict=True):
+    trim = _differentiate(model, name)
+    slopes = (trim.drift_slope, trim.input_slope, trim.output_slope)
+    for what, value, slope in zip(functions, trim[:3], slopes, strict=True):
         for which, array in ((f"`{what}`", value), (f"the Jacobian of `{what}`", slope)):
             if not np.isfinite(array).all():
                 raise ModelError(f"{which} of `{name}` is not finite at the trim {x.tolist()}.")
 
 
 def _differentiate(model: ControlAffine, name: str) -> AtTrim:
-    """Return a model at its trim, after checking that JAX's derivatives are its slopes there."""
+    """Return a model at its trim, after checking JAX's derivatives against slopes of its values."""
     try:
-        there = at_trim(model)
-    # The model is anyone's code, and JAX says in many ways that it cannot derive it.
+        trim = at_trim(model)
+    # The model is the user's code, and JAX raises errors of many types where it has no derivative.
     except Exception as error:
         raise ModelError(
-            f"`{name}` has no derivative at its trim, by {error_summary(error)}; write it "
-            "with `jax.numpy` alone."
+            f"`{name}` has no derivative at its trim ({error_summary(error)}); write the model "
+            "with `jax.numpy` only."
         ) from error
-    gap = there.gap
+    gap = trim.gap
     if gap is not None:
         n, state = len(model.state_names), model.state_names[gap.variable]
         row, column = divmod(gap.entry - n, len(model.input_names))
@@ -250,11 +251,11 @@ def _differentiate(model: ControlAffine, name: str) -> AtTrim:
             else (f"`input_map` for `{model.state_names[row]}` and `{model.input_names[column]}`")
         )
         raise ModelError(
-            f"JAX finds the derivative {gap.said:.4g} in `{state}` of {which} of `{name}` at the "
-            f"trim, and its values show {gap.seen:.4g}; write it without `stop_gradient` and "
-            "derivatives of its own."
+            f"the derivative of {which} of `{name}` in `{state}` at the trim is "
+            f"{gap.derivative:.4g} by JAX and {gap.slope:.4g} by its values; write the model "
+            "without `stop_gradient` and without derivatives of its own."
         )
-    return there
+    return trim
 
 
 def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, ...]) -> None:
@@ -263,7 +264,7 @@ def _check_shape(name: str, what: str, got: tuple[int, ...], shape: tuple[int, .
 
 
 def _check_trim(model: ControlAffine, name: str, u: np.ndarray) -> None:
-    """Check |f(x*) + g(x*) u*| <= 1e-9 in the model's units."""
+    """Check that |f(x*) + g(x*) u*| <= 1e-9, in the model's units."""
     residual = at_trim(model).drift + at_trim(model).input_map @ u
     worst = int(np.argmax(np.abs(residual)))
     if abs(residual[worst]) > _TRIM_TOLERANCE:
@@ -274,53 +275,59 @@ def _check_trim(model: ControlAffine, name: str, u: np.ndarray) -> None:
         )
 
 
-def trim_shortfall(model: ControlAffine, wanted: np.ndarray | None = None) -> dict[str, Shortfall]:
-    """Return which inputs of a trim the actuators cut, by name; `wanted` (m,) is another's trim."""
-    asked, delivered = np.asarray(model.trim[1], float), at_trim(model).delivered
-    if wanted is not None and (wanted != asked).any():
+def trim_shortfall(
+    model: ControlAffine, trim_input: Float[Array, " m"] | None = None
+) -> dict[str, Shortfall]:
+    """Return the inputs of the trim that the actuators cut, by name.
+
+    `trim_input` is the trim of another model that these actuators are to hold.
+    """
+    requested, delivered = np.asarray(model.trim[1], float), at_trim(model).delivered
+    if trim_input is not None and (trim_input != requested).any():
         with precision("float64"):
-            asked, delivered = wanted, limited(model, wanted[None])[0]
-    triples = zip(model.input_names, delivered.tolist(), asked.tolist(), strict=True)
-    return {name: Shortfall(got, wanted) for name, got, wanted in triples if got != wanted}
+            requested, delivered = trim_input, limited(model, trim_input[None])[0]
+    pairs = map(Shortfall, delivered.tolist(), requested.tolist())
+    named = zip(model.input_names, pairs, strict=True)
+    return {name: pair for name, pair in named if pair.delivered != pair.requested}
 
 
-def limited(model: ControlAffine, asked: np.ndarray) -> np.ndarray:
-    """Return what the actuators deliver of each of some inputs (K, m)."""
-    return np.asarray(_limited(model, asked))
+def limited(model: ControlAffine, requested: Float[Array, "K m"]) -> Float[Array, "K m"]:
+    """Return the inputs that the actuators deliver for requested ones."""
+    return np.asarray(_limited(model, requested))
 
 
 @cached_jit
-def _limited(model: ControlAffine, asked: jax.Array) -> jax.Array:
-    return jax.vmap(model.limit)(asked)
+def _limited(model: ControlAffine, requested: jax.Array) -> jax.Array:
+    return jax.vmap(model.limit)(requested)
 
 
 def is_limited(model: ControlAffine) -> bool:
-    """Tell whether the actuators of a model have limits, said in either way."""
+    """Tell whether a model has `input_limits` or replaces `limit`."""
     return model.input_limits is not None or type(model).limit is not ControlAffine.limit
 
 
-def at_limits(model: ControlAffine, u: np.ndarray) -> tuple[str, ...]:
-    """Return which normalized inputs cannot be changed by a little both ways about u (m,)."""
-    moved = _LITTLE * np.asarray(model.input_scale, float).T
-    asked = np.concatenate([u + moved, u - moved])
+def at_limits(model: ControlAffine, u: Float[Array, " m"]) -> tuple[str, ...]:
+    """Return the normalized inputs that cannot change slightly in both directions about u."""
+    changes = _SMALL * np.asarray(model.input_scale, float).T
+    requested = np.concatenate([u + changes, u - changes])
     with precision("float64"):
-        got = limited(model, asked)
-    changed = (got != asked).any(axis=1).reshape(2, -1).any(axis=0)
+        delivered = limited(model, requested)
+    changed = (delivered != requested).any(axis=1).reshape(2, -1).any(axis=0)
     return tuple(n for n, cut in zip(model.input_names, changed, strict=True) if cut)
 
 
 def _weak_actuators(model: ControlAffine, name: str) -> tuple[str, ...]:
     """Warn of a trim that the actuators do not deliver."""
     # `limit` returns what fits unchanged, to the bit, so any difference is saturation.
-    short = trim_shortfall(model).items()
-    told = ", ".join(f"`{what}` {got:.4g} of {asked:.4g}" for what, (got, asked) in short)
-    return (f"the actuators of `{name}` cannot hold its trim: they deliver {told}.",) * bool(short)
+    cut = trim_shortfall(model).items()
+    parts = ", ".join(f"`{what}` {part:.4g} of {full:.4g}" for what, (part, full) in cut)
+    return (f"the actuators of `{name}` cannot hold its trim: they deliver {parts}.",) * bool(cut)
 
 
 def _low_precision(model: ControlAffine, name: str) -> tuple[str, ...]:
     """Warn of parameters that a JAX array made without float64 has already rounded."""
     leaves = jax.tree_util.tree_leaves_with_path(model)
-    # Made outside of an x64 context a JAX array is float32, whatever it was given.
+    # A JAX array created outside of an x64 context is float32, whatever its argument.
     rounded = [
         jax.tree_util.keystr(path).lstrip(".")
         for path, leaf in leaves
@@ -329,6 +336,6 @@ def _low_precision(model: ControlAffine, name: str) -> tuple[str, ...]:
     if not rounded:
         return ()
     return (
-        f"{listing(rounded)} of `{name}` is a float32 array, so its values carry only 7 digits; "
+        f"{listing(rounded)} of `{name}` is a float32 array, so its values have only 7 digits; "
         "keep parameters as Python numbers or float64 NumPy arrays.",
     )

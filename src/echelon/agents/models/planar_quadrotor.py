@@ -1,7 +1,5 @@
 """The quadrotor in a vertical plane, the agent of the optimization baseline (arXiv 2301.05841)."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -57,8 +55,7 @@ class PlanarQuadrotor(ControlAffine):
     def __check_init__(self) -> None:
         """Refuse parameters that are not positive."""
         names = ("mass", "inertia", "gravity", "arm", "motor_thrust")
-        values: dict[str, Any] = {name: getattr(self, name) for name in names}
-        check_positive(self, **values)
+        check_positive(self, **{name: getattr(self, name) for name in names})
 
     @property
     def trim(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -125,8 +122,8 @@ class PlanarQuadrotor(ControlAffine):
         """Return what two rotors within [0, motor_thrust] deliver, attitude before collective."""
         left = jnp.asarray(_LEFT, u.dtype)
         tilt = u[1] * left / (2.0 * self.arm)
-        wanted = u[0] / 2.0 + tilt
+        commanded = u[0] / 2.0 + tilt
         f = attitude_priority(u[0] / 2.0, tilt, jnp.zeros_like(tilt), self.motor_thrust)
         delivered = jnp.stack([jnp.sum(f), self.arm * (left @ f)])
-        # u itself where it fits, since mixing there and back would round and count as saturation.
-        return jnp.where(fits(wanted, self.motor_thrust), u, delivered)
+        # u itself where it fits: rounding of the mixing would count as saturation.
+        return jnp.where(fits(commanded, self.motor_thrust), u, delivered)

@@ -1,9 +1,8 @@
 """The 12-state quadrotor of the paper's example.
 
-It has the gravity and the thrust rotation that the paper's equations leave out.
+It includes gravity and the rotation of the thrust, which the paper's equations leave out.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,18 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.airframe import Airframe
-from echelon.agents.models.heading import Heading
-from echelon.agents.models.model import (
-    ControlAffine,
-    FlatBound,
-    FlatChains,
-    Flattened,
-    Limits,
-    Rows,
-    check_positive,
-    diagonal,
-    wound,
-)
+from echelon.agents.models.model import Flattened, Limits, Rows, check_positive, diagonal
 from echelon.agents.models.rigid_body import (
     attitude_along,
     body_axes,
@@ -35,32 +23,33 @@ from echelon.agents.models.rigid_body import (
     free_spin,
     thrust_axis,
 )
+from echelon.agents.models.rigid_vehicle import UPRIGHT, RigidVehicle
 from echelon.agents.models.rotors import attitude_priority, fits
 from echelon.core.errors import ModelError, did_you_mean, listing
-from echelon.core.types import Input, InputMap, Output, State
+from echelon.core.types import Input, InputMap, State
 
 _IDENTIFIED = (16.571710e-6, 16.655602e-6, 29.261652e-6)
-"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015); no other propellers' is published."""
+"""Inertia of a Crazyflie of 28 g, kg m^2 (Foerster 2015), the only one that is published."""
 
 
-def _flown(mass: float, motor_thrust: float, torque_per_thrust: float) -> dict[str, Any]:
+def _crazyflie(mass: float, motor_thrust: float, torque_per_thrust: float) -> dict[str, Any]:
     numbers = {"motor_thrust": motor_thrust, "torque_per_thrust": torque_per_thrust}
     return {"mass": mass, "inertia": _IDENTIFIED, **numbers}
 
 
-# What a motor gives is what the firmware holds at any charge of the battery. Fresh it gives more:
-# 0.16 N by Foerster, whose numbers the paper takes.
+# The motor thrust is the one that the firmware reaches at any charge of the battery. A full battery
+# gives more: 0.16 N by Foerster, whose numbers the paper takes.
 PARAMETERS: dict[str, dict[str, Any]] = {
-    "crazyflie": _flown(0.028, 0.15975, 0.005964552),
-    "crazyflie-2.1+": _flown(0.029, 0.12, 0.006993),
-    "crazyflie-legacy": _flown(0.029, 0.12, 0.00735),
-    "crazyflie-thrust-kit": _flown(0.0325, 0.18, 0.00516),
+    "crazyflie": _crazyflie(0.028, 0.15975, 0.005964552),
+    "crazyflie-2.1+": _crazyflie(0.029, 0.12, 0.006993),
+    "crazyflie-legacy": _crazyflie(0.029, 0.12, 0.00735),
+    "crazyflie-thrust-kit": _crazyflie(0.0325, 0.18, 0.00516),
     "paper": {"mass": 0.028, "inertia": (6.4893e-6, 16.4562e-6, 29.5435e-6)},
 }
 """Named parameter sets. `crazyflie` is the Crazyflie 2.1 that Foerster (2015) identified, with the
-calibration that its firmware had then, and `paper` the paper's Table I as printed. The others are
-of the firmware from 2025 on (Bitcraze, platform defaults of cf2), by its propellers: those of the
-2.1+, the older ones, and the thrust upgrade kit; their inertia is Foerster's."""
+calibration of its firmware at that time; `paper` is the paper's Table I as printed. The others are
+defaults of the firmware from 2025 on (Bitcraze, platform cf2) for the propellers of the 2.1+, the
+older ones and the thrust upgrade kit; their inertia is Foerster's."""
 
 
 def _with_rate(
@@ -77,7 +66,7 @@ _LEFT = (1.0, 1.0, -1.0, -1.0)
 _SPIN = (1.0, -1.0, 1.0, -1.0)
 
 
-class Quadrotor(ControlAffine):
+class Quadrotor(RigidVehicle):
     """Quadrotor in space by the Newton-Euler equations, ZYX Euler angles.
 
     pdot = v, vdot = -g e3 + R(zeta) e3 T / m,
@@ -95,7 +84,7 @@ class Quadrotor(ControlAffine):
     mass: float = 0.028
     inertia: tuple[float, float, float] = (16.571710e-6, 16.655602e-6, 29.261652e-6)
     gravity: float = 9.81
-    # The motors stand 0.046 m from the hub, over sqrt 2 along each body axis; 0.639 N in all, a
+    # The motors are 0.046 m from the hub, over sqrt 2 along each body axis; 0.639 N in all, a
     # quarter each.
     arm: float = 0.0325
     motor_thrust: float = 0.15975
@@ -103,17 +92,9 @@ class Quadrotor(ControlAffine):
     allow_unphysical: bool = eqx.field(default=False, static=True)
 
     state_names = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "p", "q", "r")
-    state_units = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
     input_names = ("thrust", "torque_x", "torque_y", "torque_z")
     input_units = ("N", "N m", "N m", "N m")
-    output_names = ("x", "y", "z", "yaw")
-    position = ("x", "y", "z")
-    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
-    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
-    flat_outputs = ("x", "y", "z", "yaw")
-    # The path's second derivative sets the attitude, whose second derivative is the torque.
-    flat_order = 4
-    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
+    flat_bounds = UPRIGHT
     state_groups = {
         "position": ("x", "y", "z"),
         "velocity": ("vx", "vy", "vz"),
@@ -125,8 +106,6 @@ class Quadrotor(ControlAffine):
     # A tilt turns the thrust into the direction that weighs 500: with a weight of 1 for it the
     # fastest mode goes from 143 1/s at hover to 706 1/s at 30 degrees.
     symmetry_inputs = (4.0, 1.0, 1.0, 1.0)
-    # One over the square of what counts as much: 1 m, 2 m/s, 0.7 rad, 5 rad/s; 5 m/s^2, 20 rad/s^2.
-    weights = ((1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3, (1 / 25,) + (1 / 400,) * 3)
 
     @classmethod
     def named(cls, name: str, **changes: Any) -> "Quadrotor":
@@ -150,8 +129,8 @@ class Quadrotor(ControlAffine):
         return cls.named("crazyflie")
 
     def __check_init__(self) -> None:
-        """Refuse parameters that no vehicle can have."""
-        names = ("mass", "gravity", "arm", "motor_thrust", "torque_per_thrust")
+        """Reject parameters that no vehicle can have."""
+        names = ("mass", "arm", "motor_thrust", "torque_per_thrust")
         check_positive(self, **{name: getattr(self, name) for name in names})
         check_moments(self, self.inertia)
         if not self.allow_unphysical:
@@ -164,7 +143,7 @@ class Quadrotor(ControlAffine):
 
     @property
     def damping(self) -> Rows:
-        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw; position is left out."""
+        """Damp velocity (1.6 1/s by tilting, 2 1/s upward), tilt and yaw, but not position."""
         # A tilt accelerates by g times itself, so 1.6/g rad per m/s damp at 1.6 1/s. Poles of the
         # attitude: s^2 + 16 s + 60 = (s + 6) (s + 10); of the yaw: (s + 2)^2.
         tilt, stiff, damp = 1.6 / self.gravity, 60.0, 16.0
@@ -182,7 +161,7 @@ class Quadrotor(ControlAffine):
 
     @property
     def input_limits(self) -> Limits:
-        """Each motor gives between 0 and `motor_thrust`."""
+        """Each motor delivers between 0 and `motor_thrust`."""
         # Thrust and torques mix the motors by orthogonal patterns of signs, with squares that sum
         # to 4: the inverse is the transpose over 4.
         rows = tuple(
@@ -198,7 +177,7 @@ class Quadrotor(ControlAffine):
 
     @property
     def airframe(self) -> Airframe:
-        """What its motors move."""
+        """The rigid body under the motors."""
         numbers = self.gravity, self.arm, self.torque_per_thrust, self.motor_thrust
         return Airframe(self.mass, self.inertia, *numbers)
 
@@ -214,14 +193,6 @@ class Quadrotor(ControlAffine):
         lift = jnp.pad(thrust_axis(x[6:9])[:, None] / self.mass, ((0, 0), (0, 3)))
         spin = jnp.pad(jnp.diag(1.0 / jnp.asarray(self.inertia, x.dtype)), ((0, 0), (1, 0)))
         return jnp.concatenate([nothing, lift, nothing, spin])
-
-    def output(self, x: State) -> Output:
-        """Return position and yaw."""
-        return jnp.concatenate([x[:3], x[8:9]])
-
-    def difference(self, x: State, y: State) -> State:
-        """Return x - y with the angles the shorter way round."""
-        return wound(x - y, 6, 7, 8)
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).
@@ -247,12 +218,6 @@ class Quadrotor(ControlAffine):
             jnp.concatenate([thrust[None], torque]),
         )
 
-    @property
-    def flat_bounds(self) -> tuple[FlatBound, ...]:
-        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        # z'' = (T/m) cos(roll) cos(pitch) - g, and none of the three can pass 0 unless it does.
-        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
-
     def flatten(self, x: State, e: jax.Array) -> Flattened:
         """Return position and yaw with derivatives; e is the thrust over mass minus g, its rate."""
         # With a = T/m, p^(2) = a R e3 - g e3, and R' = R [omega]x makes p^(3) = R (a q, -a p, a')
@@ -267,13 +232,13 @@ class Quadrotor(ControlAffine):
         def invert(tops: jax.Array) -> Input:
             snap = tops[:3] @ axes
             (sr, sp), (cr, cp) = jnp.sin(x[6:8]), jnp.cos(x[6:8])
-            # One quotient for all, which take longest of what is done here.
+            # One quotient for all, since divisions take longest here.
             both = 1.0 / (a * cr)
             p_dot = q * r - (2.0 * rate * p + snap[1]) * (cr * both)
             q_dot = (snap[0] - 2.0 * rate * q) * (cr * both) - p * r
             # yaw' is (sin(roll) q + cos(roll) r) / cos(pitch), and tops[3] its rate.
-            known = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
-            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - known) * (a * both)])
+            drift = turning[0] * (cr * q - sr * r) + sr * q_dot + sp * turning[1] * turning[2]
+            spin = jnp.stack([p_dot, q_dot, (cp * tops[3] - drift) * (a * both)])
             spin = spin - free_spin(self.inertia, x[9:12])
             return jnp.concatenate([(snap[2] + a * (p**2 + q**2))[None], spin])
 
@@ -282,13 +247,13 @@ class Quadrotor(ControlAffine):
     def limit(self, u: Input) -> Input:
         """Return what four motors within [0, motor_thrust] deliver.
 
-        What does not fit gives way in this order: the collective, then yaw, then roll and pitch.
+        Where they cannot deliver u, first the collective is reduced, then yaw, then roll and pitch.
         """
         left, front, spin = (jnp.asarray(sign, u.dtype) for sign in (_LEFT, _FRONT, _SPIN))
         # The same mixer as in `input_limits`, its part for yaw apart.
         tilt = (u[1] * left - u[2] * front) / (4.0 * self.arm)
         yaw = u[3] * spin / (4.0 * self.torque_per_thrust)
-        wanted = u[0] / 4.0 + tilt + yaw
+        commanded = u[0] / 4.0 + tilt + yaw
         f = attitude_priority(u[0] / 4.0, tilt, yaw, self.motor_thrust)
         torque = [
             self.arm * (left @ f),
@@ -296,5 +261,5 @@ class Quadrotor(ControlAffine):
             self.torque_per_thrust * (spin @ f),
         ]
         delivered = jnp.stack([jnp.sum(f), *torque])
-        # u itself where it fits, since mixing there and back would round and count as saturation.
-        return jnp.where(fits(wanted, self.motor_thrust), u, delivered)
+        # u itself where it fits: rounding of the mixing would count as saturation.
+        return jnp.where(fits(commanded, self.motor_thrust), u, delivered)

@@ -4,16 +4,14 @@ An inner loop on board cancels the attitude dynamics, so that Euler-angle accele
 input. Gains made for these agents say what formation laws can promise above such a loop.
 """
 
-import math
-
 import jax
 import jax.numpy as jnp
 
-from echelon.agents.models.heading import Heading
-from echelon.agents.models.model import ControlAffine, FlatBound, FlatChains, check_positive, wound
+from echelon.agents.models.model import FlatChains
 from echelon.agents.models.rigid_body import attitude_along, lift_along, thrust_axis
+from echelon.agents.models.rigid_vehicle import UPRIGHT, RigidVehicle
 from echelon.core.numerics import derivatives as derivatives_of
-from echelon.core.types import Input, InputMap, Output, Scalar, State
+from echelon.core.types import Input, InputMap, Scalar, State
 
 _GROUPS = {
     "position": ("x", "y", "z"),
@@ -22,9 +20,6 @@ _GROUPS = {
     "rate": ("roll_rate", "pitch_rate", "yaw_rate"),
 }
 _NAMES = tuple(name for group in _GROUPS.values() for name in group)
-_UNITS = ("m",) * 3 + ("m/s",) * 3 + ("rad",) * 3 + ("rad/s",) * 3
-# One over the square of what counts as much, as for the quadrotor under torques.
-_WEIGHTS = (1.0,) * 3 + (0.25,) * 3 + (2.0,) * 3 + (0.04,) * 3
 
 
 def _flown(path: jax.Array, gravity: float) -> tuple[State, jax.Array, jax.Array]:
@@ -40,7 +35,7 @@ def _flown(path: jax.Array, gravity: float) -> tuple[State, jax.Array, jax.Array
     return x, derivatives_of(thrust, now, 1), bend
 
 
-class QuadrotorEuler(ControlAffine):
+class QuadrotorEuler(RigidVehicle):
     """pdot = v, vdot = R(zeta) e3 (g + a) - g e3, zetaddot = input.
 
     12 states: position (m), velocity (m/s), Euler angles (rad), Euler-angle rates (rad/s). Inputs:
@@ -51,28 +46,10 @@ class QuadrotorEuler(ControlAffine):
     gravity: float = 9.81
 
     state_names = _NAMES
-    state_units = _UNITS
     state_groups = _GROUPS
     input_names = ("thrust", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
     input_units = ("m/s^2",) + ("rad/s^2",) * 3
-    output_names = ("x", "y", "z", "yaw")
-    position = ("x", "y", "z")
-    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
-    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
-    flat_outputs = ("x", "y", "z", "yaw")
-    # The path's second derivative sets the attitude, whose second derivative is the input.
-    flat_order = 4
-    flat_chains = FlatChains((4, 4, 4, 2), (2, 0, 0, 0))
-    weights = (_WEIGHTS, (1 / 25,) + (1 / 400,) * 3)
-
-    def __check_init__(self) -> None:
-        """Refuse a gravity that is not positive."""
-        check_positive(self, gravity=self.gravity)
-
-    @property
-    def flat_bounds(self) -> tuple[FlatBound, ...]:
-        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
+    flat_bounds = UPRIGHT
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
@@ -87,14 +64,6 @@ class QuadrotorEuler(ControlAffine):
         spin = jnp.pad(jnp.eye(3, dtype=x.dtype), ((0, 0), (1, 0)))
         return jnp.concatenate([nothing, lift, nothing, spin])
 
-    def output(self, x: State) -> Output:
-        """Return position and yaw."""
-        return jnp.concatenate([x[:3], x[8:9]])
-
-    def difference(self, x: State, y: State) -> State:
-        """Return x - y with the angles the shorter way round."""
-        return wound(x - y, 6, 7, 8)
-
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).
 
@@ -104,7 +73,7 @@ class QuadrotorEuler(ControlAffine):
         return x, jnp.append(thrust[0], bend)
 
 
-class QuadrotorThrust(ControlAffine):
+class QuadrotorThrust(RigidVehicle):
     """The same agent with its thrust as a 13th state, so that g is constant.
 
     pdot = v, vdot = R(zeta) e3 (g + a) - g e3, zetaddot = input, adot = input. The state a is
@@ -114,28 +83,13 @@ class QuadrotorThrust(ControlAffine):
     gravity: float = 9.81
 
     state_names = (*_NAMES, "thrust")
-    state_units = (*_UNITS, "m/s^2")
+    state_units = (*RigidVehicle.state_units, "m/s^2")
     state_groups = _GROUPS
     input_names = ("thrust_rate", "roll_acceleration", "pitch_acceleration", "yaw_acceleration")
     input_units = ("m/s^3",) + ("rad/s^2",) * 3
-    output_names = ("x", "y", "z", "yaw")
-    position = ("x", "y", "z")
-    chart = {"pitch": (-math.pi / 2, math.pi / 2)}
-    heading = Heading("yaw", (("x", "y"), ("vx", "vy")))
-    flat_outputs = ("x", "y", "z", "yaw")
-    # The path's second derivative sets the attitude, whose second derivative is the input.
-    flat_order = 4
     flat_chains = FlatChains((4, 4, 4, 2), (1, 0, 0, 0))
-    weights = ((*_WEIGHTS, 0.04), (1 / 25,) + (1 / 400,) * 3)
-
-    def __check_init__(self) -> None:
-        """Refuse a gravity that is not positive."""
-        check_positive(self, gravity=self.gravity)
-
-    @property
-    def flat_bounds(self) -> tuple[FlatBound, ...]:
-        """Thrust stays above 0, roll and pitch within 90 deg, where z'' stays above -g."""
-        return (FlatBound(("z",), 2, -self.gravity, "roll and pitch within 90 deg"),)
+    flat_bounds = UPRIGHT
+    weights = ((*RigidVehicle.weights[0], 0.04), RigidVehicle.weights[1])
 
     def drift(self, x: State) -> State:
         """Return f(x)."""
@@ -149,14 +103,6 @@ class QuadrotorThrust(ControlAffine):
         spin = jnp.pad(jnp.eye(3, dtype=x.dtype), ((0, 0), (1, 0)))
         thrust = jnp.eye(4, dtype=x.dtype)[:1]
         return jnp.concatenate([jnp.zeros((9, 4), x.dtype), spin, thrust])
-
-    def output(self, x: State) -> Output:
-        """Return position and yaw."""
-        return jnp.concatenate([x[:3], x[8:9]])
-
-    def difference(self, x: State, y: State) -> State:
-        """Return x - y with the angles the shorter way round."""
-        return wound(x - y, 6, 7, 8)
 
     def flat(self, derivatives: jax.Array) -> tuple[State, Input]:
         """Return the state and input that fly a path (x, y, z, yaw).

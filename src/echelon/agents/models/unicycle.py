@@ -10,7 +10,7 @@ from echelon.agents.models.model import (
     FlatChains,
     check_positive,
     diagonal,
-    wound,
+    wrap_angles,
 )
 from echelon.core.types import Input, InputMap, State
 
@@ -64,7 +64,7 @@ class Unicycle(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the heading wrapped."""
-        return wound(x - y, 2)
+        return wrap_angles(x - y, 2)
 
 
 class UnicyclePoint(ControlAffine):
@@ -120,4 +120,4 @@ class UnicyclePoint(ControlAffine):
 
     def difference(self, x: State, y: State) -> State:
         """Return x - y with the heading wrapped."""
-        return wound(x - y, 2)
+        return wrap_angles(x - y, 2)

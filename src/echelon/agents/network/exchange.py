@@ -1,4 +1,4 @@
-"""The seam of the network: what an agent learns from the values that its neighbours sent."""
+"""The exchange over the network: an agent's disagreement with the values of its neighbours."""
 
 import operator
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from typing import TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from echelon.core.types import Array, States
 
@@ -14,13 +15,13 @@ Difference: TypeAlias = Callable[[States, States], States]
 
 
 class Exchange(eqx.Module):
-    """What agents learn from their neighbours: directed copies of the edges, as arrays for JAX.
+    """The disagreement of agents with their neighbours: directed edges as arrays for JAX.
 
-    The agents' own values and the values that they sent are separate arguments, since on a real
+    The agents' own values and the values that they received are separate arguments, since on a real
     network the second may be old or lost.
 
     Attributes:
-        receivers, senders: (K,) who hears whom.
+        receivers, senders: (K,) the ends of each directed edge.
         weights: (K,); of a graph that switches (S, K), a row for each stretch of time.
     """
 
@@ -32,16 +33,25 @@ class Exchange(eqx.Module):
         """Return the computation during one of the stretches."""
         return Exchange(self.receivers, self.senders, jnp.asarray(self.weights)[row])
 
-    def __call__(self, own: States, sent: States, difference: Difference = operator.sub) -> States:
-        """Return z (N, n), z_i = sum_j A_ij (own_i - sent_j).
+    def along_edges(self, values: Float[jax.Array, "N s"]) -> Float[jax.Array, "K s"]:
+        """Return the value sent along each edge, of values (N, s) that all agents send."""
+        return values[self.senders]
+
+    def __call__(
+        self,
+        values: Float[jax.Array, "N s"],
+        received: Float[jax.Array, "K s"],
+        difference: Difference = operator.sub,
+    ) -> Float[jax.Array, "N s"]:
+        """Return z (N, s), z_i = sum_j A_ij (values_i - received_ij).
 
         Args:
-            own: (N, n) states of the agents.
-            sent: (N, n) what was sent of each.
-            difference: of states (K, n) and (K, n), where it is another: of angles, which wind.
+            values: (N, s) values of the agents.
+            received: (K, s) values that were received along each edge.
+            difference: of values (K, s) and (K, s), which for angles is not plain subtraction.
         """
-        weights = jnp.asarray(self.weights, own.dtype)[:, None]
+        weights = jnp.asarray(self.weights, values.dtype)[:, None]
         # Differences before sums: at consensus they vanish exactly, while sums of positions would
         # leave rounding.
-        differences = weights * difference(own[self.receivers], sent[self.senders])
-        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(own))
+        differences = weights * difference(values[self.receivers], received)
+        return jax.ops.segment_sum(differences, self.receivers, num_segments=len(values))

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.csgraph as csgraph
 
 from echelon.agents.network.bound import Grounded
 from echelon.agents.network.edges import (
@@ -26,42 +24,43 @@ from echelon.agents.network.eigenvalues import (
     switching_spectrum,
     symmetric_spectrum,
 )
-from echelon.agents.network.exchange import Exchange
+from echelon.agents.network.matrices import GraphMatrices
 from echelon.agents.network.radius import advising, pairs_within
 from echelon.agents.network.reach import check_reached, nearest_leaders
 from echelon.agents.network.spectrum import Spectrum
 from echelon.agents.network.switching import Schedule, Stretch, unite
 from echelon.agents.network.tree import ordered_outward, outward_edges, parents_of
 from echelon.core.errors import GraphError
-from echelon.core.types import Array, States
+from echelon.core.types import Array
 
 if TYPE_CHECKING:
     import networkx as nx
 
 
 @final
-class Graph:
+class Graph(GraphMatrices):
     """An immutable graph on agents 0 .. N-1, some of which are leaders.
 
-    An edge of an undirected graph is heard both ways. A directed one (i, j) is an arrow along which
-    i tells j: **j hears i**, as in Moreau (2005) and in Ren and Beard (2008), so that arrows lead
-    from the leaders to all others, and A_ji is its weight.
+    Undirected edges carry information both ways. A directed edge (i, j) is an arrow: **j receives
+    from i**, as in Moreau (2005) and in Ren and Beard (2008), so that arrows lead from the leaders
+    to all others, and A_ji is its weight.
 
     Args:
         edges: (i, j) or (i, j, weight).
-        leaders: those who lead.
-        agents: how many there are; the largest number named, plus one, when left out.
-        directed: whether edges are heard one way.
+        leaders: numbers of the leaders.
+        agents: the number N of agents, leaders included; by default the largest number in an edge
+            plus one.
+        directed: whether edges carry information one way.
         weights: of the edges, where these hold none.
 
     Attributes:
-        edges: (E, 2) integers, each edge once in the order given, undirected ones with the smaller
-            agent first.
+        edges: (E, 2) integers, each edge once in the order of the argument, undirected ones with
+            the smaller agent first.
         weights: (E,) positive weights A_ij; of one that switches, the largest.
         agents: the number N of agents, leaders included.
         leaders: sorted agent numbers.
         followers: all other agents, sorted.
-        directed: whether edges are heard one way.
+        directed: whether edges carry information one way.
         schedule: when which weights hold; None where they never change.
 
     Raises:
@@ -77,14 +76,14 @@ class Graph:
         directed: bool = False,
         weights: Sequence[float] | None = None,
     ) -> None:
-        """Check and keep the graph."""
+        """Check the edges, weights and leaders."""
         edges = edges if weights is None else give_weights(edges, weights)
         pairs, heavy = split_weights(edges)
         self.directed = bool(directed)
         count = count_agents(pairs, agents)
-        self._keep(*check_edges(pairs, heavy, count, self.directed), count, leaders, None)
+        self._set(*check_edges(pairs, heavy, count, self.directed), count, leaders, None)
 
-    def _keep(
+    def _set(
         self,
         edges: Array,
         weights: Array,
@@ -99,7 +98,7 @@ class Graph:
             raise GraphError(f"all {self.agents} agents are leaders, and at least one must follow.")
         check_reached(self)
         self._spectrum: Spectrum | None = None
-        # Runs share a graph, and its spectrum is kept: what cannot change cannot go stale.
+        # Runs share a graph and its spectrum, which no change of an array may make false.
         for array in (self.edges, self.weights):
             array.setflags(write=False)
 
@@ -112,7 +111,7 @@ class Graph:
         directed: bool = False,
         weights: Sequence[float] | None = None,
     ) -> "Graph":
-        """Return the graph of the given edges, as the class itself."""
+        """Return the graph of the edges, as the constructor does."""
         return cls(edges, leaders, agents, directed, weights)
 
     @classmethod
@@ -128,19 +127,19 @@ class Graph:
 
         Args:
             stretches: (time in s, the edges from then on), the first at 0.
-            leaders: those who lead.
-            agents: how many there are.
-            directed: whether edges are heard one way.
-            period: s, after which all begins again; the last edges stay for ever when left out.
+            leaders: numbers of the leaders.
+            agents: the number of agents.
+            directed: whether edges carry information one way.
+            period: s, after which the stretches repeat; without it the last edges stay for ever.
 
         Raises:
-            GraphError: a stretch has a false edge, the times do not ascend, or no leader reaches an
-                agent along the edges of a whole period, or along the last ones.
+            GraphError: a stretch has an invalid edge, the times do not ascend, or no leader reaches
+                an agent along the edges of a whole period, or along the last ones.
         """
         graph = cls.__new__(cls)
         graph.directed = bool(directed)
         pairs, heavy, count, schedule = unite(stretches, agents, period, graph.directed)
-        graph._keep(pairs, heavy, count, leaders, schedule)
+        graph._set(pairs, heavy, count, leaders, schedule)
         return graph
 
     @classmethod
@@ -153,8 +152,10 @@ class Graph:
             GraphError: its nodes are not 0 .. N-1.
         """
         if set(graph.nodes) != set(range(len(graph))):
-            text = "the nodes of the networkx graph must be the whole numbers from 0 on"
-            raise GraphError(f"{text}, without a gap.")
+            raise GraphError(
+                "the nodes of the networkx graph must be the whole numbers from 0 on, without "
+                "a gap."
+            )
         edges = [(i, j, data.get("weight", 1.0)) for i, j, data in graph.edges(data=True)]
         return cls(edges, leaders, len(graph), graph.is_directed())
 
@@ -220,77 +221,23 @@ class Graph:
             return cls(pairs_within(points, radius), leaders, agents)
 
     def one_way(self) -> "Graph":
-        """Return the directed graph in which agents hear those alone that are nearer to a leader.
+        """Return the directed graph in which agents receive only from those nearer to a leader.
 
         Raises:
-            GraphError: the graph switches, or falls apart between leaders.
+            GraphError: the graph switches, or splits into parts with different leaders.
         """
         edges, weights = outward_edges(self)
         return Graph(edges, self.leaders, self.agents, True, weights.tolist())
 
-    def adjacency(self) -> sp.csr_array:
-        """Return the adjacency matrix (N, N), sparse: A_ij weighs what i hears of j.
-
-        It is symmetric for undirected graphs; of one that switches it has the largest weights.
-        """
-        return self._weighing(self.weights)
-
-    def _weighing(self, weights: Array) -> sp.csr_array:
-        (receivers, senders), place = self._ways()
-        entries = (weights[place], (receivers, senders))
-        return sp.csr_array(sp.coo_array(entries, shape=(self.agents, self.agents)))
-
-    def told(self, weights: Array | None = None) -> sp.csr_array:
-        """Return (N, N), sparse: entry ij where i tells j, its weight; of some weights (E,)."""
-        A = self._weighing(self.weights if weights is None else weights)
-        A.eliminate_zeros()
-        return sp.csr_array(A.T) if self.directed else A
-
-    def laplacian(self) -> sp.csr_array:
-        """Return the Laplacian (N, N), sparse; its rows sum to zero."""
-        return self._laplacian(self.adjacency())
-
-    def _laplacian(self, A: sp.csr_array) -> sp.csr_array:
-        return sp.csr_array(csgraph.laplacian(A, use_out_degree=self.directed))
-
-    def grounded_laplacian(self) -> sp.csr_array:
-        """Return the follower block of the Laplacian, sparse and positive definite.
-
-        It is the paper's L of Lemma 1; of a directed graph it is not symmetric.
-        """
-        return self._grounding(self.weights)
-
-    def _grounding(self, weights: Array, leaderward: bool = False) -> sp.csr_array:
-        A, rows = self._weighing(weights), np.asarray(self.followers)
-        if leaderward:
-            depth, A = self.depths(), sp.coo_array(A)
-            A.data = np.where(depth[A.col] < depth[A.row], A.data, 0.0)
-            A = sp.csr_array(A)
-            return sp.csr_array(sp.diags_array(A.sum(axis=1)) - A)[rows][:, rows]
-        return sp.csr_array(self._laplacian(A)[rows][:, rows])
-
-    def stretches(self, leaderward: bool = False) -> tuple[sp.csr_array, ...]:
-        """Return the grounded Laplacian of each stretch of time, one where nothing switches.
-
-        Leaderward, of hearing those alone that are nearer to a leader.
-        """
-        rows = self.weights[None] if self.schedule is None else self.schedule.weights
-        return tuple(self._grounding(row, leaderward) for row in rows)
-
-    def inverse_grounded(self) -> Array:
-        """Return the paper's M = L^-1 of Assumption 6 as a dense matrix (for small graphs)."""
-        # Dense: the inverse has no zeros within a connected piece of followers.
-        return np.linalg.inv(self.grounded_laplacian().toarray())
-
     def spectrum(self) -> Spectrum:
         """Return the eigenvalues of the grounded Laplacian; computed once.
 
-        All of them, or beyond 400 followers of an undirected graph the smallest and the largest; of
-        one that switches, those of all stretches.
+        All of them; beyond 400 followers of an undirected graph the smallest and the largest; of a
+        graph that switches, those of all stretches.
 
         Raises:
-            GraphError: the weights are too far apart for the smallest to be known, or too many
-                followers of a directed graph hear each other in circles.
+            GraphError: the weights are too far apart for the smallest to be known, or a directed
+                graph has too large a strongly connected component of followers.
         """
         if self._spectrum is None:
             if self.schedule is not None:
@@ -302,101 +249,63 @@ class Graph:
         return self._spectrum
 
     def _grounded(self) -> Grounded:
-        """Return the grounded Laplacian by its weights."""
-        place = np.full(self.agents, -1)
-        place[list(self.followers)] = np.arange(len(self.followers))
-        ends = place[self.edges]
-        free, held = (ends >= 0).all(axis=1), (ends >= 0).sum(axis=1) == 1
-        holds = np.stack([ends[held].max(axis=1), self.weights[held]], axis=1)
-        return Grounded(ends[free], self.weights[free], holds, len(self.followers))
+        """Return the weights of the grounded Laplacian."""
+        row = np.full(self.agents, -1)
+        row[list(self.followers)] = np.arange(len(self.followers))
+        ends = row[self.edges]
+        free, grounded = (ends >= 0).all(axis=1), (ends >= 0).sum(axis=1) == 1
+        to_leaders = np.stack([ends[grounded].max(axis=1), self.weights[grounded]], axis=1)
+        return Grounded(ends[free], self.weights[free], to_leaders, len(self.followers))
 
     def parent_spectrum(self) -> Spectrum:
-        """Return the eigenvalues where each agent of a tree is sent its parent's input.
+        """Return the eigenvalues where each agent of a tree receives its parent's input.
 
-        They are the edges' weights, those between leaders aside (theory page, T4).
+        They are the weights of all edges but those between leaders (theory page, T4).
         """
-        led = np.isin(self.edges, self.leaders).all(axis=1)
-        weights = np.unique(self.weights[~led])
+        between_leaders = np.isin(self.edges, self.leaders).all(axis=1)
+        weights = np.unique(self.weights[~between_leaders])
         weights.setflags(write=False)
         return Spectrum(weights, len(weights), float(weights[0]))
 
-    def neighbours(self, agent: int) -> tuple[int, ...]:
-        """Return the agents that `agent` hears, sorted."""
-        if not 0 <= agent < self.agents:
-            raise GraphError(
-                f"agent {agent} is not in this graph, whose agents are 0 to {self.agents - 1}."
-            )
-        (receivers, senders), _ = self._ways()
-        return tuple(sorted(senders[receivers == agent].tolist()))
-
     def nearest_leader(self) -> tuple[int, ...]:
-        """Return for each agent the leader fewest edges away (the lowest number on a tie)."""
+        """Return the nearest leader of each agent, in edges (the lowest number on a tie)."""
         return nearest_leaders(self)
 
     def outward(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
-        """Return the agents by how far they are from the leaders, each with its earlier neighbours.
+        """Return the agents by distance from the leaders, each with its earlier neighbours.
 
-        It is the order in which agents can plan when each needs the plans of those before it. Among
-        the equally far the lower number comes first; a leader has no earlier neighbours.
+        It is the order in which agents can plan when each needs the plans of those before it. At
+        equal distance the lower number comes first; a leader has no earlier neighbours.
         """
         return ordered_outward(self)
-
-    def depths(self) -> Array:
-        """Return (N,) how many edges away each agent's nearest leader is."""
-        among = {"indices": self.leaders, "unweighted": True, "min_only": True}
-        return csgraph.dijkstra(self.told(), **among).astype(int)
 
     def parents(self) -> tuple[int, ...]:
         """Return each agent's only neighbour that is nearer to a leader; leaders are their own.
 
         Raises:
-            GraphError: the graph is no tree (edges between leaders aside), lets an agent hear more
-                than one where it is directed, or switches.
+            GraphError: the graph is no tree (edges between leaders aside), a directed one lets an
+                agent receive from more than one other, or the graph switches.
         """
         return parents_of(self)
-
-    def _ways(self) -> tuple[tuple[Array, Array], Array]:
-        """Return who hears whom, receivers and senders, and along which edge, (K,) each."""
-        (i, j), edge = self.edges.T, np.arange(len(self.edges))
-        if self.directed:
-            return (j, i), edge
-        return (np.concatenate([i, j]), np.concatenate([j, i])), np.concatenate([edge, edge])
-
-    def exchange(self, leaderward: bool = False) -> "Exchange":
-        """Return the computation of the disagreement; leaderward, of those nearer a leader.
-
-        Of a graph that switches its weights are (S, K), a row for each stretch.
-        """
-        (receivers, senders), place = self._ways()
-        if leaderward:
-            depth = self.depths()
-            nearer = depth[senders] < depth[receivers]
-            receivers, senders, place = receivers[nearer], senders[nearer], place[nearer]
-        rows = self.weights if self.schedule is None else self.schedule.weights
-        return Exchange(receivers, senders, rows[..., place])
-
-    def disagreement(self, y: States, t: float = 0.0) -> States:
-        """Return z (N, n) with z_i = sum_j A_ij (y_i - y_j), for y (N, n), at a time (s)."""
-        heard = self.exchange()
-        return (heard if self.schedule is None else heard.during(self.schedule.row(t)))(y, y)
 
     def __eq__(self, other: object) -> bool:
         """Tell whether two graphs have the same agents, leaders and edges in the same order."""
         return (
             isinstance(other, Graph)
-            and self._known == other._known
+            and self._constants == other._constants
             and np.array_equal(self.edges, other.edges)
             and np.array_equal(self.weights, other.weights)
         )
 
     def __hash__(self) -> int:
         """Hash what `__eq__` compares."""
-        return hash((self._known, self.edges.tobytes(), self.weights.tobytes()))
+        return hash((self._constants, self.edges.tobytes(), self.weights.tobytes()))
 
     @property
-    def _known(self) -> tuple[object, ...]:
-        when = self.schedule and (*(x.tobytes() for x in self.schedule[:2]), self.schedule.period)
-        return self.agents, self.leaders, self.directed, when
+    def _constants(self) -> tuple[object, ...]:
+        schedule = self.schedule
+        times = schedule and (*(x.tobytes() for x in schedule[:2]), schedule.period)
+        return self.agents, self.leaders, self.directed, times
 
     def __repr__(self) -> str:
         """Say the size."""

@@ -50,7 +50,7 @@ def who_hears_whom(graph: Graph) -> str:
         told = _by_leader(graph, near, hops)
     else:
         told = _in_all(graph, near, hops)
-    heard = graph.told()
+    heard = graph.outgoing()
     alone = [k for k in graph.leaders if {*heard[[k]].indices.tolist()} <= {*graph.leaders}]
     unheard = [f"nobody hears {_numbered('leader', alone)}"] if alone else []
     return "; ".join([*told, *unheard])
@@ -59,7 +59,7 @@ def who_hears_whom(graph: Graph) -> str:
 def _ways(graph: Graph) -> tuple[Array, Array, Array]:
     """Return for each agent its nearest leader, its neighbour on the way there, and the links."""
     asked = {"indices": graph.leaders, "unweighted": True, "return_predecessors": True}
-    links, before = map(np.atleast_2d, csgraph.dijkstra(graph.told(), **asked))
+    links, before = map(np.atleast_2d, csgraph.dijkstra(graph.outgoing(), **asked))
     # The first of equals, as everywhere that the nearest leader counts.
     row = np.argmin(links, axis=0)
     agents = np.arange(graph.agents)

@@ -1,20 +1,16 @@
 """Whom the leaders reach, along the edges of a graph at a time or of a whole window of it."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from echelon.agents.network.edges import name_agents
+from echelon.agents.network.matrices import GraphMatrices
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
 
-if TYPE_CHECKING:
-    from echelon.agents.network.graph import Graph
 
-
-def check_reached(graph: "Graph") -> None:
+def check_reached(graph: GraphMatrices) -> None:
     """Check that a leader reaches everybody: along all edges, or those that count in the end.
 
     Raises:
@@ -41,7 +37,7 @@ def check_reached(graph: "Graph") -> None:
         raise GraphError(f"the graph is disconnected: {name_agents(apart)} no path to agent 0.")
 
 
-def _cut_off(graph: "Graph", lost: Array) -> str:
+def _cut_off(graph: GraphMatrices, lost: Array) -> str:
     """Return the sentence on agents that no leader ever reaches."""
     who = f"{name_agents(lost)} no path to a leader ({_name_leaders(graph)})"
     if graph.schedule is not None and graph.schedule.period is not None:
@@ -57,7 +53,7 @@ def _cut_off(graph: "Graph", lost: Array) -> str:
     return f"the graph is disconnected: {who}."
 
 
-def lost_along(graph: "Graph", weights: Array) -> Array:
+def lost_along(graph: GraphMatrices, weights: Array) -> Array:
     """Return the agents that no leader reaches along the edges that have a weight (E,)."""
     if not graph.directed:
         # One way of each edge is enough, and half of what takes long where they are millions.
@@ -69,19 +65,19 @@ def lost_along(graph: "Graph", weights: Array) -> Array:
         led[label[list(graph.leaders)]] = True
         return np.flatnonzero(~led[label])
     among = {"indices": graph.leaders, "unweighted": True, "min_only": True}
-    return np.flatnonzero(np.isinf(csgraph.dijkstra(graph.told(weights), **among)))
+    return np.flatnonzero(np.isinf(csgraph.dijkstra(graph.outgoing(weights), **among)))
 
 
-def nearest_leaders(graph: "Graph") -> tuple[int, ...]:
+def nearest_leaders(graph: GraphMatrices) -> tuple[int, ...]:
     """Return what `Graph.nearest_leader` says."""
     if len(graph.leaders) == 1:
         return graph.leaders * graph.agents
-    hops = csgraph.dijkstra(graph.told(), indices=graph.leaders, unweighted=True)
+    hops = csgraph.dijkstra(graph.outgoing(), indices=graph.leaders, unweighted=True)
     # `argmin` takes the first of equals, and leaders are sorted.
     return tuple(np.array(graph.leaders)[np.argmin(hops, axis=0)].tolist())
 
 
-def lost_at_times(graph: "Graph") -> str:
+def lost_at_times(graph: GraphMatrices) -> str:
     """Return whom leaders do not reach at some time, and when; empty where they always do."""
     if graph.schedule is None:
         return ""
@@ -92,6 +88,6 @@ def lost_at_times(graph: "Graph") -> str:
     return ""
 
 
-def _name_leaders(graph: "Graph") -> str:
+def _name_leaders(graph: GraphMatrices) -> str:
     kind = "leader" if len(graph.leaders) == 1 else "leaders"
     return f"{kind} {', '.join(str(leader) for leader in graph.leaders[:8])}"

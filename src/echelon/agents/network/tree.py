@@ -1,20 +1,16 @@
 """A graph as seen from its leaders: who comes before whom, and who is whose parent."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from echelon.agents.network.edges import name_agents
+from echelon.agents.network.matrices import GraphMatrices
 from echelon.core.errors import GraphError
 from echelon.core.types import Array
 
-if TYPE_CHECKING:
-    from echelon.agents.network.graph import Graph
 
-
-def ordered_outward(graph: "Graph") -> tuple[tuple[int, tuple[int, ...]], ...]:
+def ordered_outward(graph: GraphMatrices) -> tuple[tuple[int, tuple[int, ...]], ...]:
     """Return what `Graph.outward` says.
 
     Raises:
@@ -31,7 +27,7 @@ def ordered_outward(graph: "Graph") -> tuple[tuple[int, tuple[int, ...]], ...]:
     )
 
 
-def outward_edges(graph: "Graph") -> tuple[Array, Array]:
+def outward_edges(graph: GraphMatrices) -> tuple[Array, Array]:
     """Return the edges (E, 2) as arrows from nearer to a leader to farther, and their weights (E,).
 
     Edges between agents equally far are none of them.
@@ -52,7 +48,7 @@ def outward_edges(graph: "Graph") -> tuple[Array, Array]:
     return edges, np.asarray(heard.weights)
 
 
-def parents_of(graph: "Graph") -> tuple[int, ...]:
+def parents_of(graph: GraphMatrices) -> tuple[int, ...]:
     """Return what `Graph.parents` says.
 
     Raises:
@@ -85,7 +81,7 @@ def parents_of(graph: "Graph") -> tuple[int, ...]:
     return tuple(parents.tolist())
 
 
-def shares(graph: "Graph", agent: int, earlier: tuple[int, ...]) -> Array:
+def shares(graph: GraphMatrices, agent: int, earlier: tuple[int, ...]) -> Array:
     """Return what part each neighbour has in an agent's targets, by the edges' weights."""
     weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
     return weights / weights.sum()

@@ -4,7 +4,7 @@ import abc
 
 import equinox as eqx
 
-from echelon.agents.models.heading import heading_index
+from echelon.agents.models.heading_symmetry import heading_index
 from echelon.agents.models.model import ControlAffine
 from echelon.core.types import Input, Scalar, State
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.heading import heading_of, rest_heading
+from echelon.agents.models.heading_symmetry import heading_of, rest_heading
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.reference import Reference, check_finite, in_space, numbers_of
 from echelon.core.errors import ReferenceError

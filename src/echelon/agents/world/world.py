@@ -5,6 +5,7 @@ from typing import final
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
+from echelon.agents.network.channel import Channel
 from echelon.agents.world.disturbance import Disturbance
 from echelon.agents.world.plant import check_plant, differences
 from echelon.core.errors import SimulationError
@@ -19,15 +20,17 @@ class World:
         plant: the agents as they are, where they differ from the model: these move, and have these
             actuators.
         disturbance: wind and noise on all agents.
+        channel: what the network does to messages; left out, the network is ideal.
     """
 
     plant: ControlAffine | None = None
     disturbance: Disturbance | None = None
+    channel: Channel | None = None
 
     @property
     def ideal(self) -> bool:
-        """Whether the agents are as the model says, and nothing disturbs them."""
-        return self.plant is None and self.disturbance is None
+        """Whether the agents are as the model says, undisturbed, and the network is ideal."""
+        return self.plant is None and self.disturbance is None and self.channel is None
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
         """Return what moves: the plant, or the model where no other is given."""

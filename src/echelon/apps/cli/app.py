@@ -6,6 +6,7 @@ Heavy modules are imported inside each command, so that `--help` is quick.
 import contextlib
 import errno
 import functools
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -61,6 +62,8 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; an error becomes one sentence and its exit code."""
+    # Where the home folder is read-only, matplotlib prints two lines about its cache.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     folder = keep_compiled_code(os.environ)
     with disk_cache.use_folder(folder), outlive_readers(), STOP.listen():
         try:

@@ -18,10 +18,13 @@ def doctor(as_json: JsonOption = False) -> None:
         rows = [check._asdict() for check in checks]
         print(json.dumps({"facts": facts, "checks": rows}, indent=2))
     else:
+        from rich.markup import escape
+
         console = tables.console()
         console.print(tables.pairs(facts))
         for check in checks:
             verdict = "[green]pass[/]" if check.holds else "[red]FAIL[/]"
-            console.print(f"{verdict}  {check.claim} ({check.found})", highlight=False)
+            sentence = escape(f"{check.claim} ({check.found})")
+            console.print(f"{verdict}  {sentence}", highlight=False)
     if not all(check.holds for check in checks):
         raise typer.Exit(1)

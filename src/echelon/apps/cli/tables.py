@@ -22,11 +22,12 @@ def console() -> "Console":
 
 def pairs(facts: dict[str, str]) -> "Table":
     """Return facts as two columns."""
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table.grid(padding=(0, 2))
     for name, text in facts.items():
-        table.add_row(name, text)
+        table.add_row(name, escape(text))
     return table
 
 

@@ -1,28 +1,30 @@
 """The closed loop as it runs live, and knobs that compile nothing."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.hearing import edges_of
 from echelon.agents.world.disturbance import Disturbance
-from echelon.agents.world.world import World
 from echelon.apps.live.knobs import Knobs, LiveParts
-from echelon.apps.live.live_stepper import mover_of
+from echelon.apps.live.live_stepper import choose_stepper
+from echelon.core.compiled import cached_jit
 from echelon.core.errors import GraphError
-from echelon.core.numerics import precision
-from echelon.core.types import Array, Input, Scalar, State
-from echelon.core.words import Feedforward
+from echelon.core.numerics import Precision, precision
+from echelon.core.types import Array
 from echelon.experiments.results.lyapunov import goes_both_ways, potential
-from echelon.laws.law import Law, LocalView, Memory
+from echelon.laws.law import Law
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.step.loop import Loop, Moment, Switches, assemble
+from echelon.simulation.step.sequence import begin
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.gains.gain import Gain
 
@@ -30,51 +32,6 @@ PICTURE = 0.04
 """Seconds of a picture."""
 _AHEAD = 60.0
 """Seconds for which it is known when the graph switches."""
-
-
-@final
-class Dimmed(Law):
-    """A follower's law that is sent a share of the feed-forward: all at 1, nothing at 0."""
-
-    law: Law
-    share: Any
-    feedforward: Feedforward = eqx.field(static=True)
-    turning: bool = eqx.field(static=True)
-
-    def facing(self, heading: Scalar) -> Law:
-        """Return the law in the axes of a heading."""
-        return eqx.tree_at(lambda each: each.law, self, self.law.facing(heading))
-
-    def init(self) -> Memory:
-        """Return what the law begins with."""
-        return self.law.init()
-
-    def update(self, model: ControlAffine, view: LocalView, memory: Memory) -> tuple[Input, Memory]:
-        """Return the input of one agent."""
-        dimmed = eqx.tree_at(
-            lambda v: v.feedforward,
-            view,
-            jnp.asarray(self.share, view.x.dtype) * view.feedforward,
-        )
-        return self.law.update(model, dimmed, memory)
-
-    def begin(self, model: ControlAffine, x: State) -> Memory:
-        """Return what the law begins with at x."""
-        return self.law.begin(model, x)
-
-    def signal(self, model: ControlAffine, x: State, offset: State, memory: Memory) -> Any:
-        """Return what neighbours hear."""
-        return self.law.signal(model, x, offset, memory)
-
-    def settle(
-        self, model: ControlAffine, view: LocalView, wanted: Input, got: Input, memory: Memory
-    ) -> Memory:
-        """Return the memory once the actuators have acted."""
-        return self.law.settle(model, view, wanted, got, memory)
-
-    def message(self, model: ControlAffine, x: State, v: Input, memory: Memory) -> Any:
-        """Return what the law sends."""
-        return self.law.message(model, x, v, memory)
 
 
 class Picture(NamedTuple):
@@ -108,7 +65,8 @@ class LiveLoop:
 
     def __init__(self, parts: Parts, settings: Settings, panel: LiveParts) -> None:
         """Prepare what the steps need."""
-        world = World(parts.world.plant, parts.world.disturbance or Disturbance())
+        disturbance = parts.world.disturbance or Disturbance()
+        world = dataclasses.replace(parts.world, disturbance=disturbance)
         prepared = prepare(parts.replace(world=world), settings)
         problem, drive = prepared.problem, prepared.parts.drive
         assert isinstance(drive, Laws)
@@ -121,8 +79,8 @@ class LiveLoop:
         elif panel.start.coupling is not None:
             c = np.asarray(panel.start.coupling)
             law = eqx.tree_at(lambda each: each.coupling, law, c, is_leaf=_is_none)
-        dimmed = Dimmed(law, np.asarray(1.0), law.feedforward, law.turning)
-        self.loop: Loop = eqx.tree_at(lambda each: each.follower, loop, dimmed)
+        # The share of the feed-forward is a number of the loop, so that a knob can change it.
+        self.loop: Loop = dataclasses.replace(loop, follower=law, share=np.asarray(1.0))
         self.panel, self.settings, self.parts = panel, settings, prepared.parts
         self.potentials: dict[Any, Callable[[Array], Array]] = {}
         self.states, self.measured = problem.states, list(problem.meter.measured)
@@ -134,23 +92,25 @@ class LiveLoop:
         self.potential = self._potential(panel.start)
         self.ahead = range(0)
         self._look_ahead(0)
-        self.mover = mover_of(self.loop, self._unlike(), self.states, settings)
+        engine = choose_stepper(self.loop, self._unlike(), self.states, settings)
+        self.stepper = engine.stepper
+        self.precision: Precision = engine.precision
         self.restart()
 
     def _unlike(self) -> Loop:
         """Return a loop that differs from this one in all that a knob turns, but for weights."""
-        other = [np.full(np.shape(leaf), np.nan) for leaf in self._turned(self.loop)]
-        return eqx.tree_at(self._turned, self.loop, tuple(other))
+        other = [np.full(np.shape(leaf), np.nan) for leaf in self._adjustable(self.loop)]
+        return eqx.tree_at(self._adjustable, self.loop, tuple(other))
 
-    def _turned(self, loop: Loop) -> tuple[Any, ...]:
-        """Return the numbers of the followers' law that knobs turn."""
+    def _adjustable(self, loop: Loop) -> tuple[Any, ...]:
+        """Return the numbers that knobs change: the feed-forward's share, and those of the law."""
         follower: Any = loop.follower
         if self.panel.start.coupling is None:
-            return (follower.share,)
+            return (loop.share,)
         if self.panel.parts.drive.gain is None:
-            return follower.share, follower.law.coupling
-        own = follower.law.gain
-        return follower.share, own.coupling, own.P, own.R, own.R_inverse, own.inner
+            return loop.share, follower.coupling
+        gain = follower.gain
+        return loop.share, gain.coupling, gain.P, gain.R, gain.R_inverse, gain.inner
 
     def _look_ahead(self, step: int) -> None:
         """Let the loop know when the graph switches in the periods about a step."""
@@ -172,13 +132,14 @@ class LiveLoop:
 
     def restart(self, states: Array | None = None, step: int = 0) -> None:
         """Begin again, the knobs as they are; or go on from where others have come, (N, n)."""
-        begin = self.states if states is None else states
-        self.now: Moment = self.mover.begin(self.loop, begin, step)
+        with precision(self.precision):
+            now = begin(self.loop, jnp.asarray(self.states if states is None else states))
+            self.now: Moment = now._replace(step=jnp.asarray(step, jnp.int32))
 
     @property
     def engine(self) -> str:
         """What computes the steps, `native` or `jax`."""
-        return self.mover.engine
+        return self.stepper.engine
 
     @property
     def steps(self) -> int:
@@ -196,7 +157,7 @@ class LiveLoop:
             self.loop,
             (self.offsets, weights, self.panel.wind(knobs)),
         )
-        self.loop = eqx.tree_at(self._turned, loop, self._numbers(knobs))
+        self.loop = eqx.tree_at(self._adjustable, loop, self._numbers(knobs))
 
     def _numbers(self, knobs: Knobs) -> tuple[Any, ...]:
         """Return what these are at the knobs."""
@@ -234,15 +195,35 @@ class LiveLoop:
     def advance(self, still: bool = False) -> Picture:
         """Go on to the next picture, or look at the present one, and return it."""
         self._look_ahead(self.steps)
-        self.now, states, inputs = self.mover.move(self.loop, self.now, 0 if still else self.count)
+        # Once a picture, however many knobs were turned since the last one.
+        if self.stepper.loop is not self.loop:
+            self.stepper.turn(self.loop)
+        # A frame now, from which all steps are taken, and one at their end.
+        counts = np.array([0 if still else self.count, 0], np.int32)
+        with precision(self.precision):
+            chunk = self.stepper.advance(self.now, counts, self._reference())
+        self.now, states, inputs = chunk.now, chunk.states[-1], chunk.inputs[-1]
         y = states - self.offsets
         with np.errstate(over="ignore", invalid="ignore"):
             away = (y - y[self.nearest])[:, self.measured]
             errors = np.linalg.norm(away, axis=1)
-        known = np.isfinite(inputs).all(axis=1) & ~self.mover.beyond(states).any(axis=1)
+        valid = np.isfinite(inputs).all(axis=1) & (np.abs(states) < self.stepper.largest).all(
+            axis=1
+        )
         time = self.steps * self.settings.dt
-        V = float(self.potential(y[None])[0]) if known.all() and self.potential else np.nan
-        return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(known))
+        V = float(self.potential(y[None])[0]) if valid.all() and self.potential else np.nan
+        return Picture(time, states, inputs, errors, self.offsets, V, np.logical_not(valid))
+
+    def _reference(self) -> Array | None:
+        """Return what the stepper measures leaders against, though no picture shows it."""
+        times = self.loop.motion.dt * (self.steps + jnp.arange(self.count + 1))
+        reference = _reference_states(self.loop.leader, self.loop.model, times)
+        return None if reference is None else np.asarray(reference, np.float64)
+
+
+@cached_jit
+def _reference_states(leader: Law, model: ControlAffine, times: jax.Array) -> jax.Array | None:
+    return leader.reference_states(model, times)
 
 
 def _inner(gain: Gain) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from echelon.agents.models.heading import state_turn
+from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.world.disturbance import disturbed, draw

@@ -1,10 +1,11 @@
-"""The numbers of a run: the errors of the paper's Table II, and what else an engineer asks for."""
+"""The numbers of a run: the errors of the paper's Table II, settling times, effort and more."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_type_hints
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
@@ -15,13 +16,39 @@ from echelon.simulation.engine.result import Result, finite_or_none
 from echelon.simulation.step.meter import SETTLED, output_error
 
 _FEW = 8
-"""Agents of which all pairs are looked at sooner than the nearest are found."""
+"""Agents up to which comparing all pairs is faster than a search for the nearest."""
+ERROR = "error"
+"""In place of a unit: that of the formation errors, `Result.unit`."""
+
+
+class Quantity(NamedTuple):
+    """How tables, figures and data sets present a number of a run or of an agent.
+
+    Attributes:
+        meaning: in data sets.
+        unit: `ERROR` for the unit of formation errors; empty without one.
+        label: of a column or an axis; in a column `{unit}`, `{window}` (s) and `{settled}` stand
+            for those of the run.
+        of: computes the number of a run of a sweep; None of an agent's, which `metrics` computes.
+    """
+
+    meaning: str
+    unit: str = ""
+    label: str = ""
+    of: Callable[[Any], float | None] | None = None
+
+
+def quantities(numbers: type) -> dict[str, Quantity]:
+    """Return the quantities among the fields of a tuple of numbers, by name."""
+    hints = get_type_hints(numbers, include_extras=True)
+    marks = ((name, mark) for name, hint in hints.items() for mark in get_args(hint)[1:])
+    return {name: mark for name, mark in marks if isinstance(mark, Quantity)}
 
 
 class LeaderMetrics(NamedTuple):
     """Root-mean-square deviation of a leader from its reference; None without a reference.
 
-    `saturated` is the fraction of steps in which a limit acted.
+    `saturated` is the fraction of steps in which a limit changed the input.
     """
 
     rmse: float | None
@@ -34,21 +61,35 @@ class LeaderMetrics(NamedTuple):
 class FollowerMetrics(NamedTuple):
     """One follower's formation error: the length of the vector to its goal relative to its leader.
 
-    `settling_time` (s) is when the error has come below 1 cm for good. `effort` is the
+    `settling_time` (s) is the time after which the error stays below 1 cm. `effort` is the
     root-mean-square of the normalized input about the trim. `saturated` is the fraction of steps in
-    which a limit acted.
+    which a limit changed the input. A further number is one more field with its `Quantity`.
     """
 
     agent: int
-    rmse: float | None
-    steady_rmse: float | None
-    settling_time: float | None
-    effort: float | None
-    saturated: float
+    rmse: Annotated[
+        float | None,
+        Quantity("root mean square of the formation error", ERROR, "RMSE{unit}\n(all)"),
+    ]
+    steady_rmse: Annotated[
+        float | None,
+        Quantity("the same in the steady window", ERROR, "steady{unit}\n(last {window:.3g} s)"),
+    ]
+    settling_time: Annotated[
+        float | None,
+        Quantity("time after which the error stays below 1 cm", "s", "within {settled}\nfrom, s"),
+    ]
+    effort: Annotated[
+        float | None, Quantity("root mean square of the normalized input", "", "effort")
+    ]
+    saturated: Annotated[
+        float,
+        Quantity("fraction of steps in which a limit changed the input", "", "saturated,\n% steps"),
+    ]
 
 
 class EdgeMetrics(NamedTuple):
-    """Root-mean-square of (actual minus wanted distance) on one edge."""
+    """Root-mean-square of (actual minus desired distance) on one edge."""
 
     edge: tuple[int, int]
     distance_rmse: float | None
@@ -91,7 +132,7 @@ def representatives(rows: Sequence[_Row], error: Callable[[_Row], float]) -> lis
 
 def steady_error(row: LeaderMetrics | FollowerMetrics) -> float:
     """Return the steady error of an agent."""
-    # Whoever has none has not come so far, and stands with the worst.
+    # An agent without one did not reach the steady window, and counts as the worst.
     return np.inf if row.steady_rmse is None else row.steady_rmse
 
 
@@ -111,7 +152,7 @@ def metrics(result: Result) -> Metrics:
 
 def formation_errors(result: Result) -> Array:
     """Return each agent's error length over time, (T, N), in the result's unit."""
-    # Where a square is beyond all numbers, the length is infinite, which says enough.
+    # Where a square overflows, the length is infinite.
     with np.errstate(over="ignore"):
         return np.linalg.norm(result.errors[:, :, list(result.measured)], axis=2)
 
@@ -124,28 +165,30 @@ def output_errors(result: Result, leader: int | None = None) -> Array | None:
     if result.reference is None or not len(result.times):
         return None
     leader = result.graph.leaders[0] if leader is None else leader
-    wanted = result.reference + result.formation.offsets[leader]
+    desired = result.reference + result.formation.offsets[leader]
     with precision("float64"):
-        return np.asarray(_output_errors(result.model, result.states[:, leader], wanted))
+        return np.asarray(_output_errors(result.model, result.states[:, leader], desired))
 
 
 @cached_jit
-def _output_errors(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
-    return jax.vmap(lambda x, wanted: output_error(model, x, wanted))(x, wanted)
+def _output_errors(
+    model: ControlAffine, x: Float[jax.Array, "T n"], desired: Float[jax.Array, "T n"]
+) -> Float[jax.Array, "T q"]:
+    return jax.vmap(lambda x, desired: output_error(model, x, desired))(x, desired)
 
 
-def _root_mean(total: Any, steps: Any) -> float | None:
+def _root_mean(total: float | np.floating, steps: float | np.floating) -> float | None:
     """Return the root of a mean of squares, from their sum; None where there is no mean."""
     return finite_or_none(np.sqrt(total / steps)) if steps > 0 else None
 
 
 def _leaders(result: Result, exists: bool) -> tuple[LeaderMetrics, ...]:
     names, sums = result.model.output_names, result.sums
-    known, (steps, steady) = exists and result.reference is not None, sums.steps
+    has_errors, (steps, steady) = exists and result.reference is not None, sums.steps
 
     def one(k: int, agent: int) -> LeaderMetrics:
         saturated = float(result.saturated[agent])
-        if not known:
+        if not has_errors:
             return LeaderMetrics(None, None, dict.fromkeys(names), agent, saturated)
         outputs = (_root_mean(total, steps) for total in sums.outputs[k])
         return LeaderMetrics(
@@ -179,9 +222,9 @@ def _followers(result: Result, exists: bool) -> tuple[FollowerMetrics, ...]:
 
 
 def _settling_time(result: Result, agent: int, last: float) -> float | None:
-    """Return the first time from which on the error stays below 1 cm, to a step, or None.
+    """Return the time after which the error stays below 1 cm, to a step, or None.
 
-    `last` is the error in the last stored frame, after the last step that the sums know.
+    `last` is the error in the last stored frame, after the last step in the sums.
     """
     if not last <= SETTLED:
         return None

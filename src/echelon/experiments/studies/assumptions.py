@@ -12,7 +12,15 @@ from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
 from echelon.agents.references.demand import ReferenceDemand, asked, infeasible, too_fast
 from echelon.core.linear import eigenvalue_text
-from echelon.core.statement import Hypothesis, Statement, Topic
+from echelon.core.statement import (
+    Hypothesis,
+    Statement,
+    Topic,
+    fails,
+    holds,
+    unneeded,
+    vacuous,
+)
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.finite_condition import finite_condition
 from echelon.guarantees.promises.hypotheses import goal_drifts
@@ -25,7 +33,7 @@ from echelon.synthesis.certificates.axis_modes import obstacle
 # Far above what rounding makes of an eigenvalue 0, and far below any rate of use: at 1e-9 1/s an
 # error takes 30 years to fall to 1/e.
 ZERO = 1e-9
-_HOLDS, _PROOF = Verdict.HOLDS, Kind.PROOF
+_PROOF, _LINEAR = Kind.PROOF, Kind.LINEARIZATION
 _BENT = "the model bends at the trim, and has no linearization there"
 
 
@@ -34,33 +42,33 @@ def graph_lines(parts: Parts) -> Iterator[Statement]:
     graph = parts.graph
     low, high = graph.spectrum().low, graph.spectrum().high
     # A model is asked for f and g without a time, so that none can break it.
-    text = "f and g depend on x alone"
-    yield Statement(Topic.AUTONOMOUS, _HOLDS, _PROOF, text=text)
-    # The paper has unit weights; its lemmas need only that they are positive.
-    unit, shown = bool((graph.weights == 1.0).all()), f"{graph.agents} agents"
-    text = "connected and static" + ("" if unit else "; weights need not be 1")
-    shown = f"{shown}, {len(graph.edges)} edges"
-    other = _other_graph(graph)
-    held = Verdict.of(not other)
-    remedy = "T7 and T8 of the theory page stand in its place" if other else ""
-    yield Statement(Topic.GRAPH, held, _PROOF, len(graph.edges), shown, other or text, remedy)
+    yield holds(Topic.AUTONOMOUS, _PROOF, "f and g depend on x alone")
+    other, size = _other_graph(graph), f"{graph.agents} agents, {len(graph.edges)} edges"
+    remedy = "T7 and T8 of the theory page stand in its place"
+    if other:
+        yield fails(Topic.GRAPH, _PROOF, other, len(graph.edges), size, remedy=remedy)
+    else:
+        # The paper has unit weights; its lemmas need only that they are positive.
+        unit = bool((graph.weights == 1.0).all())
+        text = "connected and static" + ("" if unit else "; weights need not be 1")
+        yield holds(Topic.GRAPH, _PROOF, text, len(graph.edges), size)
     followers, leaders = len(graph.followers), len(graph.leaders)
-    shown = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
-    text = who_hears_whom(graph)
-    yield Statement(Topic.PARENTS, _HOLDS, _PROOF, leaders, shown, text)
-    shown, text = f"lambda_min {low:.6g}, lambda_max {high:.6g}", "for the grounded Laplacian"
-    yield Statement(Topic.GROUNDED, _HOLDS, _PROOF, low, shown, text)
-    text = "no eigenvalue of any L has a smaller real part" if other else "grounded Laplacian"
-    yield Statement(Topic.POSITIVE, held, _PROOF, low, f"{low:.6g}", text, remedy)
-    text = "the LMI is not used"
-    yield Statement(Topic.SCHUR, Verdict.NOT_NEEDED, _PROOF, text=text)
+    roles = f"{leaders} leader{'s' * (leaders > 1)}, {followers} follower{'s' * (followers > 1)}"
+    yield holds(Topic.PARENTS, _PROOF, who_hears_whom(graph), leaders, roles)
+    extremes = f"lambda_min {low:.6g}, lambda_max {high:.6g}"
+    yield holds(Topic.GROUNDED, _PROOF, "for the grounded Laplacian", low, extremes)
+    if other:
+        text = "no eigenvalue of any L has a smaller real part"
+        yield fails(Topic.POSITIVE, _PROOF, text, low, f"{low:.6g}", remedy=remedy)
+    else:
+        yield holds(Topic.POSITIVE, _PROOF, "grounded Laplacian", low, f"{low:.6g}")
+    yield unneeded(Topic.SCHUR, _PROOF, "the LMI is not used")
     # A follower beside a leader keeps the weight of that edge on its diagonal and loses the
     # leader's column, so its row sums to that weight.
     rows = float(np.abs(graph.grounded_laplacian().sum(axis=1)).max())
-    shown = f"row sum {rows:.3g}"
     text = "true for rows that sum to zero; the grounded Laplacian's do not"
     remedy = "nothing here rests on it: Lemma 1 serves instead"
-    yield Statement(Topic.EDGES, Verdict.FAILS, _PROOF, rows, shown, text, remedy)
+    yield fails(Topic.EDGES, _PROOF, text, rows, f"row sum {rows:.3g}", remedy=remedy)
 
 
 def _other_graph(graph: Graph) -> str:
@@ -86,13 +94,13 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     yield monotone
     both = not promise.hypotheses[Hypothesis.SYMMETRY].fails
     both = both and monotone.verdict is Verdict.HOLDS
-    text, linear = "needs Assumption 5 and symmetric offsets", Kind.LINEARIZATION
-    verdict, remedy = Verdict.of(both), "" if both else "see Assumption 5 and the offsets"
-    yield Statement(Topic.DRIFT_ALONG_Z, verdict, linear, text=text, remedy=remedy)
-    largest = _printed_lmi(parts, promise)
-    shown, text = f"eigenvalue {largest:.3g} > 0", "infeasible for every P > 0: its upper left "
-    text, remedy = f"{text}block is zero", "use the finite condition"
-    yield Statement(Topic.LMI_AS_PRINTED, Verdict.FAILS, _PROOF, largest, shown, text, remedy)
+    text, remedy = "needs Assumption 5 and symmetric offsets", "see Assumption 5 and the offsets"
+    yield (
+        holds(Topic.DRIFT_ALONG_Z, _LINEAR, text)
+        if both
+        else fails(Topic.DRIFT_ALONG_Z, _LINEAR, text, remedy=remedy)
+    )
+    yield _printed_line(parts, promise)
     yield _finite_line(parts, promise)
 
 
@@ -100,72 +108,70 @@ def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
     name, slow = Topic.LEADER_TRACKING, promise.own
     if slow is None:
-        return Statement(name, Verdict.NOT_NEEDED, _PROOF, text="it follows nothing")
+        return unneeded(name, _PROOF, "it follows nothing")
     if not promise.linear:
-        return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
-    text, remedy = "at the trim", ""
-    # So asked that NaN counts as not damped.
-    if not slow < -ZERO:
-        text, remedy = "the tracking error is not damped at the trim", "give `leader.gain` another "
-        remedy += "method"
-    verdict, shown = Verdict.of(slow < -ZERO), f"{slow:.3g} 1/s"
-    return Statement(name, verdict, Kind.LINEARIZATION, slow, shown, text, remedy)
+        return vacuous(name, _LINEAR, _BENT)
+    # NaN counts as not damped.
+    if slow < -ZERO:
+        return holds(name, _LINEAR, "at the trim", slow, f"{slow:.3g} 1/s")
+    text = "the tracking error is not damped at the trim"
+    remedy = "give `leader.gain` another method"
+    return fails(name, _LINEAR, text, slow, f"{slow:.3g} 1/s", remedy=remedy)
 
 
 def _reference_line(model: ControlAffine, found: ReferenceDemand, settings: Settings) -> Statement:
     """Say what a leader must do to follow; no model here limits a speed but by its inputs."""
-    name, remedy = Topic.REFERENCE_DEMAND, ""
     limited = settings.limits and model.input_limits is not None
     sizes = ((found.speed, "m/s"), (found.acceleration, "m/s^2"))
     # Below a micrometre and the like are the differences' rounding.
-    shown = [f"{round(x, 5):.3g} {unit}" for x, unit in sizes if x is not None]
-    shown += [f"{100.0 * found.share:.3g} % of the limits' room"] if limited else []
-    text = f"at most, over {settings.horizon:g} s; the limits alone bound what it may ask"
-    text = text if limited else f"at most, over {settings.horizon:g} s; nothing here bounds it"
-    fast = limited and found.share > 1.0
-    if fast:
-        text, remedy = too_fast(model, found), "make it slower or smaller"
+    numbers = [f"{round(x, 5):.3g} {unit}" for x, unit in sizes if x is not None]
+    numbers += [f"{100.0 * found.share:.3g} % of the limits' room"] if limited else []
+    number = found.share, ", ".join(numbers)
     if not found.feasible:
         text, remedy = infeasible(model, found), "give knots that the model can move along"
-    verdict = Verdict.of(found.feasible and not fast)
-    return Statement(name, verdict, Kind.SAMPLES, found.share, ", ".join(shown), text, remedy)
+        return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
+    if limited and found.share > 1.0:
+        text, remedy = too_fast(model, found), "make it slower or smaller"
+        return fails(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number, remedy=remedy)
+    bound = "the limits alone bound what it may ask" if limited else "nothing here bounds it"
+    text = f"at most, over {settings.horizon:g} s; {bound}"
+    return holds(Topic.REFERENCE_DEMAND, Kind.SAMPLES, text, *number)
 
 
 def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     """Assumption 5 for the drift that the followers have, inner loop included, at the trim."""
     name = Topic.MONOTONE
     if not promise.linear:
-        return Statement(name, Verdict.VACUOUS, Kind.LINEARIZATION, text=_BENT)
+        return vacuous(name, _LINEAR, _BENT)
     A, P = promise.loop.linear.A, promise.loop.closed.P
     slope = P @ A + A.T @ P
     worst = float(np.linalg.eigvalsh(slope)[-1])
     # Where a position does not enter the drift, A e = 0 and e'(P A + A'P) e = 0: the largest
     # eigenvalue is then 0 at best, and rounding must not make it fail.
-    holds = worst <= ZERO * max(1.0, float(np.abs(slope).max()))
-    found = None if holds else obstacle(A[None])
-    text, remedy = "the drift does not expand P", ""
-    if found is not None:
-        names = ", ".join(f"`{parts.model.state_names[k]}`" for k in found.states)
-        text = f"no P > 0 can: mode at {eigenvalue_text(found.eigenvalue)} 1/s along {names}"
-        remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
-    elif not holds:
-        text, remedy = "this P does not", "`monotone` or `inner-loop` find one, `riccati` does "
-        remedy += "without"
-    verdict, shown = Verdict.of(holds), f"{worst:.3g}"
-    return Statement(name, verdict, Kind.LINEARIZATION, worst, shown, text, remedy)
+    number = worst, f"{worst:.3g}"
+    if worst <= ZERO * max(1.0, float(np.abs(slope).max())):
+        return holds(name, _LINEAR, "the drift does not expand P", *number)
+    found = obstacle(A[None])
+    if found is None:
+        remedy = "`monotone` or `inner-loop` find one, `riccati` does without"
+        return fails(name, _LINEAR, "this P does not", *number, remedy=remedy)
+    names = ", ".join(f"`{parts.model.state_names[k]}`" for k in found.states)
+    text = f"no P > 0 can: mode at {eigenvalue_text(found.eigenvalue)} 1/s along {names}"
+    remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
+    return fails(name, _LINEAR, text, *number, remedy=remedy)
 
 
 def _flat_lines() -> Iterator[Statement]:
     """Assumption 5, Lemma 4 and the conditions on P where stopping points agree (T5)."""
     text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
-    yield Statement(Topic.MONOTONE, Verdict.HOLDS, _PROOF, 0.0, "0", text)
+    yield holds(Topic.MONOTONE, _PROOF, text, 0.0, "0")
     text = "for offsets of every flat output: they are symmetries of the chains"
-    yield Statement(Topic.DRIFT_ALONG_Z, Verdict.HOLDS, _PROOF, text=text)
+    yield holds(Topic.DRIFT_ALONG_Z, _PROOF, text)
     for name in (Topic.LMI_AS_PRINTED, Topic.FINITE):
-        yield Statement(name, Verdict.NOT_NEEDED, _PROOF, text="T5 asks nothing of a P")
+        yield unneeded(name, _PROOF, "T5 asks nothing of a P")
 
 
-def _printed_lmi(parts: Parts, promise: Promise) -> float:
+def _printed_line(parts: Parts, promise: Promise) -> Statement:
     """Return the largest eigenvalue of the paper's LMI at this P, for up to four followers."""
     # It fails at any size for one reason: on (v, s X v) with a small s > 0, [[0, X], [X, Z]] is
     # 2 s |X v|^2 + O(s^2) > 0. Four followers show it, and eigenvalues cost the cube of their
@@ -182,7 +188,10 @@ def _printed_lmi(parts: Parts, promise: Promise) -> float:
             D[i * n : (i + 1) * n, j] = goals[j] - goals[i]
             F[i * n : (i + 1) * n, j] = drifts[i] - drifts[j]
     Y = -F @ D.T
-    return float(np.linalg.eigvalsh(np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]]))[-1])
+    largest = float(np.linalg.eigvalsh(np.block([[0.0 * X, X], [X, 0.5 * (Y + Y.T)]]))[-1])
+    text = "infeasible for every P > 0: its upper left block is zero"
+    number, remedy = (largest, f"eigenvalue {largest:.3g} > 0"), "use the finite condition"
+    return fails(Topic.LMI_AS_PRINTED, _PROOF, text, *number, remedy=remedy)
 
 
 def _finite_line(parts: Parts, promise: Promise) -> Statement:
@@ -193,13 +202,11 @@ def _finite_line(parts: Parts, promise: Promise) -> Statement:
     found = finite_condition(P, parts.model, parts.formation, parts.drive)
     if found.verdict is Verdict.VACUOUS:
         text = "f is the same at all goals, so that every P passes: it says nothing"
-        return Statement(name, found.verdict, _PROOF, 0.0, "0 <= 0", text)
+        return vacuous(name, _PROOF, text, 0.0, "0 <= 0")
     every = found.agents == parts.graph.agents
-    among = "" if every else f", for {found.agents} of {parts.graph.agents} agents"
-    text, remedy = f"at the goals only{among}; it says nothing of other states", ""
+    kind, number = _PROOF if every else Kind.SAMPLES, (found.largest, f"{found.largest:.3g}")
     if found.verdict is Verdict.FAILS:
-        i, j = found.pair
-        text, remedy = f"goals of agents {i} and {j} drift apart in this P", "choose other offsets "
-        remedy += "or P"
-    kind, shown = _PROOF if every else Kind.SAMPLES, f"{found.largest:.3g}"
-    return Statement(name, found.verdict, kind, found.largest, shown, text, remedy)
+        text = "goals of agents {} and {} drift apart in this P".format(*found.pair)
+        return fails(name, kind, text, *number, remedy="choose other offsets or P")
+    among = "" if every else f", for {found.agents} of {parts.graph.agents} agents"
+    return holds(name, kind, f"at the goals only{among}; it says nothing of other states", *number)

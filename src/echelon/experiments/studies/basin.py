@@ -19,7 +19,8 @@ from echelon.laws.trim_input import TrimInput
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import Loop, assemble, final_states
+from echelon.simulation.step.loop import Loop, assemble
+from echelon.simulation.step.sequence import final_states
 from echelon.simulation.step.settings import Settings
 
 # Odd, so that the middle of a grid is the goal; two starts lie 1/20 of its half-width apart.

@@ -6,9 +6,9 @@ import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
-from echelon.core.statement import Statement, Topic
+from echelon.core.statement import Statement, Topic, fails, holds
 from echelon.core.types import Array, States
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.certificates.domain import Domain
@@ -25,13 +25,13 @@ def killing_line(parts: Parts, promise: Promise) -> Statement:
     domain = _near(parts.model) if claim is None else claim.domain
     where = f"within {_NEAR:g} of the trim" if claim is None else "on the domain"
     residual, kind = killing_residual(parts.model, promise.loop.closed.P, domain)
-    name, shown = Topic.KILLING, f"{residual:.3g} 1/s"
+    number = residual, f"{residual:.3g} 1/s"
     if kind is Kind.PROOF:
         text = f"g is constant {where}: a region is nonlocal (T1)"
-        return Statement(name, Verdict.HOLDS, kind, residual, shown, text)
+        return holds(Topic.KILLING, kind, text, *number)
     text = f"per unit of input, {where}: g varies, so a region is local (T2)"
     remedy = "a model with its inputs as states has constant g"
-    return Statement(name, Verdict.FAILS, kind, residual, shown, text, remedy)
+    return fails(Topic.KILLING, kind, text, *number, remedy=remedy)
 
 
 def killing_residual(model: ControlAffine, P: Array, domain: Domain) -> tuple[float, Kind]:

@@ -7,7 +7,15 @@ import numpy as np
 
 from echelon.agents.models.linearization import trim_slopes
 from echelon.agents.models.model import ControlAffine
-from echelon.core.statement import Hypothesis, Statement, Topic
+from echelon.core.statement import (
+    Hypothesis,
+    Statement,
+    Topic,
+    fails,
+    holds,
+    unneeded,
+    vacuous,
+)
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Verdict
 from echelon.guarantees.promises.closed_loop import LinearLoop
@@ -19,7 +27,7 @@ from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
 from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
 
-_KIND, _HOLDS = Kind.LINEARIZATION, Verdict.HOLDS
+_KIND = Kind.LINEARIZATION
 _WIDE = 4
 """Of lambda_max by lambda_min; beyond it little is left of the delay that could be borne."""
 _STIFF = 1e10
@@ -34,27 +42,27 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
         return
     if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
         text = "any coupling; what delay is left depends on c and the graph alone"
-        yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+        yield unneeded(Topic.MARGINS, _KIND, text)
         yield from _stopping_lines(parts, settings)
         return
-    if not promise.linear or promise.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails:
-        verdict, text = Verdict.NOT_NEEDED, "there is nothing to lose"
-        if not promise.linear:
-            verdict, text = Verdict.VACUOUS, "the model bends at the trim, and has no modes there"
-        yield Statement(Topic.MARGINS, verdict, _KIND, text=text)
+    if not promise.linear:
+        text = "the model bends at the trim, and has no modes there"
+        yield vacuous(Topic.MARGINS, _KIND, text)
+        return
+    if promise.hypotheses[Hypothesis.DISAGREEMENT_DECAY].fails:
+        yield unneeded(Topic.MARGINS, _KIND, "there is nothing to lose")
         return
     stiffness = margins.stiffness(loop.closed)
     if stiffness > _STIFF:
         text = f"the fastest mode is {stiffness:.2g} times the slowest, which rounding hides"
-        yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, stiffness, text=text)
+        yield unneeded(Topic.MARGINS, _KIND, text, stiffness)
         return
     low, high = margins.gain_margin(loop.closed)
-    shown, text = f"{low:.3g} to {high:.3g}", "factors on the coupling"
-    yield Statement(Topic.GAIN, _HOLDS, _KIND, low, shown, text)
+    yield holds(Topic.GAIN, _KIND, "factors on the coupling", low, f"{low:.3g} to {high:.3g}")
     delay = margins.delay_margin(loop.closed)
-    shown = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
+    time = f"{1e3 * delay.delay:.3g} ms" if np.isfinite(delay.delay) else "any"
     text = f"uniform delay of z, lost at lambda = {delay.eigenvalue:.3g}; {loop.where}"
-    yield Statement(Topic.DELAY, _HOLDS, _KIND, delay.delay, shown, text)
+    yield holds(Topic.DELAY, _KIND, text, delay.delay, time)
     low, high = loop.certificate.lambda_min, loop.certificate.lambda_max
     alike = margins.delay_margin(loop.closed._replace(eigenvalues=np.array([low]))).delay
     yield _spread_line(low, high, delay.delay, alike)
@@ -71,10 +79,10 @@ def _turns_lines(promise: Promise) -> Iterator[Statement]:
     if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling with which one P serves all graphs, whenever they switch"
-        yield Statement(Topic.GAIN, _HOLDS, _KIND, low, f"{low:.3g} to inf", what)
+        yield holds(Topic.GAIN, _KIND, what, low, f"{low:.3g} to inf")
     text = "any coupling; " if anywhere else ""
     text += "what delay is left is of one graph, and none is known for graphs that take turns"
-    yield Statement(Topic.MARGINS, Verdict.NOT_NEEDED, _KIND, text=text)
+    yield unneeded(Topic.MARGINS, _KIND, text)
 
 
 def _spread_line(low: float, high: float, delay: float, best: float) -> Statement:
@@ -83,14 +91,14 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     Couplings are chosen for lambda_min, and what delay a mode bears falls with c lambda; `best` is
     the delay that is left at lambda_min alone.
     """
-    ratio, shown = high / low, f"{high / low:.3g}"
+    ratio = high / low
     if not ratio > _WIDE:
         text = f"no more than {_WIDE}, so that the fastest mode costs little of the delay"
-        return Statement(Topic.EIGENVALUE_RATIO, _HOLDS, _KIND, ratio, shown, text)
+        return holds(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}")
     text = f"lambda_max is {ratio:.3g} times lambda_min, for which c is chosen: "
     text += f"z may be {1e3 * delay:.3g} ms old, and could be {1e3 * best:.3g} ms if all were equal"
     remedy = "let agents hear one way, from the leader outward, by `graph.directed: true`"
-    return Statement(Topic.EIGENVALUE_RATIO, Verdict.FAILS, _KIND, ratio, shown, text, remedy)
+    return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
 
 
 def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
@@ -104,9 +112,8 @@ def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
     c, values = float(law.strength(dt)), agreement_modes(parts.graph, law)
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
-    shown = f"{1e3 * delays[at]:.3g} ms"
     text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"
-    yield Statement(Topic.DELAY, _HOLDS, _KIND, float(delays[at]), shown, text)
+    yield holds(Topic.DELAY, _KIND, text, float(delays[at]), f"{1e3 * delays[at]:.3g} ms")
     best = 0.5 * np.pi / (c * float(np.real(values).min()))
     yield _spread_line(float(np.real(values).min()), float(sizes.max()), float(delays[at]), best)
 
@@ -115,13 +122,13 @@ def _scaling_line(model: ControlAffine, loop: LinearLoop) -> Statement:
     # The trim input, and an inner loop's, weaken with the rest.
     slopes = trim_slopes(model) - loop.linear.B.T[:, :, None] * loop.inner[:, None, :]
     worst = margins.input_scaling(loop.closed, slopes=slopes).abscissa
-    text, shown = (
-        "each input 30 % weaker or stronger (at these corners, not between them), as by a wrong "
-        "mass or inertia",
-        f"{worst:.3g} 1/s",
-    )
-    remedy = "" if worst < 0.0 else "identify them better, or raise `coupling`"
-    return Statement(Topic.SCALING, Verdict.of(worst < 0.0), _KIND, worst, shown, text, remedy)
+    text = "each input 30 % weaker or stronger (at these corners, not between them), as by a wrong "
+    text += "mass or inertia"
+    number = worst, f"{worst:.3g} 1/s"
+    if worst < 0.0:
+        return holds(Topic.SCALING, _KIND, text, *number)
+    remedy = "identify them better, or raise `coupling`"
+    return fails(Topic.SCALING, _KIND, text, *number, remedy=remedy)
 
 
 class _Push(NamedTuple):
@@ -150,9 +157,9 @@ def _push_lines(model: ControlAffine, loop: LinearLoop) -> Iterator[Statement]:
     unit = f"{units.pop()} " if len(units) == 1 and "" not in units else ""
 
     def line(name: Topic, bounds: Array, text: str) -> Statement:
-        shown = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
+        each = ", ".join(f"{model.state_names[k]} {bounds[k]:.3g}" for k in watched)
         worst, text = float(bounds[list(watched)].max()), f"{unit}per {where}: {text}; {loop.where}"
-        return Statement(name, _HOLDS, _KIND, worst, shown, text)
+        return holds(name, _KIND, text, worst, each)
 
     text = "no push of that norm on all followers together takes any farther"
     yield line(Topic.DISTURBANCE_NETWORK, invariant_ellipsoid(loop.closed, E), text)
@@ -169,11 +176,11 @@ def _string_line(parts: Parts, loop: LinearLoop) -> Iterator[Statement]:
         return
     gain = margins.string_gain(loop.closed).gain
     depth = int(graph.depths().max())
-    shown = f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
+    number = gain**depth, f"{gain:.3g}, {gain**depth:.3g} over {depth} links"
     # Heard one way, a branch is such a chain whatever is fed forward.
-    used = parts.drive.feedforward is Feedforward.PARENT or graph.directed
-    text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
-    if not used:
+    if parts.drive.feedforward is Feedforward.PARENT or graph.directed:
+        text = "by so much a push may grow along a branch; fewer links or more `coupling` help"
+        yield holds(Topic.STRING, _KIND, text, *number)
+    else:
         text = "what feeding forward the parent's input would amplify; it is not used here"
-    verdict = _HOLDS if used else Verdict.NOT_NEEDED
-    yield Statement(Topic.STRING, verdict, _KIND, gain**depth, shown, text)
+        yield unneeded(Topic.STRING, _KIND, text, *number)

@@ -1,34 +1,116 @@
-"""What is kept of a run in a sweep: how it ended, its errors, and what was promised of it."""
+"""The numbers that a sweep records of each run: its errors, how it ended and what is guaranteed.
+
+A further number is one more entry of `NUMBERS`, or of `FollowerMetrics` for one of each agent.
+"""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import Outcome
 from echelon.core.statement import Hypothesis
 from echelon.core.types import Array
-from echelon.experiments.results.metrics import FollowerMetrics, formation_errors, metrics
+from echelon.experiments.results.metrics import (
+    ERROR,
+    FollowerMetrics,
+    Metrics,
+    Quantity,
+    formation_errors,
+    metrics,
+    quantities,
+)
 from echelon.guarantees.promises.promise import Promise
 from echelon.simulation.engine.result import Result
 
 REFUSED, MISSING = -1, -2
-"""In place of an outcome: of a run whose parts cannot be made, and of one that is still to do."""
-OUTCOMES = {each: k for k, each in enumerate(Outcome)}
+"""In place of an outcome: of a run whose parts cannot be built, and of one that is still to do."""
+OUTCOMES = {outcome: code for code, outcome in enumerate(Outcome)}
 
-OF_AGENT = ("rmse", "steady_rmse", "final_error", "settling_time", "effort", "saturated")
-NUMBERS = (
-    "formation_rmse",
-    "formation_steady_rmse",
-    "worst_final_error",
-    "worst_settling_time",
-    "leader_rmse",
-    "leader_steady_rmse",
-    "saturation_fraction",
-    "promise_rate",
-    "certified_radius",
-    "start_size",
-)
+
+class _RunNumbers(NamedTuple):
+    """What numbers of a run are computed from.
+
+    Attributes:
+        result: the run.
+        metrics: of the run.
+        promise: of its parts.
+        agents: each number of an agent, (N,); NaN for leaders.
+    """
+
+    result: Result
+    metrics: Metrics
+    promise: Promise
+    agents: Mapping[str, Array]
+
+    def followers(self, name: str) -> Array:
+        """Return a number of the followers."""
+        return self.agents[name][list(self.result.graph.followers)]
+
+    def root_mean(self, name: str) -> float:
+        """Return the root mean square of a number of the followers."""
+        return np.sqrt(np.mean(self.followers(name) ** 2))
+
+    @property
+    def certified_radius(self) -> float | None:
+        """The radius of the certified set; None where nothing is guaranteed on one."""
+        certified = self.promise.certified if self.promise.promised else None
+        return None if certified is None else certified.radius
+
+    @property
+    def start_size(self) -> float | None:
+        """The radius of the starts; None without a certified set."""
+        starts = self.promise.hypotheses[Hypothesis.STARTS]
+        return None if self.certified_radius is None else starts.number
+
+
+AGENT_NUMBERS = quantities(FollowerMetrics) | {
+    "final_error": Quantity("formation error at the end", ERROR)
+}
+NUMBERS: Mapping[str, Quantity] = {
+    "formation_rmse": Quantity(
+        "root mean square of the followers' errors, over all steps and followers",
+        ERROR,
+        "formation RMSE",
+        lambda run: run.root_mean("rmse"),
+    ),
+    "formation_steady_rmse": Quantity(
+        "the same in the steady window", ERROR, of=lambda run: run.root_mean("steady_rmse")
+    ),
+    "worst_final_error": Quantity(
+        "error of the follower that is farthest from its goal at the end",
+        ERROR,
+        "worst final error",
+        lambda run: run.followers("final_error").max(),
+    ),
+    "worst_settling_time": Quantity(
+        "time after which the errors of all followers stay below 1 cm",
+        "s",
+        "settling time",
+        lambda run: run.followers("settling_time").max(),
+    ),
+    "leader_rmse": Quantity(
+        "root mean square of the first leader's error",
+        ERROR,
+        of=lambda run: run.metrics.leader.rmse,
+    ),
+    "leader_steady_rmse": Quantity(
+        "the same in the steady window", ERROR, of=lambda run: run.metrics.leader.steady_rmse
+    ),
+    "saturation_fraction": Quantity(
+        "mean over all agents of `saturated`", of=lambda run: run.metrics.saturation_fraction
+    ),
+    "promise_rate": Quantity(
+        "rate at which errors are guaranteed to decay", "1/s", of=lambda run: run.promise.rate
+    ),
+    "certified_radius": Quantity(
+        "r of the certified set: sum_i delta_i'P delta_i <= r^2",
+        of=lambda run: run.certified_radius,
+    ),
+    "start_size": Quantity("r on which the run starts", of=lambda run: run.start_size),
+}
+SUMMARIZED = ("formation_rmse", "worst_final_error", "worst_settling_time")
+"""The numbers that reports and figures show the distribution of."""
 UNIT = "error_unit"
 WORDS = (
     *("message", "promise_kind", "promise_theorem", "promise_against", "engine", "warnings"),
@@ -39,58 +121,36 @@ Columns = Mapping[str, Array]
 
 
 def numbers_of(result: Result, promise: Promise) -> dict[str, Any]:
-    """Return what is kept of a run; what does not exist is NaN."""
-    found = metrics(result)
-    of_agent = {name: np.full(result.graph.agents, np.nan) for name in OF_AGENT}
-    known = result.outcome is not Outcome.DIVERGED and len(result.times)
-    last = formation_errors(result)[-1] if known else of_agent["final_error"]
-    of_agent["saturated"] = result.saturated
-    for one in found.followers:
-        _fill(of_agent, one, float(last[one.agent]))
-    followers = list(result.graph.followers)
-    size = {name: of_agent[name][followers] for name in OF_AGENT}
+    """Return the numbers of a run; what does not exist is NaN."""
+    numbers = metrics(result)
+    agents = {name: np.full(result.graph.agents, np.nan) for name in AGENT_NUMBERS}
+    if result.outcome is not Outcome.DIVERGED and len(result.times):
+        followers = list(result.graph.followers)
+        agents["final_error"][followers] = formation_errors(result)[-1][followers]
+    for follower in numbers.followers:
+        for name in quantities(FollowerMetrics):
+            agents[name][follower.agent] = _number(getattr(follower, name))
+    agents["saturated"] = result.saturated
+    run = _RunNumbers(result, numbers, promise, agents)
+    computed = {name: _number(each.of(run)) for name, each in NUMBERS.items() if each.of}
     return {
-        **of_agent,
+        **agents,
+        **computed,
         "outcome": OUTCOMES[result.outcome],
         "message": "" if result.outcome is Outcome.COMPLETED else result.message,
-        "formation_rmse": np.sqrt(np.mean(size["rmse"] ** 2)),
-        "formation_steady_rmse": np.sqrt(np.mean(size["steady_rmse"] ** 2)),
-        "worst_final_error": size["final_error"].max(),
-        "worst_settling_time": size["settling_time"].max(),
-        "leader_rmse": _number(found.leader.rmse),
-        "leader_steady_rmse": _number(found.leader.steady_rmse),
-        "saturation_fraction": found.saturation_fraction,
         "engine": result.engine,
         "warnings": "\n".join(result.warnings),
         UNIT: result.unit,
-        **_promised(promise),
+        "promised": int(promise.promised),
+        "promise_kind": str(promise.kind) if promise.promised else "",
+        "promise_theorem": "" if promise.theorem is None else str(promise.theorem),
+        "promise_against": "; ".join(promise.reasons),
     }
 
 
 def refused(why: str) -> dict[str, Any]:
-    """Return what is kept of a run whose parts cannot be made."""
+    """Return the columns of a run whose parts cannot be built."""
     return {"outcome": REFUSED, "message": why}
-
-
-def _fill(of_agent: dict[str, Array], one: FollowerMetrics, last: float) -> None:
-    for name, value in one._asdict().items():
-        if name in of_agent:
-            of_agent[name][one.agent] = _number(value)
-    of_agent["final_error"][one.agent] = last
-
-
-def _promised(promise: Promise) -> dict[str, Any]:
-    theorem, found = promise.theorem, promise.certified if promise.promised else None
-    starts = promise.hypotheses[Hypothesis.STARTS]
-    return {
-        "promised": int(promise.promised),
-        "promise_kind": str(promise.kind) if promise.promised else "",
-        "promise_theorem": "" if theorem is None else str(theorem),
-        "promise_rate": _number(promise.rate),
-        "promise_against": "; ".join(promise.reasons),
-        "certified_radius": np.nan if found is None else found.radius,
-        "start_size": _number(None if found is None else starts.number),
-    }
 
 
 def _number(value: float | None) -> float:
@@ -100,15 +160,15 @@ def _number(value: float | None) -> float:
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Array]:
     """Return the columns of some runs, each with all names."""
     agents = max([0, *(len(row["saturated"]) for row in rows if "saturated" in row)])
-    found: dict[str, Array] = {
+    columns: dict[str, Array] = {
         "outcome": np.array([row["outcome"] for row in rows], np.int8),
         "promised": np.array([row.get("promised", 0) for row in rows], np.int8),
     }
-    found |= {name: np.array([row.get(name, np.nan) for row in rows], float) for name in NUMBERS}
-    found |= {name: np.array([row.get(name, "") for row in rows], str) for name in WORDS}
-    for name in OF_AGENT:
-        found[name] = np.full((len(rows), agents), np.nan)
+    columns |= {name: np.array([row.get(name, np.nan) for row in rows], float) for name in NUMBERS}
+    columns |= {name: np.array([row.get(name, "") for row in rows], str) for name in WORDS}
+    for name in AGENT_NUMBERS:
+        columns[name] = np.full((len(rows), agents), np.nan)
         for k, row in enumerate(rows):
             if name in row:
-                found[name][k, : len(row[name])] = row[name]
-    return found
+                columns[name][k, : len(row[name])] = row[name]
+    return columns

@@ -1,4 +1,4 @@
-"""Which runs a sweep has, and in which order they are computed."""
+"""The plan of a sweep: its runs, and the order in which they are computed."""
 
 from collections.abc import Iterator
 from functools import cached_property
@@ -11,17 +11,14 @@ from echelon.core.limits import excess_runs
 from echelon.experiments.scenario.scenario import Scenario, varied
 from echelon.experiments.sweeps.axes import SEED, Axis
 
-NUMBERS, OF_AGENT = 16, 6
-"""That are kept of a run, and of each of its agents."""
-
 
 class SweepRun(NamedTuple):
     """A run of a sweep.
 
     Attributes:
-        place: the number of its value on each axis.
-        case: number of what it shares with those that differ in the seed alone.
-        seed: its seed; None where the scenario says it.
+        place: the index of its value on each axis.
+        case: number of its case; runs of one case differ only in the seed.
+        seed: its seed; None for the scenario's.
     """
 
     place: tuple[int, ...]
@@ -33,12 +30,12 @@ class SweepRun(NamedTuple):
 class Sweep:
     """A scenario in all combinations of the values of some of its keys.
 
-    Runs are numbered with the seeds running fastest, wherever they stand among the axes, since what
-    differs in its seed alone is built once.
+    Runs are numbered with the seeds running fastest, whatever the order of the axes, since runs
+    that differ only in the seed are built once.
 
     Args:
         scenario: what does not vary.
-        axes: what does.
+        axes: the keys that vary, with their values.
 
     Raises:
         ScenarioError: there are too many runs, or a value makes a scenario with faults.
@@ -54,7 +51,7 @@ class Sweep:
             last = len(axis.values) - 1
             for k in {0, last} if ends else range(last + 1):
                 self._varied([a.override(k if a is axis else 0) for a in axes])
-        self._check_size(NUMBERS + OF_AGENT * self._agents())
+        self._check_size(self._columns())
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -78,11 +75,11 @@ class Sweep:
 
     def run(self, number: int) -> SweepRun:
         """Return a run by its number."""
-        found = np.unravel_index(number, [self.shape[k] for k in self.order])
-        place = dict(zip(self.order, map(int, found), strict=True))
-        drawn = (int(a.values[place[k]]) for k, a in enumerate(self.axes) if a.key == SEED)
-        here = tuple(place[k] for k in range(len(self.axes)))
-        return SweepRun(here, number // self.seeds, next(drawn, None))
+        indices = np.unravel_index(number, [self.shape[k] for k in self.order])
+        place = dict(zip(self.order, map(int, indices), strict=True))
+        seeds = (int(a.values[place[k]]) for k, a in enumerate(self.axes) if a.key == SEED)
+        by_axis = tuple(place[k] for k in range(len(self.axes)))
+        return SweepRun(by_axis, number // self.seeds, next(seeds, None))
 
     def runs(self, first: int, count: int) -> Iterator[SweepRun]:
         """Yield runs by their numbers."""
@@ -90,14 +87,14 @@ class Sweep:
 
     def case(self, place: tuple[int, ...]) -> Scenario:
         """Return the scenario of a run, with the first of the seeds."""
-        wanted = [0 if a.key == SEED else k for a, k in zip(self.axes, place, strict=True)]
-        return self._varied([a.override(k) for a, k in zip(self.axes, wanted, strict=True)])
+        chosen = zip(self.axes, place, strict=True)
+        return self._varied([a.override(0 if a.key == SEED else k) for a, k in chosen])
 
     def _varied(self, overrides: list[str]) -> Scenario:
         try:
             return varied(self.scenario, overrides)
         except ScenarioError as error:
-            # The option's own name: the same texts come from `--set` too.
+            # Name the option that was used: `--set` has the same texts.
             text = str(error)
             for axis in self.axes:
                 text = text.replace(f"--set {axis.key}=", f"--over {axis.key}=")
@@ -108,7 +105,10 @@ class Sweep:
         if excess is not None:
             raise ScenarioError(f"the sweep is too large: {excess}.")
 
-    def _agents(self) -> int:
+    def _columns(self) -> int:
+        """Return how many values are stored of a run."""
         from echelon.experiments.scenario.build import build
+        from echelon.experiments.sweeps.numbers import AGENT_NUMBERS, NUMBERS, WORDS
 
-        return build(self.case((0,) * len(self.axes))).parts.graph.agents
+        agents = build(self.case((0,) * len(self.axes))).parts.graph.agents
+        return len(NUMBERS) + len(WORDS) + len(AGENT_NUMBERS) * agents

@@ -8,12 +8,13 @@ import numpy as np
 from echelon.core.errors import Outcome
 from echelon.core.provenance import versions
 from echelon.core.types import Array
+from echelon.experiments.results.metrics import ERROR, Quantity
 from echelon.experiments.scenario.yaml import inline_yaml
 from echelon.experiments.sweeps.axes import Axis
 from echelon.experiments.sweeps.numbers import (
+    AGENT_NUMBERS,
     MISSING,
     NUMBERS,
-    OF_AGENT,
     OUTCOMES,
     REFUSED,
     UNIT,
@@ -27,42 +28,29 @@ if TYPE_CHECKING:
     from echelon.experiments.sweeps.workers import SweepBatch
 
 _Z = 1.96
-"""Of a normal distribution, within which 95 % lie."""
-_UNITS = {"settling_time": "s", "worst_settling_time": "s", "promise_rate": "1/s"}
-_ERRORS = (
-    *("rmse", "steady_rmse", "final_error", "leader_rmse", "leader_steady_rmse"),
-    *("formation_rmse", "formation_steady_rmse", "worst_final_error"),
-)
-_WHAT = {
+"""Standard deviations within which 95 % of a normal distribution lie."""
+_MEANINGS = {
     "outcome": "how the run ended",
-    "promised": "whether anything was promised, before the run",
-    "warnings": "what of the run is probably not meant, a line each",
-    "formation_rmse": "root mean square of the followers' errors, over all steps and followers",
-    "formation_steady_rmse": "the same in the steady window",
-    "worst_final_error": "error of the follower that is farthest from its goal at the end",
-    "worst_settling_time": "when the last follower's error came below 1 cm for good",
-    "saturated": "fraction of steps in which a limit changed the input",
-    "saturation_fraction": "the same, of all agents",
-    "promise_rate": "rate at which errors are promised to shrink",
-    "promise_against": "what stands against any promise",
-    "certified_radius": "r of the certified set: sum_i delta_i'P delta_i <= r^2",
-    "start_size": "r on which the run starts",
+    "promised": "whether anything was guaranteed before the run",
+    "warnings": "settings of the run that are probably not intended, a line each",
+    "promise_against": "why nothing is guaranteed",
 }
+_QUANTITIES = {**AGENT_NUMBERS, **NUMBERS}
 
 
 def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
-    """Return the batches of a sweep as a dataset; runs that none holds are `missing`.
+    """Return the batches of a sweep as a dataset; runs that are in no batch are `missing`.
 
-    Dimensions are the keys that vary, in their order, and `agent`. `outcome` is a number whose
-    meanings stand in its attributes.
+    Dimensions are the keys that vary, in their order, and `agent`. `outcome` is a code whose
+    meanings are in its attributes.
     """
     import xarray as xr
 
     agents = max([0, *(batch.columns["saturated"].shape[1] for batch in batches)])
     keys = [axis.key for axis in plan.axes]
     variables: dict[str, Any] = {}
-    for name, fill in (*_FILLS.items(), *((name, np.nan) for name in OF_AGENT)):
-        inner = name in OF_AGENT
+    for name, fill in (*_FILLS.items(), *((name, np.nan) for name in AGENT_NUMBERS)):
+        inner = name in AGENT_NUMBERS
         whole = np.full((plan.count, agents) if inner else plan.count, fill)
         whole = whole.astype(np.int8 if name in _CODES else object if name in WORDS else float)
         for batch in batches:
@@ -72,17 +60,18 @@ def dataset_of(plan: Sweep, batches: "Sequence[SweepBatch]") -> "xr.Dataset":
         variables[name] = (dims, _arranged(plan, whole), _attributes(name))
     _measure(variables)
     coordinates = {axis.key: _values(axis) for axis in plan.axes} | {"agent": np.arange(agents)}
-    told = {f"version_{name}": text for name, text in versions().items()}
-    told |= {"scenario": plan.scenario.name, "scenario_text": plan.scenario.text}
-    told["over"] = "\n".join(axis.text for axis in plan.axes)
-    return xr.Dataset(variables, coordinates, told)
+    attributes = {f"version_{name}": text for name, text in versions().items()}
+    attributes |= {"scenario": plan.scenario.name, "scenario_text": plan.scenario.text}
+    attributes["over"] = "\n".join(axis.text for axis in plan.axes)
+    return xr.Dataset(variables, coordinates, attributes)
 
 
 def _measure(variables: dict[str, Any]) -> None:
-    """Give errors their unit in the place of the column that says it, where all runs have one."""
-    found = {str(unit) for unit in variables.pop(UNIT)[1].ravel() if unit}
-    for name in _ERRORS if found == {"m"} else ():
-        variables[name][2]["units"] = "m"
+    """Replace the column of the errors' unit by an attribute of errors, if all runs have m."""
+    units = {str(unit) for unit in variables.pop(UNIT)[1].ravel() if unit}
+    for name, quantity in _QUANTITIES.items():
+        if quantity.unit == ERROR and units == {"m"}:
+            variables[name][2]["units"] = "m"
 
 
 _CODES = ("outcome", "promised")
@@ -91,7 +80,7 @@ _FILLS |= dict.fromkeys(NUMBERS, np.nan) | dict.fromkeys(WORDS, "")
 
 
 def _arranged(plan: Sweep, whole: Array) -> Array:
-    """Return what stands in the order of computing in the order of the axes."""
+    """Return rows in the order of computing as an array in the order of the axes."""
     order = plan.order
     slow = whole.reshape([plan.shape[k] for k in order] + list(whole.shape[1:]))
     back = [order.index(k) for k in range(len(order))]
@@ -110,24 +99,25 @@ def _values(axis: Axis) -> Array:
 
 
 def _attributes(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = {"long_name": _WHAT[name]} if name in _WHAT else {}
-    if name in _UNITS:
-        found["units"] = _UNITS[name]
+    quantity = _QUANTITIES.get(name, Quantity(_MEANINGS.get(name, "")))
+    attributes: dict[str, Any] = {"long_name": quantity.meaning} if quantity.meaning else {}
+    if quantity.unit not in ("", ERROR):
+        attributes["units"] = quantity.unit
     if name == "outcome":
         codes = {MISSING: "missing", REFUSED: "refused"}
-        codes |= {k: each.name.lower() for each, k in OUTCOMES.items()}
-        found["flag_values"] = np.array([*codes], np.int8)
-        found["flag_meanings"] = " ".join(codes.values())
-    return found
+        codes |= {code: outcome.name.lower() for outcome, code in OUTCOMES.items()}
+        attributes["flag_values"] = np.array([*codes], np.int8)
+        attributes["flag_meanings"] = " ".join(codes.values())
+    return attributes
 
 
 def succeeded(dataset: "xr.Dataset", error: float | None = None) -> "xr.DataArray":
-    """Return where runs reached their horizon with all followers settled, or below an error.
+    """Return which runs completed with all followers settled, or below an error.
 
     Args:
         dataset: of a sweep.
-        error: what every follower's final error must be below; to have settled (below 1 cm for
-            good) when left out.
+        error: bound on every follower's final error; if None, all followers must have settled
+            (stay below 1 cm).
     """
     reached = dataset["outcome"] == OUTCOMES[Outcome.COMPLETED]
     if error is None:
@@ -136,7 +126,7 @@ def succeeded(dataset: "xr.Dataset", error: float | None = None) -> "xr.DataArra
 
 
 def share_bounds(count: Any, total: Any) -> tuple[Any, Any]:
-    """Return the interval of a probability behind `count` of `total` at 95 % (Wilson, 1927)."""
+    """Return the 95 % interval (Wilson, 1927) of a probability, from `count` of `total`."""
     share, spread = count / total, _Z**2 / total
     middle = (share + spread / 2) / (1 + spread)
     half = _Z * np.sqrt(share * (1 - share) / total + spread / (4 * total)) / (1 + spread)

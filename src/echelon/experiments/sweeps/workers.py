@@ -9,7 +9,7 @@ from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.sweeps.numbers import Columns, columns_of, numbers_of, refused
 from echelon.experiments.sweeps.plan import Sweep, SweepRun
 from echelon.guarantees.promises.promise import Promise, promises
-from echelon.simulation.engine.batch import Batch, Told
+from echelon.simulation.engine.batch import Batch, StepCount
 from echelon.simulation.engine.result import Result
 from echelon.simulation.native import is_installed
 
@@ -52,7 +52,7 @@ class Workers:
         most, least = (_AGENT_STEPS, _LEAST) if fast else (_AGENT_STEPS // _SLOWER, 1)
         self.size = max(least, min(_MOST, most // (settings.steps * graph.agents)))
 
-    def batch(self, first: int, count: int, told: Told) -> SweepBatch:
+    def batch(self, first: int, count: int, told: StepCount) -> SweepBatch:
         """Return what some runs come to; `told` is called several times a second.
 
         Raises:

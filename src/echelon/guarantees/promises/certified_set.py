@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.leaders import Leaders, excursion, own_paths
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -110,16 +110,15 @@ def set_lines(
     if found is None:
         local = region is not None and region.theorem is Theorem.T2
         text = "T2 is local and certifies no set" if local else "needs a region"
-        return [
-            Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
-            for name in (Hypothesis.SET, Hypothesis.STARTS)
-        ]
-    size, radius, text, remedy = size_of(parts, states), found.radius, "", ""
-    shown, holds = f"radius {radius:.3g}" if radius else "empty", Verdict.of(radius > 0.0)
-    line = Statement(Hypothesis.SET, holds, found.kind, radius, shown, found.why, found.remedy)
-    text, holds = "from there no follower leaves the domain", Verdict.of(size <= radius)
-    if not size <= radius:
-        text, remedy = "what the set promises does not reach them", "start nearer to the goals"
-    shown = f"{size:.3g} of {radius:.3g}"
-    starts = Statement(Hypothesis.STARTS, holds, found.kind, size, shown, text, remedy)
-    return [line, starts]
+        return [unneeded(each, Kind.PROOF, text) for each in (Hypothesis.SET, Hypothesis.STARTS)]
+    size, radius, kind = size_of(parts, states), found.radius, found.kind
+    if radius > 0.0:
+        line = holds(Hypothesis.SET, kind, found.why, radius, f"radius {radius:.3g}")
+    else:
+        line = fails(Hypothesis.SET, kind, found.why, radius, "empty", remedy=found.remedy)
+    number = size, f"{size:.3g} of {radius:.3g}"
+    if size <= radius:
+        text = "from there no follower leaves the domain"
+        return [line, holds(Hypothesis.STARTS, kind, text, *number)]
+    text, remedy = "what the set promises does not reach them", "start nearer to the goals"
+    return [line, fails(Hypothesis.STARTS, kind, text, *number, remedy=remedy)]

@@ -3,8 +3,8 @@
 import numpy as np
 
 from echelon.agents.models.linearization import at_trim
-from echelon.core.statement import Hypothesis, Statement
-from echelon.core.words import Kind, Verdict
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
+from echelon.core.words import Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop, grounded_slowest
 from echelon.simulation.engine.parts import Parts
 from echelon.synthesis.certificates.certificate import RegionCertificate
@@ -23,14 +23,13 @@ def claims_line(parts: Parts, loop: LinearLoop, found: RegionCertificate | None)
         loop: near the trim.
         found: what the gain's metric promises here where the leader's input is relayed.
     """
-    gain = parts.drive.gain
+    gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
     if gain is None:
-        text = "there is no gain"
-        return Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, Kind.LINEARIZATION, text=text)
+        return unneeded(name, kind, "there is no gain")
     text = _difference(parts, gain, loop, found)
-    verdict, remedy = Verdict.of(not text), "what is promised here is computed anew" if text else ""
-    text = text or "they are of this model, graph and coupling"
-    return Statement(Hypothesis.CLAIMS, verdict, Kind.LINEARIZATION, text=text, remedy=remedy)
+    if text:
+        return fails(name, kind, text, remedy="what is promised here is computed anew")
+    return holds(name, kind, "they are of this model, graph and coupling")
 
 
 def _difference(parts: Parts, gain: Gain, loop: LinearLoop, found: RegionCertificate | None) -> str:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.heading import state_turn
+from echelon.agents.models.heading_symmetry import state_turn
 from echelon.agents.models.model import ControlAffine
 from echelon.core import linear
 from echelon.core.compiled import cached_jit

@@ -4,7 +4,7 @@ A line whose `reason` is not empty stands against any promise where it fails; th
 left of one, or why.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import jax
 import numpy as np
@@ -15,9 +15,9 @@ from echelon.agents.models.model_check import at_limits, is_limited, trim_shortf
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import listing
 from echelon.core.numerics import precision
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array, States
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.leaders import apart
 from echelon.guarantees.promises.modes import modes
@@ -50,16 +50,15 @@ def agent_lines(case: Case) -> Iterator[Statement]:
 
 def _trim_applied(case: Case) -> Statement:
     """Definition 1 wants f(0) = 0: about the trim it holds, if the law applies the trim input."""
-    parts, name = case.parts, Hypothesis.TRIM_APPLIED
+    parts = case.parts
     there = np.zeros_like(parts.formation.offsets)
     size = float(np.abs(goal_drifts(parts.model, there, parts.drive)).max())
-    applied = parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float))
-    text, remedy, reason = "about the trim, whose input the law applies", "", ""
-    if not applied:
-        text, remedy = "the law leaves out the trim input", "set `follower.trim: true`"
-        reason = "the law leaves out the trim input"
-    verdict, shown = Verdict.of(applied), f"|f + g u*| {size:.2g}"
-    return Statement(name, verdict, Kind.PROOF, size, shown, text, remedy, reason)
+    number = size, f"|f + g u*| {size:.2g}"
+    if parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float)):
+        text = "about the trim, whose input the law applies"
+        return holds(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number)
+    text, remedy = "the law leaves out the trim input", "set `follower.trim: true`"
+    return fails(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number, remedy=remedy, reason=text)
 
 
 def goal_drifts(model: ControlAffine, offsets: Array, law: Law | Drive | None = None) -> Array:
@@ -81,67 +80,58 @@ def _trim_held(case: Case) -> Statement:
     model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
     moved = case.parts.world.plant_for(model)
     if not (case.settings.limits and is_limited(moved)):
-        text = "no limit acts on the inputs"
-        return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text=text)
+        return unneeded(name, Kind.PROOF, "no limit acts on the inputs")
     short = trim_shortfall(moved, np.asarray(model.trim[1], float))
     if plant is not None:
         # A heavier plant needs more than the model's trim to stay where it is.
         short |= trim_shortfall(plant)
     if not short:
-        held = at_limits(moved, np.asarray(model.trim[1], float))
-        if held:
-            return _no_room(name, held)
+        stuck = at_limits(moved, np.asarray(model.trim[1], float))
+        if stuck:
+            text = "the trim stands at a limit of the actuators, which deliver no change of "
+            text, remedy = text + listing(stuck), "give the actuators room about the trim"
+            # No small error gets the input that it asks for.
+            return fails(name, Kind.PROOF, text, 0.0, "0 %", remedy=remedy, reason=text)
         text = "the actuators deliver the input that it takes, and more either way"
-        return Statement(name, Verdict.HOLDS, Kind.PROOF, text=text)
+        return holds(name, Kind.PROOF, text)
     units = dict(zip(model.input_names, model.input_units, strict=True))
     cut = [f"{got:.4g} of {asked:.4g} {units[i]}".rstrip() for i, (got, asked) in short.items()]
     text = "the actuators deliver " + ", ".join(f"`{i}` {part}" for i, part in zip(short, cut))
     worst = min(got / asked if asked else 0.0 for got, asked in short.values())
     remedy = "lighten the agents or strengthen their actuators"
-    reason = f"{text}, and cannot hold the trim"
-    shown = f"{100.0 * worst:.3g} %"
-    return Statement(name, Verdict.FAILS, Kind.PROOF, worst, shown, text, remedy, reason)
-
-
-def _no_room(name: Hypothesis, held: Sequence[str]) -> Statement:
-    """Say that the trim stands at a limit, where no small error gets the input that it asks for."""
-    text = (
-        f"the trim stands at a limit of the actuators, which deliver no change of {listing(held)}"
-    )
-    remedy = "give the actuators room about the trim"
-    return Statement(name, Verdict.FAILS, Kind.PROOF, 0.0, "0 %", text, remedy, text)
+    number, reason = (worst, f"{100.0 * worst:.3g} %"), f"{text}, and cannot hold the trim"
+    return fails(name, Kind.PROOF, text, *number, remedy=remedy, reason=reason)
 
 
 def _exact(case: Case) -> Statement:
     """Assumption 3: states are known exactly, and nothing acts that no law asked for."""
-    text, remedy = "states are known exactly, and nothing disturbs the agents", ""
-    if case.disturbed:
-        remedy = "leave it out to see what it costs"
-        text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
-    verdict = Verdict.of(not case.disturbed)
-    return Statement(Hypothesis.EXACT_STATES, verdict, Kind.PROOF, text=text, remedy=remedy)
+    if not case.disturbed:
+        text = "states are known exactly, and nothing disturbs the agents"
+        return holds(Hypothesis.EXACT_STATES, Kind.PROOF, text)
+    text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
+    return fails(
+        Hypothesis.EXACT_STATES, Kind.PROOF, text, remedy="leave it out to see what it costs"
+    )
 
 
 def _agreement(case: Case) -> Statement:
     """Several leaders are one if they start alike and do the same; else nobody can follow all."""
     name, leaders = Hypothesis.LEADERS_AGREE, case.leaders
     if len(leaders.starts) == 1:
-        return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text="there is one")
+        return unneeded(name, Kind.PROOF, "there is one")
     if leaders.agree:
-        text = "they start alike and obey one law"
-        return Statement(name, Verdict.HOLDS, Kind.PROOF, 0.0, "0 apart", text)
+        return holds(name, Kind.PROOF, "they start alike and obey one law", 0.0, "0 apart")
     if leaders.meet:
         slow = case.loop.slowest if leaders.slowest is None else leaders.slowest
         text = "they start apart, and their own law brings them together"
-        return Statement(name, Verdict.HOLDS, _LINEAR, slow, f"{slow:.3g} 1/s", text)
+        return holds(name, _LINEAR, text, slow, f"{slow:.3g} 1/s")
     if leaders.answer:
         text = "leaders that answer to their neighbours are pushed apart by them"
-        remedy = "set `leader.reacts: false`"
-        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
-    return _drifting(case, name)
+        return fails(name, _LINEAR, text, remedy="set `leader.reacts: false`", reason=text)
+    return _drifting(case)
 
 
-def _drifting(case: Case, name: Hypothesis) -> Statement:
+def _drifting(case: Case) -> Statement:
     """Say by how much free leaders drift apart, and what is left: containment.
 
     Behind leaders that move freely, e = y_F + L_g^-1 L_FL y_L of linear agents obeys the modes of
@@ -159,8 +149,10 @@ def _drifting(case: Case, name: Hypothesis) -> Statement:
         f"the leaders do not agree, but are {away.most:.3g} {unit}apart; followers of linear "
         "agents then end in the leaders' convex hull"
     )
-    shown = f"{away.most:.3g} {unit}apart"
-    return Statement(name, Verdict.FAILS, Kind.SAMPLES, away.most, shown, text, remedy, reason)
+    number = away.most, f"{away.most:.3g} {unit}apart"
+    return fails(
+        Hypothesis.LEADERS_AGREE, Kind.SAMPLES, text, *number, remedy=remedy, reason=reason
+    )
 
 
 def _symmetric(case: Case) -> Statement:
@@ -168,7 +160,7 @@ def _symmetric(case: Case) -> Statement:
     name, parts, domain = Hypothesis.SYMMETRY, case.parts, case.domain
     model, formation = parts.model, parts.formation
     if not np.ptp(formation.offsets, axis=0).any():
-        return Statement(name, Verdict.NOT_NEEDED, Kind.PROOF, text="there are none")
+        return unneeded(name, Kind.PROOF, "there are none")
     broken = formation.broken_symmetries(model)
     kind, where = Kind.SAMPLES, ""
     if domain is not None and not broken:
@@ -178,13 +170,12 @@ def _symmetric(case: Case) -> Statement:
         else:
             bounds = (np.where(np.isfinite(b), b, s) for b, s in zip(domain.box, (-0.5, 0.5)))
             broken = formation.broken_symmetries(model, *bounds)
-    text, remedy, reason = f"f and g do not notice them{where}", "", ""
-    if broken:
-        agent, why = next(iter(broken.items()))
-        text, remedy = f"agent {agent}: {why}{where}", "offset only states that f and g ignore"
-        reason = "an offset is no symmetry of the dynamics"
-    verdict, count = Verdict.of(not broken), len(broken)
-    return Statement(name, verdict, kind, count, f"{count} broken", text, remedy, reason)
+    if not broken:
+        return holds(name, kind, f"f and g do not notice them{where}", 0, "0 broken")
+    agent, why = next(iter(broken.items()))
+    text, remedy = f"agent {agent}: {why}{where}", "offset only states that f and g ignore"
+    count, reason = len(broken), "an offset is no symmetry of the dynamics"
+    return fails(name, kind, text, count, f"{count} broken", remedy=remedy, reason=reason)
 
 
 def _smooth(case: Case) -> Statement:
@@ -193,31 +184,33 @@ def _smooth(case: Case) -> Statement:
     bends = at_trim(parts.model).bends
     if not bends.any():
         text = "values of f and g on either side of it show the slopes that A is made of"
-        return Statement(name, Verdict.HOLDS, Kind.SAMPLES, text=text)
+        return holds(name, Kind.SAMPLES, text)
     entry, variable = (parts.model.state_names[k] for k in np.argwhere(bends)[0])
     text = f"the rate of `{entry}` bends or jumps with `{variable}` at the trim"
-    remedy, reason = "what holds of all its sides is said", ""
-    if case.region is None or case.region.kind is Kind.SAMPLES:
-        remedy = "use `robust-lqr` or `contraction`, whose hull holds the slopes of both sides"
-        reason = f"{text}, where nothing linear holds"
-    verdict = Verdict.FAILS
-    return Statement(name, verdict, Kind.SAMPLES, None, "", text, remedy, reason)
+    if case.region is not None and case.region.kind is not Kind.SAMPLES:
+        return fails(name, Kind.SAMPLES, text, remedy="what holds of all its sides is said")
+    remedy = "use `robust-lqr` or `contraction`, whose hull holds the slopes of both sides"
+    reason = f"{text}, where nothing linear holds"
+    return fails(name, Kind.SAMPLES, text, remedy=remedy, reason=reason)
 
 
 def _matched(case: Case) -> Statement:
-    name, leaders, reason = Hypothesis.MATCHED_MOTION, case.leaders, ""
-    text, remedy = "the leader has no input beyond its trim, so there is nothing to send", ""
+    name, leaders = Hypothesis.MATCHED_MOTION, case.leaders
+    remedy = (
+        "`feedforward: relay` removes the lag, and asks for the leader's input at every follower"
+    )
+    if not case.matched and leaders.answer and case.governed:
+        text = "the leader answers to followers that do not know its input, and nothing is known "
+        text += "of that loop"
+        return fails(name, Kind.PROOF, text, remedy=remedy, reason=text)
+    if not case.matched:
+        return fails(name, Kind.PROOF, "followers lag behind a moving leader", remedy=remedy)
     if leaders.alike:
         text = "the leaders obey the followers' law, so there is nothing to send"
-    elif not leaders.rest:
+    elif leaders.rest:
+        text = "the leader has no input beyond its trim, so there is nothing to send"
+    elif case.fed_by_parents:
+        text = "each follower is sent its parent's input"
+    else:
         text = "the leader's input reaches every follower, which the paper's network does not give"
-        text = "each follower is sent its parent's input" if case.fed_by_parents else text
-    if not case.matched:
-        text = "followers lag behind a moving leader"
-        remedy = "`feedforward: relay` removes the lag, and asks for the leader's input at every "
-        remedy += "follower"
-        if leaders.answer and case.governed:
-            text = reason = "the leader answers to followers that do not know its input, and "
-            text = reason = f"{text}nothing is known of that loop"
-    verdict = Verdict.of(case.matched)
-    return Statement(name, verdict, Kind.PROOF, None, "", text, remedy, reason)
+    return holds(name, Kind.PROOF, text)

@@ -5,7 +5,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from echelon.agents.models.heading import heading_index, input_turn, rest_heading, turned
+from echelon.agents.models.heading_symmetry import (
+    heading_index,
+    input_turn,
+    rest_heading,
+    rotate_state,
+)
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.types import Array, Input, State, States
@@ -110,7 +115,7 @@ def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPat
 @cached_jit
 def _turned_back(model: ControlAffine, states: States, angles: jax.Array) -> States:
     """Return states (K, n) in axes that are turned by angles (K,)."""
-    return jax.vmap(lambda x, angle: turned(model, x, -angle))(states, angles)
+    return jax.vmap(lambda x, angle: rotate_state(model, x, -angle))(states, angles)
 
 
 @cached_jit

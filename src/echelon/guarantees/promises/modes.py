@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from echelon.core.linear import sampled_radius
-from echelon.core.statement import Hypothesis, Statement
-from echelon.core.words import Kind, Theorem, Verdict
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded, vacuous
+from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.frozen_laws import longest_step
 from echelon.guarantees.promises.turning import turning
@@ -39,16 +39,14 @@ def _linear(case: Case) -> Iterator[Statement]:
 def _bent(case: Case) -> Iterator[Statement]:
     """Yield what is left of these lines where there is no linearization: what a region says."""
     for name in (Hypothesis.DETECTABLE, Hypothesis.COUPLING, Hypothesis.ALONG_PATH):
-        yield Statement(name, Verdict.VACUOUS, _LINEAR, text=_BENT)
+        yield vacuous(name, _LINEAR, _BENT)
     region = case.region
     if region is None or region.theorem is Theorem.A5:
-        yield Statement(Hypothesis.DISAGREEMENT_DECAY, Verdict.VACUOUS, _LINEAR, text=_BENT)
+        yield vacuous(Hypothesis.DISAGREEMENT_DECAY, _LINEAR, _BENT)
     else:
         text = "by the slopes of all sides of the trim, where the model bends"
-        rate, shown = -region.rate, f"{-region.rate:.3g} 1/s"
-        yield Statement(
-            Hypothesis.DISAGREEMENT_DECAY, Verdict.HOLDS, region.kind, rate, shown, text
-        )
+        rate = -region.rate
+        yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{rate:.3g} 1/s")
     yield _held_beside(case)
 
 
@@ -57,16 +55,16 @@ def _held_beside(case: Case) -> Statement:
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     shown = f"dt {settings.dt:g} s"
     if case.region is None or case.beside is None:
-        return Statement(name, Verdict.VACUOUS, Kind.SAMPLES, None, shown, _BENT)
+        return vacuous(name, Kind.SAMPLES, _BENT, None, shown)
     A, dt = case.beside[:, None], settings.dt
     radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
     text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
-        return Statement(name, Verdict.HOLDS, Kind.SAMPLES, radius, shown, text)
-    text, remedy = f"the step `dt` = {dt:g} s is too long for this gain: {text}", "shorten "
-    remedy = f"{remedy}`simulation.dt`, or lower the gain"
+        return holds(name, Kind.SAMPLES, text, radius, shown)
+    text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
+    remedy = "shorten `simulation.dt`, or lower the gain"
     reason = "with the input held over the step `dt` it grows"
-    return Statement(name, Verdict.FAILS, Kind.SAMPLES, radius, shown, text, remedy, reason)
+    return fails(name, Kind.SAMPLES, text, radius, shown, remedy=remedy, reason=reason)
 
 
 # ---- where it has a linearization ---------------------------------------------------------------
@@ -75,54 +73,53 @@ def _held_beside(case: Case) -> Statement:
 def _detectable(case: Case) -> Statement:
     model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
     if not case.governed:
-        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, text="there is no P")
+        return unneeded(name, _LINEAR, "there is no P")
     rank, n = loop.certificate.observable, len(model.state_names)
     hidden = detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
+    number = rank, f"rank {rank} of {n}"
+    if not hidden:
+        return holds(name, _LINEAR, "z = 0 is reached", *number)
     names = sorted({k for mode in hidden for k in np.flatnonzero(np.abs(mode.direction) > 0.1)})
     along = ", ".join(f"`{model.state_names[k]}`" for k in names)
-    text, remedy = "z = 0 is reached", ""
-    if hidden:
-        text = f"no input feels {n - rank} of {n} directions of disagreement, and along {along} "
-        text, remedy = f"{text}it does not decay by itself", "choose another P"
-    verdict = Verdict.of(not hidden)
-    return Statement(name, verdict, _LINEAR, rank, f"rank {rank} of {n}", text, remedy)
+    text = (
+        f"no input feels {n - rank} of {n} directions of disagreement, and along {along} it does "
+    )
+    return fails(name, _LINEAR, f"{text}not decay by itself", *number, remedy="choose another P")
 
 
 def _coupled(case: Case) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
-        text = "no edge known"
-        return Statement(Hypothesis.COUPLING, Verdict.HOLDS, Kind.PROOF, c, f"c {c:.4g}", text)
-    fine, shown = c >= edge, f"c {c:.4g}, edge {edge:.4g}"
-    text, remedy = (
-        "from the edge on every mode decays: near the trim, of linear agents anywhere",
-        "",
-    )
-    if not fine:
-        text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
-        remedy = f"raise `coupling` to {edge:.4g} or more"
-    return Statement(Hypothesis.COUPLING, Verdict.of(fine), Kind.PROOF, c, shown, text, remedy)
+        return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge known", c, f"c {c:.4g}")
+    number = c, f"c {c:.4g}, edge {edge:.4g}"
+    if c >= edge:
+        text = "from the edge on every mode decays: near the trim, of linear agents anywhere"
+        return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
+    text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
+    remedy = f"raise `coupling` to {edge:.4g} or more"
+    return fails(Hypothesis.COUPLING, Kind.PROOF, text, *number, remedy=remedy)
 
 
 def _decaying(case: Case) -> Statement:
     """Whether every mode of the network decays; `every` covers what lies between extremes."""
-    name, loop, remedy, reason = Hypothesis.DISAGREEMENT_DECAY, case.loop, "", ""
+    name, loop = Hypothesis.DISAGREEMENT_DECAY, case.loop
     if not case.governed:
         law = isinstance(case.parts.drive, Laws)
         text = "the followers' law does not act on the disagreement"
         text = text if law else f"no theorem is known of `{type(case.parts.drive).__name__}`"
         remedy = "use `consensus`" if law else "use laws, which theorems speak of"
-        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
+        return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     text = f"over {loop.certificate.modes} eigenvalues of the graph"
     if case.fed_by_parents:
         text = "over the edges' weights, as parents' inputs are fed forward"
     elif len(loop.closed.eigenvalues) > loop.certificate.modes:
         text = f"at lambda_min and lambda_max; {'all' if loop.every else 'not all'} between decay"
-    if not loop.every:
-        remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
-        reason = "the disagreement does not decay"
-    verdict, shown = Verdict.of(loop.every), f"{loop.slowest:.3g} 1/s"
-    return Statement(name, verdict, _LINEAR, loop.slowest, shown, text, remedy, reason)
+    number = loop.slowest, f"{loop.slowest:.3g} 1/s"
+    if loop.every:
+        return holds(name, _LINEAR, text, *number)
+    remedy = "raise `coupling`, or let `echelon design` find a gain that decays"
+    reason = "the disagreement does not decay"
+    return fails(name, _LINEAR, text, *number, remedy=remedy, reason=reason)
 
 
 def _taking_turns(case: Case) -> Statement:
@@ -135,45 +132,44 @@ def _taking_turns(case: Case) -> Statement:
     edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
     if not case.governed:
         text = "no theorem is known of this law on graphs that take turns"
-        return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, "use `consensus`", text)
+        return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
     # At the edge the sum may only stay; what feels nothing then decays by detectability.
     if common is not None and edge is not None and c >= edge and common > -np.inf:
         text, rate = "whenever they do: sum_i delta_i'P delta_i rises on none", max(0.0, common)
-        return Statement(name, Verdict.HOLDS, _LINEAR, rate, f"{rate:.3g} 1/s", text)
+        return holds(name, _LINEAR, text, rate, f"{rate:.3g} 1/s")
     text = "no one P is known to serve all the graphs that take turns"
     remedy = "use the law `stopping-point`"
     if edge is not None and not c >= edge:
         remedy = f"raise `coupling` to {edge:.4g} or more, or {remedy}"
-    return Statement(name, Verdict.FAILS, _LINEAR, None, "", text, remedy, text)
+    return fails(name, _LINEAR, text, remedy=remedy, reason=text)
 
 
 def _along(case: Case) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
     name, frozen = Hypothesis.ALONG_PATH, case.frozen
     if not (case.loop.every and case.governed):
-        return Statement(name, Verdict.NOT_NEEDED, Kind.SAMPLES, text="there is nothing to lose")
+        return unneeded(name, Kind.SAMPLES, "there is nothing to lose")
     if frozen is None or not frozen.travelled:
         text = "the leader rests at the trim, or follows no path of its own"
-        return Statement(name, Verdict.NOT_NEEDED, Kind.SAMPLES, text=text)
+        return unneeded(name, Kind.SAMPLES, text)
     found, states = frozen.growth(), len(frozen.times)
-    shown = f"{found.rate:.3g} 1/s"
+    number = found.rate, f"{found.rate:.3g} 1/s"
     if not found.lost:
         text = f"small errors shrink over {states} states of it, each frozen until the next"
-        return Statement(name, Verdict.HOLDS, Kind.SAMPLES, found.rate, shown, text)
+        return holds(name, Kind.SAMPLES, text, *number)
     grown = f"{np.exp(min(found.most, 99.0)):.2g}-fold on a part of it"
-    grown = f"at {shown}" if found.rate >= 0.0 else grown
+    grown = f"at {found.rate:.3g} 1/s" if found.rate >= 0.0 else grown
     text = f"along the leader's path the {found.whose} errors grow {grown}, fastest at "
     text += f"{found.when:.3g} s, where {frozen.blamed} takes the law farthest from its trim"
     remedy = f"keep {frozen.blamed.partition(' ')[0]} nearer to the trim there"
-    return Statement(name, Verdict.FAILS, Kind.SAMPLES, found.rate, shown, text, remedy, text)
+    return fails(name, Kind.SAMPLES, text, *number, remedy=remedy, reason=text)
 
 
 def held(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
-        shown, text = f"dt {settings.dt:g} s", "there is nothing to lose"
-        return Statement(name, Verdict.NOT_NEEDED, _LINEAR, None, shown, text)
+        return unneeded(name, _LINEAR, "there is nothing to lose", None, f"dt {settings.dt:g} s")
     radius, printed = loop.radius(settings), settings.integrator == "printed"
     goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
     if printed and goals.any():
@@ -190,13 +186,14 @@ def held(case: Case) -> Statement:
 
 def _step(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
     """Return the line of a step from a spectral radius and where it is met."""
-    name, dt = Hypothesis.SAMPLING, case.settings.dt
+    dt = case.settings.dt
+    number = radius, f"dt {dt:g} s"
     if radius < 1.0:
-        return Statement(name, Verdict.HOLDS, _LINEAR, radius, f"dt {dt:g} s", text)
+        return holds(Hypothesis.SAMPLING, _LINEAR, text, *number)
     if not remedy:
         longest = longest_step(case.loop, case.frozen, case.settings)
         remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
     # Where agents start it lasts a moment, and a promise is of starts near the goals.
     reason = "" if "agents start" in text else "with the input held over the step `dt` it grows"
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
-    return Statement(name, Verdict.FAILS, _LINEAR, radius, f"dt {dt:g} s", text, remedy, reason)
+    return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

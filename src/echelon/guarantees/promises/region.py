@@ -14,7 +14,7 @@ import numpy as np
 from echelon.agents.models.linearization import at_trim, linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import GainError
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.guarantees.promises.leaders import Leaders
@@ -58,8 +58,7 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
         return _beside_bends(parts, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
-        line = Statement(_NAME, Verdict.NOT_NEEDED, Kind.PROOF, number_text="none", text=text)
-        return Region(None, None, line)
+        return Region(None, None, unneeded(_NAME, Kind.PROOF, text, number_text="none"))
     try:
         found = _computed(parts, gain, gain.certificate.region)
     except GainError as error:
@@ -83,7 +82,7 @@ def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     It has no linearization there, but a hull holds the slopes of all its sides nearby.
     """
     text = "the slopes beside the trim, where the model bends, do not all contract in P"
-    none = Statement(_NAME, Verdict.NOT_NEEDED, Kind.VERTICES, number_text="none", text=text)
+    none = unneeded(_NAME, Kind.VERTICES, text, number_text="none")
     try:
         pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
         found = pairs and _contraction(parts, gain, pairs, exact=False)
@@ -194,14 +193,14 @@ def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:
 
 
 def _lost(text: str, remedy: str) -> Statement:
-    return Statement(_NAME, Verdict.FAILS, Kind.PROOF, None, "none", text, remedy)
+    return fails(_NAME, Kind.PROOF, text, None, "none", remedy=remedy)
 
 
 def _line(parts: Parts, found: RegionCertificate) -> Statement:
     theorem, kind = found.theorem, found.kind
     text = f"{theorem}: {theorem.value} {found.domain.in_words(parts.model)}"
     text += f"; no more than {kind}, since {found.why}" if found.why else ""
-    shown, skew = f"{found.rate:.3g} 1/s", parts.graph.spectrum().skew
+    skew = parts.graph.spectrum().skew
     if skew > 1.0:
         text += f"; their squares weighted as T7 has it, {skew:.3g} to 1 at most"
-    return Statement(_NAME, Verdict.of(True), kind, found.rate, shown, text)
+    return holds(_NAME, kind, text, found.rate, f"{found.rate:.3g} 1/s")

@@ -11,13 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.heading import heading_gap, heading_index, heading_of, state_turn
+from echelon.agents.models.heading_symmetry import (
+    heading_gap,
+    heading_index,
+    heading_of,
+    state_turn,
+)
 from echelon.agents.models.model import ControlAffine
 from echelon.core.compiled import cached_jit
 from echelon.core.rational import bisect
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds
 from echelon.core.types import Array
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind
 from echelon.guarantees.promises.case import Case
 from echelon.laws.law import gain_of
 from echelon.simulation.engine.law_drive import Laws
@@ -46,18 +51,18 @@ def turning(case: Case) -> Iterator[Statement]:
     text += f"`{name}` what it does at the trim"
     slowest = slowest_in_turns(case)
     if not slowest:
-        yield Statement(_NAME, Verdict.HOLDS, kind, gap, f"gap {gap:.1g}", text)
+        yield holds(_NAME, kind, text, gap, f"gap {gap:.1g}")
         return
     worst = max(slowest, key=lambda rate: slowest[rate])
-    shown = f"{slowest[worst]:.3g} 1/s at {worst:.3g} rad/s"
+    number = slowest[worst], f"{slowest[worst]:.3g} 1/s at {worst:.3g} rad/s"
     if slowest[worst] < 0.0:
         text += f"; in a steady turn of {worst:.3g} rad/s modes decay at {-slowest[worst]:.3g} 1/s"
-        yield Statement(_NAME, Verdict.HOLDS, kind, slowest[worst], shown, text)
+        yield holds(_NAME, kind, text, *number)
         return
     found = f"in a steady turn of {worst:.3g} rad/s, as on the leader's path, the disagreement "
     found += "does not decay"
     remedy = f"turn no faster than {_fastest(case, worst):.3g} rad/s"
-    yield Statement(_NAME, Verdict.FAILS, kind, slowest[worst], shown, found, remedy, reason=found)
+    yield fails(_NAME, kind, found, *number, remedy=remedy, reason=found)
 
 
 def turns_in_words(case: Case) -> str:

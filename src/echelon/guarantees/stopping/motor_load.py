@@ -12,9 +12,9 @@ from echelon.agents.models.model import ControlAffine
 from echelon.core.enclosure.interval import Interval
 from echelon.core.memoize import memoize
 from echelon.core.rational import bisect, float_above, float_below, norm_above
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Kind, Verdict
+from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.motor_bounds import (
     MotorDemand,
@@ -160,17 +160,18 @@ def strain_of(run: StoppingRun) -> LoadLine:
     """Return whether the motors of a run's agents suffice, by T5 with limits."""
     frame, reason = run.parts.model.airframe, _beyond(run)
     if frame is None or reason:
-        text = reason or _UNKNOWN
-        return LoadLine(None, _line(Verdict.NOT_NEEDED, Kind.PROOF, None, "", text))
+        return LoadLine(None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN))
     case = _MotorCase.of(run, frame)
     found, starts = _from(case)
-    kind, shown, most = case.path.kind, _shown(found), Fraction(frame.motor_thrust)
+    kind, most = case.path.kind, Fraction(frame.motor_thrust)
+    number = None if found.slope is None else float(found.least), _shown(found)
     if not found.within(most):
         text = "from these starts the motors are not shown to give what is asked"
-        text += f": {shown}" if shown else ", and the thrust not to vanish"
+        text += f": {number[1]}" if number[1] else ", and the thrust not to vanish"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
-        return LoadLine(None, _line(Verdict.FAILS, kind, found, shown, text, remedy))
+        # Without a reason: a promise of agents without limits is one too.
+        return LoadLine(None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy))
     ahead = _ahead(frame, run.ahead)
     strain = MotorLoad(
         kind,
@@ -182,7 +183,7 @@ def strain_of(run: StoppingRun) -> LoadLine:
         _told(case, run.law.roots_for(3), starts, ahead),
     )
     text = "the motors give what is asked from these starts, all the way"
-    return LoadLine(strain, _line(Verdict.HOLDS, kind, found, shown, text))
+    return LoadLine(strain, holds(Hypothesis.LIMITS, kind, text, *number))
 
 
 def _beyond(run: StoppingRun) -> str:
@@ -194,14 +195,6 @@ def _beyond(run: StoppingRun) -> str:
         return _UNKNOWN
     speeds = [*map(run.speed, range(4)), *map(run.own_speed, range(4))]
     return "a `speed` is infinite" if any(map(math.isinf, speeds)) else ""
-
-
-def _line(
-    verdict: Verdict, kind: Kind, found: Motors | None, shown: str, text: str, remedy: str = ""
-) -> Statement:
-    number = None if found is None or found.slope is None else float(found.least)
-    # Without a reason: a promise of agents without limits is one too.
-    return Statement(Hypothesis.LIMITS, verdict, kind, number, shown, text, remedy)
 
 
 def _shown(found: Motors) -> str:

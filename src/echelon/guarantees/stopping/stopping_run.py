@@ -13,9 +13,9 @@ from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.core.compiled import cached_jit
 from echelon.core.linear import sampled_radius
-from echelon.core.statement import Hypothesis, Statement
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.types import Array
-from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.laws.flat_loop import FlatLoop
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint, beginning_of
@@ -150,39 +150,24 @@ def _flat(
 
 def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     """Yield the conditions of T5 beside the tube."""
-    n = len(run.parts.model.state_names)
-    text = "of the flat outputs they are; those of other states are none"
-    broken = _moves_others(run)
-    remedy, reason = "", ""
-    if broken:
-        text, remedy = (
-            f"the offset of `{broken}` is none of a flat output",
-            "offset flat outputs only",
-        )
-        reason = "an offset is no symmetry of the law"
-    verdict = Verdict.of(not broken)
-    yield Statement(Hypothesis.SYMMETRY, verdict, _PROOF, None, "", text, remedy, reason)
+    n, c = len(run.parts.model.state_names), run.coupling
+    yield _offsets_line(run)
     text = "in flat coordinates every agent is linear, with or without a trim"
-    yield Statement(Hypothesis.SMOOTH, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
     text = f"feedback makes chains of all {n} states and the integrators before inputs"
-    yield Statement(Hypothesis.DETECTABLE, Verdict.NOT_NEEDED, _PROOF, text=text)
-    yield Statement(
-        Hypothesis.MATCHED_MOTION, Verdict.HOLDS, _PROOF, text=f"{run.law.information[1]}"
-    )
-    c = run.coupling
-    shown = f"c {c:.4g}, edge 0"
-    yield Statement(Hypothesis.COUPLING, Verdict.HOLDS, _PROOF, c, shown, "any coupling will do")
+    yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
+    yield holds(Hypothesis.MATCHED_MOTION, _PROOF, run.law.information[1])
+    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling will do", c, f"c {c:.4g}, edge 0")
     text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
     if run.parts.graph.schedule is not None:
         text = "the slower of the slowest root and of what is left after a period, or in the end"
-    shown = f"{-run.rate:.3g} 1/s"
-    yield Statement(Hypothesis.DISAGREEMENT_DECAY, Verdict.HOLDS, _PROOF, -run.rate, shown, text)
+    yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
     text = "the law is linear in flat coordinates wherever it goes"
-    yield Statement(Hypothesis.ALONG_PATH, Verdict.NOT_NEEDED, _PROOF, text=text)
+    yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
         yield _switching_line(run)
-    yield Statement(Hypothesis.CLAIMS, Verdict.NOT_NEEDED, _PROOF, text="there is no gain")
+    yield unneeded(Hypothesis.CLAIMS, _PROOF, "there is no gain")
 
 
 def _switching_line(run: StoppingRun) -> Statement:
@@ -193,16 +178,21 @@ def _switching_line(run: StoppingRun) -> Statement:
     if schedule.period is not None:
         text = f"the leader reaches everybody along the edges of any {schedule.period:g} s together"
     text += ", and zeta' is told in spite of edges that are not there"
-    return Statement(Hypothesis.SWITCHING, Verdict.HOLDS, _PROOF, run.rate, "", text)
+    return holds(Hypothesis.SWITCHING, _PROOF, text, run.rate)
 
 
-def _moves_others(run: StoppingRun) -> str:
-    """Return the first state with an offset that is no flat output; empty without one."""
-    outputs, model = run.law.ready.chains.outputs, run.parts.model
-    for k in np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0)):
-        if model.state_names[k] not in outputs:
-            return model.state_names[k]
-    return ""
+def _offsets_line(run: StoppingRun) -> Statement:
+    """Say whether all offsets are of flat outputs."""
+    names = run.parts.model.state_names
+    offset = np.flatnonzero(np.ptp(run.parts.formation.offsets, axis=0))
+    others = (names[k] for k in offset if names[k] not in run.law.ready.chains.outputs)
+    broken = next(others, None)
+    if broken is None:
+        text = "of the flat outputs they are; those of other states are none"
+        return holds(Hypothesis.SYMMETRY, _PROOF, text)
+    text, remedy = f"the offset of `{broken}` is none of a flat output", "offset flat outputs only"
+    reason = "an offset is no symmetry of the law"
+    return fails(Hypothesis.SYMMETRY, _PROOF, text, remedy=remedy, reason=reason)
 
 
 def _step_line(run: StoppingRun) -> Statement:
@@ -216,10 +206,10 @@ def _step_line(run: StoppingRun) -> Statement:
         # Its distance from its path would grow, on which the tube and the motors rest.
         text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {led:.3g} is above 1"
         remedy = f"lower `leader.coupling` to {1.0 / dt:.4g}"
-        return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, led, shown, text, remedy, text)
+        return fails(name, Kind.LINEARIZATION, text, led, shown, remedy=remedy, reason=text)
     if share <= 1.0 + 1e-12 and radius < 1.0:
         text = f"Euler's step of zeta grows nowhere; spectral radius {radius:.4g} a step"
-        return Statement(name, Verdict.HOLDS, Kind.LINEARIZATION, share, shown, text)
+        return holds(name, Kind.LINEARIZATION, text, share, shown)
     text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
     remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
     remedy += f"`simulation.dt` to {1.0 / (c * run.law.reach.heaviest):.3g} s"
@@ -227,7 +217,7 @@ def _step_line(run: StoppingRun) -> Statement:
         text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
         text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
         remedy += "`simulation.dt`"
-    return Statement(name, Verdict.FAILS, Kind.LINEARIZATION, share, shown, text, remedy, text)
+    return fails(name, Kind.LINEARIZATION, text, share, shown, remedy=remedy, reason=text)
 
 
 def _radius(run: StoppingRun) -> float:
@@ -300,10 +290,8 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     text += f"leader's is {s:.3g}, and it can drift away for ever"
     helps = "" if inner and current >= s else "set `observer: true`, or "
     remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"
-    fails = Verdict.FAILS
-    return Statement(
-        Hypothesis.EXACT_STATES, fails, _PROOF, asked, f"{asked:.3g}", text, remedy, text
-    )
+    number = asked, f"{asked:.3g}"
+    return fails(Hypothesis.EXACT_STATES, _PROOF, text, *number, remedy=remedy, reason=text)
 
 
 @cached_jit

@@ -3,13 +3,13 @@
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from echelon.core.errors import GainError
-from echelon.core.statement import Hypothesis, Statement
-from echelon.core.words import Feedforward, Kind, Theorem, Verdict
+from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
+from echelon.core.words import Feedforward, Kind, Theorem
 from echelon.guarantees.stopping.arrival import Arrival, arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
@@ -111,9 +111,9 @@ def tube_of(run: StoppingRun, briefly: bool = False) -> _Found:
         text = str(error).rstrip(".")
         remedy = "choose `roots` of a larger common unit" if "unit" in text else "let them be alike"
         return _nothing(text, remedy)
-    shown = ", ".join(f"{gain:.4g}" for gain in gains)
-    text = "of what agreement asks, at most, in speed and its derivatives: no size of the formation"
-    inner = Statement(Hypothesis.REGION, Verdict.HOLDS, _PROOF, gains[-1], shown, f"T5: {text}")
+    text = "T5: of what agreement asks, at most, in speed and its derivatives: no size of the "
+    number = gains[-1], ", ".join(f"{gain:.4g}" for gain in gains)
+    inner = holds(Hypothesis.REGION, _PROOF, f"{text}formation", *number)
     if borders is None:
         name = f"`{type(model).__name__}`"
         text = f"{name} does not say where its flat coordinates end"
@@ -154,11 +154,9 @@ def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
     """Return that no tube is known, and why."""
     reason = f"{text}, so no tube is known"
     name = Hypothesis.SET if before else Hypothesis.REGION
-    lines = [Statement(name, Verdict.FAILS, _PROOF, None, "none", text, remedy, reason)]
-    rest = {Hypothesis.REGION, Hypothesis.SET, Hypothesis.STARTS} - {name}
-    rest -= {cast(Hypothesis, line.statement) for line in before}
-    text = "needs a tube"
-    lines += [Statement(each, Verdict.NOT_NEEDED, _PROOF, text=text) for each in rest]
+    lines = [fails(name, _PROOF, text, None, "none", remedy=remedy, reason=reason)]
+    others = (Hypothesis.SET, Hypothesis.STARTS) if not before else (Hypothesis.STARTS,)
+    lines += [unneeded(each, _PROOF, "needs a tube") for each in others]
     return _Found(None, (*before, *lines))
 
 
@@ -169,44 +167,45 @@ def _set_lines(run: StoppingRun, borders: Sequence[Border], kind: Kind) -> Itera
     """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
         text = "its flat coordinates have no border: any state is a start"
-        yield Statement(Hypothesis.SET, Verdict.HOLDS, kind, math.inf, "everywhere", text)
-        yield Statement(Hypothesis.STARTS, Verdict.HOLDS, kind, 0.0, "inside", _NO_BORDER)
+        yield holds(Hypothesis.SET, kind, text, math.inf, "everywhere")
+        yield holds(Hypothesis.STARTS, kind, _NO_BORDER, 0.0, "inside")
         return
     nearest = min(borders, key=lambda b: b.left)
     yield _room_line(run, nearest, kind)
     if not nearest.steepest > 0.0:
-        yield Statement(Hypothesis.STARTS, Verdict.NOT_NEEDED, kind, text="there is no set")
+        yield unneeded(Hypothesis.STARTS, kind, "there is no set")
         return
-    far, bound, remedy, reason = float(nearest.left), nearest.bound, "", ""
-    text = f"{nearest.what()} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
-    if not nearest.left > 0:
-        text = f"from these starts {nearest.what()} is not proved to stay above {bound.above:.4g}"
-        where, reason = nearest.outputs, text
-        remedy = f"start nearer to the leader's speed in {where}, start the leader on its path "
-        remedy += f"there, or lower `speed` of {where}, of the leader and the followers"
-    shown, holds = f"{far:.3g} left", Verdict.of(nearest.left > 0)
-    yield Statement(Hypothesis.STARTS, holds, kind, far, shown, text, remedy, reason)
+    far, bound, where = float(nearest.left), nearest.bound, nearest.outputs
+    number = far, f"{far:.3g} left"
+    if nearest.left > 0:
+        text = f"{nearest.what()} stays {far:.3g} above {bound.above:.4g}, with {bound.within}"
+        yield holds(Hypothesis.STARTS, kind, text, *number)
+        return
+    text = f"from these starts {nearest.what()} is not proved to stay above {bound.above:.4g}"
+    remedy = f"start nearer to the leader's speed in {where}, start the leader on its path there, "
+    remedy += f"or lower `speed` of {where}, of the leader and the followers"
+    yield fails(Hypothesis.STARTS, kind, text, *number, remedy=remedy, reason=text)
 
 
 def _room_line(run: StoppingRun, border: Border, kind: Kind) -> Statement:
     """Say how far starts may be off behind a leader that keeps to its path."""
-    bound, steepest, text = border.bound, border.steepest, ""
-    remedy, shown = "", f"{steepest:.3g} off"
+    bound, steepest = border.bound, border.steepest
+    number = steepest, f"{steepest:.3g} off"
+    if border.fastest > 0.0 and steepest > 0.0:
+        text = f"any place, with {bound.within}, and {border.speeds} so far off the leader's, "
+        text = f"{text}which keeps to its path in {border.outputs}"
+        return holds(Hypothesis.SET, kind, text, *number)
     if not border.fastest > 0.0:
         text = f"on the leader's path {border.what()} comes to {border.path:.3g}, and the chart "
         text, remedy = f"{text}ends at {bound.above:.3g}", "choose a path that keeps away from it"
-    elif not steepest > 0.0:
+    else:
         s = run.speed(run.law.ready.chains.outputs.index(bound.outputs[0]))
         text = f"at a `speed` of {s:.3g} agreement alone may take {border.what()} to "
         text = f"{text}{bound.above:.3g}, where the chart ends"
         # What one link may have of a speed against the leader.
         least = border.fastest / run.links
         remedy = f"lower the `speed` of {border.outputs} below {least:.3g}"
-    holds, reason = Verdict.of(steepest > 0.0), text
-    if not text:
-        text = f"any place, with {bound.within}, and {border.speeds} so far off the leader's, "
-        text = f"{text}which keeps to its path in {border.outputs}"
-    return Statement(Hypothesis.SET, holds, kind, steepest, shown, text, remedy, reason)
+    return fails(Hypothesis.SET, kind, text, *number, remedy=remedy, reason=text)
 
 
 def _who(run: StoppingRun, borders: Sequence[Border]) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.sweeps.axes import SEED
+from echelon.experiments.sweeps.numbers import NUMBERS, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
@@ -14,12 +15,6 @@ from echelon.output.plots.figure_files import save
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
-
-_NUMBERS = {
-    "formation_rmse": "formation RMSE",
-    "worst_final_error": "worst final error",
-    "worst_settling_time": "settling time",
-}
 
 
 def sweep_figures(data: "xr.Dataset") -> "dict[str, Figure]":
@@ -63,11 +58,11 @@ def _canvas(columns: int) -> "tuple[Figure, list[Any]]":
 
 def _distributions(data: "xr.Dataset") -> "Figure":
     """Return the shares of runs below each value, as lines."""
-    figure, axes = _canvas(len(_NUMBERS))
-    for ax, (name, text) in zip(axes, _NUMBERS.items(), strict=True):
+    figure, axes = _canvas(len(SUMMARIZED))
+    for ax, name in zip(axes, SUMMARIZED, strict=True):
         values = np.sort(data[name].values.ravel())
         values = values[np.isfinite(values)]
-        ax.set_xlabel(draw.label(text, data[name].attrs.get("units", "")))
+        ax.set_xlabel(draw.label(NUMBERS[name].label, data[name].attrs.get("units", "")))
         ax.set_ylim(0.0, 1.02)
         if not values.size:
             continue

@@ -9,6 +9,7 @@ from echelon.experiments.results.metrics import (
     LeaderMetrics,
     Metrics,
     metrics,
+    quantities,
     representatives,
     steady_error,
 )
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 # With more agents of a role the table shows the best, the median and the worst.
 _MANY = 12
+_COLUMNS = quantities(FollowerMetrics)
 
 
 def report(result: Result) -> str:
@@ -54,10 +56,12 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     from rich import box
     from rich.table import Table
 
-    unit = "" if result.unit == "state" else f", {result.unit}"
-    steady = f"steady{unit}\n(last {numbers.steady_window:.3g} s)"
-    settled = "within 1 cm\nfrom, s" if result.unit == "m" else "within 0.01\nfrom, s"
-    columns = ["agent", f"RMSE{unit}\n(all)", steady, settled, "effort", "saturated,\n% steps"]
+    texts = {
+        "unit": "" if result.unit == "state" else f", {result.unit}",
+        "window": numbers.steady_window,
+        "settled": "1 cm" if result.unit == "m" else "0.01",
+    }
+    columns = ["agent", *(quantity.label.format(**texts) for quantity in _COLUMNS.values())]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
     title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
@@ -88,8 +92,8 @@ def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:
     leaders, followers = numbers.leaders, numbers.followers
     # A single leader needs no number, as in the paper's table.
     names = ["leader"] if len(leaders) == 1 else None
-    rows = [_leader_row(label, row) for label, row in labelled("leader", leaders, names)]
-    rows += [_follower_row(label, row) for label, row in labelled("follower", followers)]
+    agents = [*labelled("leader", leaders, names), *labelled("follower", followers)]
+    rows = [[label, *(_cell(numbers, name) for name in _COLUMNS)] for label, numbers in agents]
     if printed:
         for k, row in enumerate(rows):
             row += [_number(PRINTED[method][k]) for method in ("consensus", "optimization")]
@@ -111,21 +115,17 @@ def labelled(
         yield (f"{kind}({name})" if kind else name), row
 
 
-def _leader_row(label: str, leader: LeaderMetrics) -> list[str]:
-    errors = [_number(leader.rmse), _number(leader.steady_rmse)]
-    return [label, *errors, "", "", _percent(leader.saturated)]
-
-
-def _follower_row(label: str, follower: FollowerMetrics) -> list[str]:
-    settled = "never" if follower.settling_time is None else f"{follower.settling_time:.4g}"
-    settled = "-" if follower.rmse is None else settled
-    errors = [_number(follower.rmse), _number(follower.steady_rmse)]
-    return [label, *errors, settled, _number(follower.effort), _percent(follower.saturated)]
+def _cell(agent: LeaderMetrics | FollowerMetrics, name: str) -> str:
+    """Return a cell of the table; empty if the agent's role has no such number."""
+    if name == "saturated":
+        return f"{100.0 * agent.saturated:.3g}"
+    if not hasattr(agent, name):
+        return ""
+    value: float | None = getattr(agent, name)
+    if name == "settling_time" and value is None and agent.rmse is not None:
+        return "never"
+    return _number(value)
 
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
-
-
-def _percent(value: float) -> str:
-    return f"{100.0 * value:.3g}"

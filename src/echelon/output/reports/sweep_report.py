@@ -7,6 +7,7 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.experiments.sweeps.axes import SEED
+from echelon.experiments.sweeps.numbers import NUMBERS, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
 
 if TYPE_CHECKING:
@@ -28,10 +29,7 @@ def sweep_mapping(data: "xr.Dataset") -> dict[str, Any]:
         "outcomes": {name: count for name, count in counts.items() if count},
         "settled": int(succeeded(data).sum()),
         "promised": int((data["promised"] == 1).sum()),
-        "quantiles": {
-            name: _quantiles(data[name].values)
-            for name in ("formation_rmse", "worst_final_error", "worst_settling_time")
-        },
+        "quantiles": {name: _quantiles(data[name].values) for name in SUMMARIZED},
     }
 
 
@@ -45,11 +43,11 @@ def sweep_report(data: "xr.Dataset") -> str:
     lines = [f"- {summary['runs']} runs: {outcomes}."]
     lines += [f"- Settled to 1 cm: {_share(summary['settled'], done)}."]
     lines += [f"- With a guarantee: {summary['promised']} of {summary['runs']}."]
-    units = {"worst_settling_time": " s"}
     for name, values in summary["quantiles"].items():
         if values is not None:
             low, median, high = (f"{value:.3g}" for value in values)
-            label, unit = name.replace("_", " ").capitalize(), units.get(name, "")
+            label = name.replace("_", " ").capitalize()
+            unit = " s" if NUMBERS[name].unit == "s" else ""
             lines.append(f"- {label}: median {median}{unit}; 5 to 95 %: {low} to {high}{unit}.")
     return "\n".join([*lines, *_warnings(data), *_cases(data)])
 

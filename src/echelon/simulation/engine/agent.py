@@ -17,7 +17,8 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.loop import Loop, act_alone, assemble
+from echelon.simulation.step.action import act
+from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
 
 
@@ -182,5 +183,5 @@ def _step(
     apart = loop.model.difference if states else jnp.subtract
     gaps = jax.vmap(lambda theirs: apart(signal, theirs))(heard.reshape(-1, len(signal)))
     view = LocalView(t, own.x, own.offset, weights @ gaps, sent, loop.motion.dt)
-    _, got, memory, told = act_alone(loop, law, view, own.memory, leads)
-    return got, memory, signal, told
+    action = act(loop, law, view, own.memory, leads)
+    return action.input, action.memory, signal, action.message

@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 
 import equinox as eqx
 import numpy as np
+from jaxtyping import Bool
 
 from echelon.core.errors import EchelonError, Outcome, SimulationError
 from echelon.core.numerics import precision
@@ -23,21 +24,21 @@ from echelon.simulation.engine.jax_stepper import JaxFormations
 from echelon.simulation.engine.law_drive import Laws, choose_engine, is_long, worth_native
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import Prepared, prepare
-from echelon.simulation.engine.record import Record, Recorder, Stretch, completed, inside_at_last
+from echelon.simulation.engine.record import Recorder
 from echelon.simulation.engine.result import Result
 from echelon.simulation.engine.simulate import result_of, sample_reference, simulate
 from echelon.simulation.native.kernel_cache import KERNELS
 from echelon.simulation.native.program_key import ProgramKeys
 from echelon.simulation.native.stepper import NativeStepper, beyond
 from echelon.simulation.native.threads import processors
-from echelon.simulation.step.drive import Chunk, Stepper
+from echelon.simulation.step.drive import Stepper
 from echelon.simulation.step.loop import Loop, assemble
-from echelon.simulation.step.meter import ALWAYS, Sums, on_host
 from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
 
 Run: TypeAlias = tuple[Parts, Settings]
-Told: TypeAlias = Callable[[int, int], None]
+StepCount: TypeAlias = Callable[[int, int], None]
+"""Called with the steps that were taken, and those of the run."""
 _SMALL = 64
 """Agents of a formation that is stepped beside others though they do not fill a vector."""
 
@@ -76,18 +77,20 @@ class Batch:
         self.kinds = ProgramKeys()
         self._cases: WeakKeyDictionary[Parts, dict[Settings, _SharedRun]] = WeakKeyDictionary()
 
-    def fly(self, runs: Sequence[Run], told: Told | None = None) -> Iterator[Result | EchelonError]:
+    def fly(
+        self, runs: Sequence[Run], progress: StepCount | None = None
+    ) -> Iterator[Result | EchelonError]:
         """Yield what each run comes to, in their order, as `simulate` would have it.
 
         Args:
             runs: parts and settings of each.
-            told: called several times a second; what it raises ends the flight.
+            progress: called several times a second; what it raises ends all runs.
         """
         found: dict[int, Result | EchelonError] = {}
         for jobs in self._families(runs):
-            found |= self._together(jobs, told)
+            found |= self._together(jobs, progress)
         for place, (parts, settings) in enumerate(runs):
-            yield found.pop(place) if place in found else _alone(parts, settings, told)
+            yield found.pop(place) if place in found else _run_alone(parts, settings, progress)
 
     # ---- what belongs together ----
 
@@ -120,10 +123,10 @@ class Batch:
                 known[alike] = _SharedRun(prepared, Starts(prepared.parts), loop, family)
         return known[alike]
 
-    # ---- flights ----
+    # ---- runs ----
 
     def _together(
-        self, jobs: list[_BatchJob], told: Told | None
+        self, jobs: list[_BatchJob], progress: StepCount | None
     ) -> dict[int, Result | EchelonError]:
         """Return what a family comes to; nothing where its runs cannot go together."""
         settings = jobs[0].prepared.problem.settings
@@ -138,115 +141,49 @@ class Batch:
                     lambda: NativeStepper(loops, states, bits, None, *pool),
                     lambda why: JaxFormations(loops, states, why),
                 )
-                record = _BatchRecord(
-                    len(jobs), ChunkGrid(settings, stepper.longest), jobs[0].prepared, bits
-                )
-                record.fly(stepper, told)
+                problems = [job.prepared.problem for job in jobs]
+                recorder = Recorder(problems, ChunkGrid(settings, stepper.longest))
+                far = _fly(stepper, jobs[0].prepared, recorder, progress)
             except (SimulationError, TypeError):
-                # A model that wants its numbers as numbers is traced for each of them.
+                # A model that needs its numbers as numbers is traced for each of them.
                 return {}
         seconds = (time.perf_counter() - began) / len(jobs)
-        made = record.results([job.prepared for job in jobs], stepper, seconds)
-        # Each by itself then goes on by JAX.
-        return {job.place: r for job, r, far in zip(jobs, made, record.far, strict=True) if not far}
+        engine, warnings = stepper.engine, stepper.warnings
+        return {
+            job.place: result_of(job.prepared, record._replace(seconds=seconds), engine, warnings)
+            for job, record, lost in zip(
+                jobs, recorder.close(Outcome.INTERRUPTED), far, strict=True
+            )
+            # Those beyond the kernels' range are run again by JAX, each by itself.
+            if not lost
+        }
 
 
-@final
-class _BatchRecord:
-    """What is kept of formations that fly together."""
-
-    def __init__(self, count: int, grid: ChunkGrid, first: Prepared, bits: int) -> None:
-        self.count, self.grid, self.first, self.bits = count, grid, first, bits
-        self.times, self._states = list[Array](), list[Array]()
-        self._inputs, self._references = list[Array](), list[Array]()
-        nothing = on_host(first.problem.meter.nothing(np))
-        self.sums = Sums(*(np.stack([part] * count) for part in nothing))
-        self.finite, self.far = np.ones(count, bool), np.zeros(count, bool)
-
-    def fly(self, stepper: Stepper, told: Told | None) -> None:
-        """Take all steps."""
-        now, done, frames = stepper.start(), 0, 0
-        self.native = stepper.engine == "native"
-        while frames < self.grid.frames:
-            reference = sample_reference(self.first, done, self.grid.longest + 1)
-            made = stepper.advance(now, self.grid.counts(done), reference)
-            frames += self._keep(made, reference, done)
-            now, done = made.now, done + int(made.sums.steps[0])
-            if told is not None:
-                told(done, self.grid.steps)
-
-    def _keep(self, made: Chunk, reference: Array | None, first: int) -> int:
-        """Keep a chunk; return how many of its frames were stored."""
-        counts = self.grid.counts(first)
-        points = first + np.cumsum(counts) - counts
-        frames, agents = len(made.states), made.states.shape[1] // self.count
-        x, u = (part.reshape(frames, self.count, agents, -1) for part in (made.states, made.inputs))
-        # The sums of one that was lost stay what they were when it was, as in a run of its own.
-        self.sums = _where(self.finite, self.sums.plus(_split(made.sums, self.count)), self.sums)
-        finite = np.isfinite(x).all(axis=(2, 3)) & np.isfinite(u).all(axis=(2, 3))
-        stored = self.grid.stored(points)
-        # Frames between those that are stored tell of a loss too, and of states too large.
-        self.finite &= finite.all(axis=0)
-        if self.native:
-            self.far |= beyond(x, self.bits).any(axis=(0, 2, 3))
-        self.times.append(self.first.problem.settings.dt * points[stored])
-        self._states.append(x[stored])
-        self._inputs.append(u[stored])
-        if reference is not None:
-            self._references.append(reference[points - first][stored])
-        return int(stored.sum())
-
-    def results(
-        self, prepared: Sequence[Prepared], stepper: Stepper, seconds: float
-    ) -> Iterator[Result]:
-        """Yield the runs, each of which took so many seconds."""
-        states, inputs = (
-            np.ascontiguousarray(np.concatenate(parts).swapaxes(0, 1))
-            for parts in (self._states, self._inputs)
-        )
-        usual = self._usual(states, inputs)
-        reference = np.concatenate(self._references) if self._references else None
-        engine, warnings, times = stepper.engine, stepper.warnings, np.concatenate(self.times)
-        for k, (each, parts) in enumerate(zip(prepared, zip(*self.sums, strict=True), strict=True)):
-            frames, sums = (times, states[k], inputs[k], reference), Sums._make(parts)
-            whole = Stretch(0, self.grid.steps, *frames, sums, (), None, seconds)
-            record = completed(whole) if usual[k] else self._closed(each, whole)
-            yield result_of(each, record, engine, warnings)
-
-    def _closed(self, prepared: Prepared, whole: Stretch) -> Record:
-        recorder = Recorder(prepared.problem, self.grid, whole.sums, [whole])
-        return recorder.close(Outcome.INTERRUPTED)
-
-    def _usual(self, states: Array, inputs: Array) -> Array:
-        """Return which runs (K,) end as most do: finite and in their chart."""
-        meter = self.first.problem.meter
-        inside = inside_at_last(meter, self.sums.inside, states[:, -1], self.grid.steps)
-        finite = [np.isfinite(part).all(axis=(1, 2, 3)) for part in (states, inputs)]
-        return np.all([*finite, (inside >= ALWAYS).all(axis=(1, 2))], axis=0)
+def _fly(
+    stepper: Stepper, first: Prepared, recorder: Recorder, progress: StepCount | None
+) -> Bool[np.ndarray, " F"]:
+    """Take all steps; return which formations went beyond what native code computes."""
+    now, far = stepper.start(), np.zeros(len(recorder.problems), bool)
+    bits = int(first.problem.settings.precision[5:])
+    while not recorder.ended:
+        done, grid = recorder.done, recorder.grid
+        reference = sample_reference(first, done, grid.longest + 1)
+        chunk = stepper.advance(now, grid.counts(done), reference)
+        recorder.keep(chunk, reference, 0.0)
+        if stepper.engine == "native":
+            apart = chunk.states.reshape(len(chunk.states), len(far), -1)
+            far |= beyond(apart, bits).any(axis=(0, 2))
+        now = chunk.now
+        if progress is not None:
+            progress(recorder.done, grid.steps)
+    return far
 
 
-def _split(sums: Sums, count: int) -> Sums:
-    """Return the sums of formations that follow each other, each of a formation a row."""
-    twice = {
-        name: getattr(sums, name).reshape(2, count, -1).transpose(1, 0, 2)
-        for name in ("errors", "tracking")
-    }
-    each = {
-        name: part.reshape(count, len(part) // count, *part.shape[1:])
-        for name, part in sums._asdict().items()
-        if name not in ("steps", *twice)
-    }
-    return Sums(steps=np.stack([sums.steps] * count), **twice, **each)
-
-
-def _where(which: Array, new: Sums, old: Sums) -> Sums:
-    shaped = (which.reshape(-1, *[1] * (np.ndim(part) - 1)) for part in new)
-    return Sums(*(np.where(w, a, b) for w, a, b in zip(shaped, new, old, strict=True)))
-
-
-def _alone(parts: Parts, settings: Settings, told: Told | None) -> Result | EchelonError:
+def _run_alone(
+    parts: Parts, settings: Settings, progress: StepCount | None
+) -> Result | EchelonError:
     try:
-        return simulate(parts, settings, told and (lambda run: told(run.done, run.steps)))
+        return simulate(parts, settings, progress and (lambda run: progress(run.done, run.steps)))
     except EchelonError as error:
         return error
 

@@ -13,8 +13,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError
 from echelon.core.types import Array
-from echelon.simulation.step.loop import Loop, Moment, advance
+from echelon.simulation.step.loop import Loop, Moment
 from echelon.simulation.step.meter import Sums
+from echelon.simulation.step.sequence import advance
 
 
 def mesh_of(devices: int, agents: int) -> Mesh:
@@ -44,7 +45,12 @@ def mesh_of(devices: int, agents: int) -> Mesh:
 
 @cached_jit
 def advance_parted(
-    mesh: Mesh, loop: Loop, now: Moment, counts: jax.Array, reference: Array | None
+    mesh: Mesh,
+    loop: Loop,
+    now: Moment,
+    counts: jax.Array,
+    reference: Array | None,
+    first: jax.Array,
 ) -> tuple[Moment, tuple[Any, Any], Sums]:
     """Do what `advance` does, the agents parted among the devices of a mesh."""
     agents = len(loop.offsets)
@@ -55,7 +61,7 @@ def advance_parted(
         mine = leaf.ndim > 0 and len(leaf) == agents
         return _place(leaf, mesh, PartitionSpec("agents") if mine else PartitionSpec())
 
-    done = advance(loop, jax.tree.map(part, now), counts, reference)
+    done = advance(loop, jax.tree.map(part, now), counts, reference, first)
     return jax.tree.map(lambda leaf: _place(leaf, mesh, PartitionSpec()), done)
 
 

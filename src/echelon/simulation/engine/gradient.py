@@ -24,8 +24,9 @@ from echelon.simulation.native.backward import Backward, Wants
 from echelon.simulation.native.varying import VaryingNumbers, alike, bare
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.drive import Drive, Problem
-from echelon.simulation.step.loop import Loop, Moment, assemble, begin, control, step
-from echelon.simulation.step.meter import Sums, distance_of, reference_at
+from echelon.simulation.step.loop import Loop, Moment, assemble
+from echelon.simulation.step.meter import Sums, distance_of
+from echelon.simulation.step.sequence import begin, measured_step
 from echelon.simulation.step.settings import Settings
 
 Cost: TypeAlias = Callable[[Sums], jax.Array]
@@ -370,14 +371,8 @@ def _sums(loop: Loop, states: jax.Array, reference: Array | None, steps: int) ->
     """Return the sums over the steps of a run."""
 
     def one(done: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:
-        now, sums = done
-        acted = control(loop, now)
-        wanted = reference_at(reference, now.step, now.states)
-        # What is counted has no slope, and needs no look at who went from limit to limit.
-        read = loop.meter.read(
-            now.step, now.states, acted.inputs, acted.limited, jnp.zeros_like(acted.limited), wanted
-        )
-        return (step(loop, now, acted), sums.plus(read)), None
+        now, sums = measured_step(loop, done[0], reference, 0)
+        return (now, done[1].plus(sums)), None
 
     @jax.checkpoint
     def several(done: tuple[Moment, Sums], _: None) -> tuple[tuple[Moment, Sums], None]:

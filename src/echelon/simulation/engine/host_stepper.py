@@ -1,30 +1,51 @@
-"""Agents whose inputs come from the host: a pilot gives them every few steps, the plant moves."""
+"""Agents whose inputs come from the host: a pilot gives them every few steps, and they are held."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias, final
+from typing import TypeAlias, final
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.compiled import cached_jit
+from echelon.agents.models.model import ControlAffine
 from echelon.core.errors import SimulationError
-from echelon.core.types import Array, Inputs, States
+from echelon.core.types import Array, Input
+from echelon.laws.law import Law, LocalView
 from echelon.simulation.step.drive import Chunk, Problem, Stepper, Stopped
-from echelon.simulation.step.meter import Meter, Sums, on_host, reference_at
-from echelon.simulation.step.motion import Motion
+from echelon.simulation.step.loop import Moment, assemble
+from echelon.simulation.step.meter import Sums, on_host
+from echelon.simulation.step.sequence import advance, begin
 from echelon.simulation.step.solver_stats import SolverStats
 
 Pilot: TypeAlias = Callable[[int, Array], Array]
-"""(step, states (N, n)) -> wanted physical inputs (N, m) from that step on."""
+"""(step, states (N, n)) -> desired physical inputs (N, m) from that step on."""
 
 _PLANS = 64
 """Plans of one agent each in a chunk: a solver takes some 20 ms for one."""
 
 
 @final
+class HeldInput(Law):
+    """u = the input (m,) in the agent's memory, where a pilot puts it.
+
+    Args:
+        size: m.
+    """
+
+    size: int = eqx.field(static=True)
+
+    def init(self) -> Input:
+        """Return no input, before the pilot gives one."""
+        return jnp.zeros(self.size)
+
+    def update(self, model: ControlAffine, view: LocalView, memory: Input) -> tuple[Input, Input]:
+        """Return the input that is held."""
+        return memory, memory
+
+
+@final
 class HostStepper(Stepper):
-    """The plant under the inputs of a pilot, which gives them every `hold` steps.
+    """The closed loop under the inputs of a pilot, which gives them every `hold` steps.
 
     Args:
         problem: the agents and how they move.
@@ -40,8 +61,11 @@ class HostStepper(Stepper):
         hold: int,
         work: Callable[[], SolverStats],
     ) -> None:
-        """Keep what never changes."""
-        self.problem, self.pilot, self.hold, self._work = problem, pilot, hold, work
+        """Assemble the loop."""
+        law = HeldInput(len(problem.model.input_names))
+        self.loop, self.states = assemble(problem, law, law), problem.states
+        self.pilot, self.hold, self._work = pilot, hold, work
+        self._queried = -1
 
     @property
     def work(self) -> SolverStats:
@@ -51,9 +75,9 @@ class HostStepper(Stepper):
     @property
     def longest(self) -> int:
         """Steps in which a few dozen plans are made."""
-        return self.hold * max(1, _PLANS // len(self.problem.states))
+        return self.hold * max(1, _PLANS // len(self.states))
 
-    def recall(self, leaves: Sequence[Array]) -> "_Held":
+    def recall(self, leaves: Sequence[Array]) -> Moment:
         """Refuse: what a pilot has planned is no part of the moment.
 
         Raises:
@@ -61,125 +85,86 @@ class HostStepper(Stepper):
         """
         raise SimulationError("a run whose inputs are planned cannot go on from what was kept.")
 
-    def start(self) -> "_Held":
+    def start(self) -> Moment:
         """Return the moment at which the run begins, before the pilot gives any input."""
-        x = jnp.asarray(self.problem.states)
-        still = jnp.zeros((len(x), len(self.problem.model.input_names)), x.dtype)
-        return _Held(0, x, still, jnp.zeros(len(x), bool))
+        self._queried = -1
+        return begin(self.loop, self.states)
 
-    def advance(self, now: "_Held", counts: Array, reference: Array | None) -> Chunk:
+    def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps, until a pilot stops or a state is not finite."""
-        made = _Made(self.problem.meter.nothing(), now.step, reference)
+        chunk = _HeldChunk(now, self.loop.meter.nothing(), reference)
         try:
             for count in counts:
-                now = self._frame(now, int(count), made)
-                if not np.isfinite(made.states[-1]).all():
+                self._frame(chunk, int(count))
+                if not np.isfinite(chunk.states[-1]).all():
                     break
         except Stopped as reason:
-            made.stopped = f"The run was stopped, since {reason}"
+            return chunk.close(f"The run was stopped, since {reason}")
         except KeyboardInterrupt:
-            made.stopped = "The run was interrupted"
-        return made.chunk(now)
+            return chunk.close("The run was interrupted")
+        return chunk.close(None)
 
-    def _frame(self, now: "_Held", count: int, made: "_Made") -> "_Held":
+    def _frame(self, chunk: "_HeldChunk", count: int) -> None:
         """Store a frame and take `count` steps; query the pilot wherever a hold begins."""
-        end = now.step + count
+        end = chunk.step + count
         try:
             # The last frame has no steps after it, and so no plan of its own.
-            now = self._query_pilot(now) if count else now
+            if count:
+                self._query_pilot(chunk)
         finally:
             # Where the pilot stops right here, the frame is kept with the inputs that led to it.
-            if now.step or now.fresh:
-                made.store(now)
-        while now.step < end:
-            now = self._query_pilot(now)
+            if chunk.step or self._queried == 0:
+                self._take(chunk, 0, store=True)
+        while chunk.step < end:
+            self._query_pilot(chunk)
             # To the next frame or the next plan, whichever comes first.
-            steps = min(end, (now.step // self.hold + 1) * self.hold) - now.step
-            states, sums = self._hold(now, steps, made)
-            made.sums = made.sums.plus(sums)
-            now = now._replace(step=now.step + steps, states=states, fresh=False)
+            self._take(chunk, min(end, (chunk.step // self.hold + 1) * self.hold) - chunk.step)
             # No solver is given a state that is not finite: it would fail, and count as a failure.
-            if not np.isfinite(np.asarray(states)).all():
-                return now
-        return now
+            if not np.isfinite(np.asarray(chunk.now.states)).all():
+                return
 
-    def _hold(self, now: "_Held", steps: int, made: "_Made") -> tuple[States, Sums]:
-        """Return the states after `steps` steps under held inputs, and the sums over them."""
-        # As one array, so that another step or length compiles nothing again.
-        span = np.array([now.step, made.first, steps], np.int32)
-        problem, reference = self.problem, made.reference
-        return _hold_inputs(problem.motion, problem.meter, now[1:4], jnp.asarray(span), reference)
-
-    def _query_pilot(self, now: "_Held") -> "_Held":
-        """Return the moment with the pilot's inputs, where a hold begins and they are not new."""
-        if now.fresh or now.step % self.hold:
-            return now
+    def _query_pilot(self, chunk: "_HeldChunk") -> None:
+        """Put the pilot's inputs into the agents' memories where a hold begins, once."""
+        if chunk.step % self.hold or chunk.step == self._queried:
+            return
         # Solvers work in float64, and so are the states that they start from.
-        wanted = jnp.asarray(self.pilot(now.step, np.asarray(now.states, np.float64)))
-        inputs = self.problem.motion.deliver(wanted.astype(now.states.dtype))
-        # To the bit, as `limit` returns what fits.
-        limited = jnp.any(inputs != wanted, axis=1)
-        return now._replace(inputs=inputs, limited=limited, fresh=True)
+        states = chunk.now.states
+        desired = jnp.asarray(self.pilot(chunk.step, np.asarray(states, np.float64)))
+        desired = desired.astype(states.dtype)
+        self._queried = chunk.step
+        chunk.now = chunk.now._replace(
+            leader_memory=desired[self.loop.leaders], follower_memory=desired[self.loop.followers]
+        )
 
-
-class _Held(NamedTuple):
-    """A moment: the step, the states (N, n), the inputs (N, m) that are held and who is limited.
-
-    `fresh` says that the pilot gave them at this very step.
-    """
-
-    step: int
-    states: States
-    inputs: Inputs
-    limited: jax.Array
-    fresh: bool = False
+    def _take(self, chunk: "_HeldChunk", count: int, store: bool = False) -> None:
+        """Take steps, or store a frame."""
+        # As an array, so that another count compiles nothing again.
+        counts = np.array([count], np.int32)
+        chunk.now, frames, sums = advance(
+            self.loop, chunk.now, counts, chunk.reference, chunk.first
+        )
+        chunk.step += count
+        chunk.sums = chunk.sums.plus(sums)
+        if store:
+            for stored, frame in zip((chunk.states, chunk.inputs), frames, strict=True):
+                stored.append(np.asarray(frame[0], np.float64))
 
 
 @final
-class _Made:
-    """The frames and sums of a chunk while it is flown."""
+class _HeldChunk:
+    """The frames and sums of a chunk while it is computed."""
 
-    def __init__(self, sums: Sums, first: int, reference: Array | None) -> None:
+    def __init__(self, now: Moment, sums: Sums, reference: Array | None) -> None:
+        self.now, self.step, self.first = now, int(now.step), now.step
+        self.sums, self.reference = sums, reference
         self.states: list[Array] = []
         self.inputs: list[Array] = []
-        self.sums, self.first, self.reference = sums, first, reference
-        self.stopped: str | None = None
 
-    def store(self, now: _Held) -> None:
-        """Store a frame."""
-        self.states.append(np.asarray(now.states, np.float64))
-        self.inputs.append(np.asarray(now.inputs, np.float64))
-
-    def chunk(self, now: _Held) -> Chunk:
-        """Return what was made."""
-        shape = np.shape(now.states), np.shape(now.inputs)
+    def close(self, stopped: str | None) -> Chunk:
+        """Return what was computed, and why it ended early."""
+        shapes = self.now.states.shape, self.now.cut.shape
         states, inputs = (
-            np.array(rows).reshape(len(rows), *each)
-            for rows, each in zip((self.states, self.inputs), shape, strict=True)
+            np.array(rows).reshape(len(rows), *shape)
+            for rows, shape in zip((self.states, self.inputs), shapes, strict=True)
         )
-        return Chunk(now, states, inputs, on_host(self.sums), self.stopped)
-
-
-@cached_jit
-def _hold_inputs(
-    motion: Motion,
-    meter: Meter,
-    held: tuple[States, Inputs, jax.Array],
-    span: jax.Array,
-    reference: Array | None,
-) -> tuple[States, Sums]:
-    """Return the states after some steps under held inputs, and the sums over them.
-
-    `held` are states, inputs and who is limited; `span` (3,) is the step, the first step that the
-    reference speaks of, and the number of steps.
-    """
-    states, inputs, limited = held
-
-    def one(step: jax.Array, done: tuple[States, Sums]) -> tuple[States, Sums]:
-        x, sums = done
-        wanted = reference_at(reference, step - span[1], x)
-        # An input that is held does not alternate.
-        read = meter.read(step, x, inputs, limited, jnp.zeros_like(limited), wanted)
-        return motion.advance(x, inputs, step), sums.plus(read)
-
-    return jax.lax.fori_loop(span[0], span[0] + span[2], one, (states, meter.nothing()))
+        return Chunk(self.now, states, inputs, on_host(self.sums).split(1), stopped)

@@ -14,8 +14,9 @@ from echelon.core.types import Array
 from echelon.simulation.engine.devices import advance_parted, mesh_of
 from echelon.simulation.native.varying import is_number
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, advance, begin
-from echelon.simulation.step.meter import Sums, on_host
+from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.meter import on_host
+from echelon.simulation.step.sequence import advance, begin
 
 _AGENT_STEPS, _FEWEST = 100_000, 4
 """Steps of one agent each in a chunk, and the fewest of all agents.
@@ -67,6 +68,15 @@ class JaxStepper(Stepper):
         """Steps that take some tenths of a second, or a few of very many agents."""
         return _longest(len(self.states))
 
+    @property
+    def largest(self) -> float:
+        """The magnitude of states beyond which nothing is computed: none."""
+        return np.inf
+
+    def turn(self, loop: Loop) -> None:
+        """Continue in a loop that is like the one before but for its numbers."""
+        self.loop = loop
+
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
         return begin(self.loop, self.states)
@@ -74,8 +84,9 @@ class JaxStepper(Stepper):
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; what happens on the way is seen afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
-        now, (states, inputs), sums = step(self.loop, now, counts, reference)
-        return Chunk(now, *on_host((states, inputs, sums)))
+        now, (states, inputs), sums = step(self.loop, now, counts, reference, now.step)
+        states, inputs, sums = on_host((states, inputs, sums))
+        return Chunk(now, states, inputs, sums.split(1))
 
 
 # ---- many formations -----------------------------------------------------------------------------
@@ -113,24 +124,13 @@ class JaxFormations(Stepper):
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         """Store frames and take steps; formations follow each other in what is returned."""
-        made = _advance_all(self.loop, self.axes, now, counts, reference)
-        (x, u), sums = on_host(made[1:])
-        # As if it were one swarm: the formations stand along the second axis, or the first.
-        twice = {name: _merged(getattr(sums, name), 1) for name in ("errors", "tracking")}
-        rest = {k: _merged(v, 0) for k, v in sums._asdict().items() if k not in twice}
-        rest["steps"] = sums.steps
-        return Chunk(made[0], _merged(x, 1), _merged(u, 1), Sums(**rest, **twice))
+        now, frames, sums = _advance_all(self.loop, self.axes, now, counts, reference)
+        states, inputs = (part.reshape(len(part), -1, part.shape[3]) for part in on_host(frames))
+        return Chunk(now, states, inputs, on_host(sums))
 
 
-def _merged(array: Array, axis: int) -> Array:
-    """Return an array with an axis and the next one as one."""
-    head, tail = array.shape[:axis], array.shape[axis + 2 :]
-    return array.reshape(*head, int(np.prod(array.shape[axis : axis + 2])), *tail)
-
-
-_ALL = Moment(None, 0, 0, 0, 0)  # type: ignore[arg-type]
+_ALL = Moment(None, 0, 0, 0, 0, WorldState(0, 0))  # type: ignore[arg-type]
 """All are at the same step."""
-_SUMS: Any = Sums(*[0] * len(Sums._fields))._replace(steps=None, errors=1, tracking=1)
 
 
 @cached_jit
@@ -140,9 +140,9 @@ def _begin_all(loop: Loop, axes: Any, states: jax.Array) -> Moment:
 
 @cached_jit
 def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, wanted: Any) -> Any:
-    each = (axes, _ALL, None, None)
-    return eqx.filter_vmap(advance, in_axes=each, out_axes=(_ALL, 1, _SUMS))(
-        loop, now, counts, wanted
+    each = (axes, _ALL, None, None, None)
+    return eqx.filter_vmap(advance, in_axes=each, out_axes=(_ALL, 1, 0))(
+        loop, now, counts, wanted, now.step
     )
 
 

@@ -55,6 +55,7 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
             Meter.of(model, graph, formation, settings),
             settings,
             initial_states(parts, settings.seed),
+            parts.world.channel,
         )
         parts.drive.accept(problem)
         warnings += parts.drive.warnings(model, graph, settings)

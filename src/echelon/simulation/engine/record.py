@@ -1,15 +1,16 @@
 """What is kept of a run while it goes on, and how it ended."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, final
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from echelon.core.errors import Outcome
 from echelon.core.types import Array
 from echelon.simulation.engine.grid import ChunkGrid
 from echelon.simulation.step.drive import Chunk, Problem, numbers
-from echelon.simulation.step.meter import ALWAYS, Meter, Sums, outside
+from echelon.simulation.step.meter import ALWAYS, Meter, Sums, on_host, outside
 
 _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outside"}
 
@@ -46,6 +47,19 @@ class Stretch(NamedTuple):
         """Whether every number of its frames is."""
         return bool(np.isfinite(self.states).all() and np.isfinite(self.inputs).all())
 
+    def rows(self, rows: Array | slice) -> "Stretch":
+        """Return some of its frames."""
+        reference = None if self.reference is None else self.reference[rows]
+        states, inputs = self.states[rows], self.inputs[rows]
+        return self._replace(
+            times=self.times[rows], states=states, inputs=inputs, reference=reference
+        )
+
+    def record(self, outcome: Outcome, message: str) -> "Record":
+        """Return it as the record of a run that ended so."""
+        frames = self.times, self.states, self.inputs, self.reference
+        return Record(*frames, self.sums, outcome, message, self.seconds)
+
 
 class Record(NamedTuple):
     """The stored frames that are finite, the sums over the steps, and how the run ended.
@@ -73,15 +87,24 @@ class Record(NamedTuple):
 
 @final
 class Recorder:
-    """Collects the stretches of a run, after those that were computed before."""
+    """Collects the stretches of a run, or of many formations that are stepped together.
+
+    Args:
+        problems: of each formation; they differ in numbers alone.
+        grid: how the run is cut into chunks.
+        before: the stretches of one formation that were computed before.
+    """
 
     def __init__(
-        self, problem: Problem, grid: ChunkGrid, nothing: Sums, before: Sequence[Stretch] = ()
+        self, problems: Sequence[Problem], grid: ChunkGrid, before: Sequence[Stretch] = ()
     ) -> None:
-        """Begin; `nothing` are the sums of no step."""
-        self.problem, self.grid, self.stretches = problem, grid, list(before)
-        self.sums = before[-1].sums if before else nothing
+        """Begin after the stretches that were computed before."""
+        self.problems, self.grid, self.stretches = problems, grid, list(before)
+        nothing = on_host(problems[0].meter.nothing(np))
+        sums = [each.sums for each in before[-1:]] or [nothing] * len(problems)
+        self.sums = Sums(*map(np.stack, zip(*sums, strict=True)))
         self.frames = sum(len(each.times) for each in before)
+        self._finite = np.full(len(problems), all(each.finite for each in before))
 
     @property
     def done(self) -> int:
@@ -96,110 +119,137 @@ class Recorder:
     @property
     def ended(self) -> bool:
         """Whether no further step is to be taken."""
-        last = self.stretches[-1] if self.stretches else None
-        return self.complete or not (last is None or last.stopped is None and last.finite)
+        stopped = bool(self.stretches) and self.stretches[-1].stopped is not None
+        return self.complete or stopped or not self._finite.any()
 
-    def keep(self, chunk: Chunk, reference: Array | None, seconds: float) -> Stretch:
-        """Keep and return the stretch of a chunk that followed a reference (S, n) step by step."""
+    def keep(self, chunk: Chunk, reference: Array | None, seconds: float) -> None:
+        """Keep the stretch of a chunk that followed a reference (S, n) step by step."""
         first, counts = self.done, self.grid.counts(self.done)
         # One that stopped has fewer points.
         points = (first + np.cumsum(counts) - counts)[: len(chunk.states)]
-        # One that is not finite is kept wherever it stands: it says when the run was lost.
-        stored = self.grid.stored(points) | ~_finite(chunk.states, chunk.inputs).all(axis=1)
-        self.sums = self.sums.plus(chunk.sums)
-        self.frames += int(stored.sum())
+        frames = self.grid.stored(points)
+        parts = map(self._by_formation, (chunk.states, chunk.inputs))
+        finite = np.all([np.isfinite(part).all(axis=(2, 3)) for part in parts], axis=0)
+        # Where a formation is lost is kept wherever it stands: it says when that was.
+        stored = frames | (~finite & self._finite).any(axis=1)
+        sums = self.sums.plus(chunk.sums)
+        # The sums of a formation that was lost stay what they were when it was.
+        self.sums = sums if self._finite.all() else sums.where(self._finite, self.sums)
+        self._finite &= finite.all(axis=0)
+        self.frames += int(frames.sum())
+        alone = len(self.problems) == 1
         if self.stretches:
             # Only the last one's are ever asked for, and many would fill the memory.
             self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
         self.stretches.append(
             Stretch(
                 first,
-                first + int(chunk.sums.steps[0]),
-                self.problem.settings.dt * points[stored],
+                first + int(chunk.sums.steps[0, 0]),
+                self.problems[0].settings.dt * points[stored],
                 chunk.states[stored],
                 chunk.inputs[stored],
                 None if reference is None else reference[points - first][stored],
-                self.sums,
-                numbers(chunk.now),
+                self.sums.of(0) if alone else self.sums,
+                numbers(chunk.now) if alone else (),
                 chunk.stopped,
                 seconds,
             )
         )
-        return self.stretches[-1]
 
     def stop(self, reason: str) -> None:
         """Note why the run goes no further."""
         self.stretches[-1] = self.stretches[-1]._replace(stopped=reason)
 
-    def close(self, unfinished: Outcome) -> Record:
-        """Return the record, cut at the first frame that is not finite.
+    def close(self, unfinished: Outcome) -> Iterator[Record]:
+        """Yield the record of each formation, cut at its first frame that is not finite.
 
         `unfinished` is how a run ended that neither reached its horizon nor was lost.
         """
         whole = join(self.stretches) or self._nothing()
-        lost = np.zeros((0, 2), int)
-        if not whole.finite:
-            lost = np.argwhere(~_finite(whole.states, whole.inputs))
-        # In the order of frames, then agents: the first row is the first to be lost.
-        cut = slice(int(lost[0, 0]) if len(lost) else None)
-        return Record(
-            whole.times[cut],
-            whole.states[cut],
-            whole.inputs[cut],
-            None if whole.reference is None else whole.reference[cut],
-            self.sums,
-            *self._verdict(whole, lost, unfinished),
-            whole.seconds,
+        states, inputs = (
+            np.ascontiguousarray(self._by_formation(part).swapaxes(0, 1))
+            for part in (whole.states, whole.inputs)
         )
+        usual = self._usual(whole, states)
+        steps = np.rint(whole.times / self.problems[0].settings.dt).astype(int)
+        # Other points are there where a formation was lost between two frames.
+        frames = self.grid.stored(steps)
+        for k, problem in enumerate(self.problems):
+            mine = whole._replace(states=states[k], inputs=inputs[k], sums=self.sums.of(k))
+            rows = frames if self._finite[k] else frames | ~_finite(mine).all(axis=1)
+            mine = mine if rows.all() else mine.rows(rows)
+            if usual[k]:
+                yield mine.record(Outcome.COMPLETED, Outcome.COMPLETED.value)
+            else:
+                yield self._closed(problem, mine, unfinished)
+
+    def _by_formation(self, rows: Float[np.ndarray, "T FN k"]) -> Float[np.ndarray, "T F N k"]:
+        """Return rows of agents that follow each other, with an axis of formations."""
+        count = len(self.problems)
+        return rows.reshape(len(rows), count, rows.shape[1] // count, rows.shape[2])
+
+    def _usual(
+        self, whole: Stretch, states: Float[np.ndarray, "F T N n"]
+    ) -> Bool[np.ndarray, " F"]:
+        """Return which formations reached the horizon, finite and in their chart."""
+        if not self.complete or whole.stopped is not None:
+            return np.zeros(len(self.problems), bool)
+        meter, steps = self.problems[0].meter, self.grid.steps
+        inside = inside_at_last(meter, self.sums.inside, states[:, -1], steps)
+        return self._finite & (inside >= ALWAYS).all(axis=(1, 2))
 
     def _nothing(self) -> Stretch:
         """Return a stretch without a frame, its arrays of the right shape all the same."""
-        agents, m = self.problem.graph.agents, len(self.problem.model.input_names)
-        states, inputs = np.zeros((0, *self.problem.states.shape)), np.zeros((0, agents, m))
-        return Stretch(0, 0, np.zeros(0), states, inputs, None, self.sums, (), None, 0.0)
+        states = np.concatenate([problem.states for problem in self.problems])
+        m = len(self.problems[0].model.input_names)
+        empty = np.zeros((0, *states.shape)), np.zeros((0, len(states), m))
+        return Stretch(0, 0, np.zeros(0), *empty, None, self.sums, (), None, 0.0)
 
-    def _completed(self, whole: Stretch) -> tuple[Outcome, str]:
+    def _closed(self, problem: Problem, whole: Stretch, unfinished: Outcome) -> Record:
+        """Return the record of a formation, cut at its first frame that is not finite."""
+        # In the order of frames, then agents: the first row is the first to be lost.
+        lost = np.argwhere(~_finite(whole))
+        outcome, message = self._verdict(problem, whole, lost, unfinished)
+        rows = slice(int(lost[0, 0]) if len(lost) else None)
+        return whole.rows(rows).record(outcome, message)
+
+    def _verdict(
+        self, problem: Problem, whole: Stretch, lost: Array, unfinished: Outcome
+    ) -> tuple[Outcome, str]:
+        """Return how a run ended; `lost` are the frames and agents that are not finite."""
+        if len(lost):
+            frame, agent = lost[0]
+            role, when = _role(problem, agent).lower(), f"by t = {whole.times[frame]:.6g} s"
+            return Outcome.DIVERGED, f"The state of {role} {agent} stopped being finite {when}."
+        if whole.stopped is None and self.complete:
+            return self._completed(problem, whole)
+        reached = float(whole.times[-1]) if len(whole.times) else 0.0
+        # One that stopped did so between two frames; the steps themselves were counted.
+        if whole.stopped:
+            reached = whole.done * problem.settings.dt
+        said = whole.stopped or f"The run was {_VERBS[unfinished]}"
+        return unfinished, f"{said} at t = {reached:.6g} s; what was computed is kept."
+
+    def _completed(self, problem: Problem, whole: Stretch) -> tuple[Outcome, str]:
         """Return how a run ended that reached its horizon: whether all stayed in their chart."""
-        last, meter = whole.states[-1], self.problem.meter
-        inside = inside_at_last(meter, self.sums.inside, last, self.grid.steps)
+        last, meter, model = whole.states[-1], problem.meter, problem.model
+        inside = inside_at_last(meter, whole.sums.inside, last, self.grid.steps)
         if not inside.size or inside.min() >= ALWAYS:
             return Outcome.COMPLETED, Outcome.COMPLETED.value
-        model = self.problem.model
         agent, k = divmod(int(inside.argmin()), inside.shape[1])
         name = [*model.chart][k]
         unit = model.state_units[model.state_names.index(name)]
         low, high = (f"{bound:.4g}" for bound in model.chart[name])
         return Outcome.LEFT_CHART, (
-            f"{self._role(agent)} {agent} left the chart of its equations at "
-            f"t = {inside.min() * self.problem.settings.dt:.6g} s: `{name}` is not between {low} "
+            f"{_role(problem, agent)} {agent} left the chart of its equations at "
+            f"t = {inside.min() * problem.settings.dt:.6g} s: `{name}` is not between {low} "
             f"and {high} {unit}".rstrip()
             + ", and what follows is not the agent's motion."
         )
 
-    def _role(self, agent: int) -> str:
-        return "Leader" if agent in self.problem.graph.leaders else "Follower"
 
-    def _verdict(self, whole: Stretch, lost: Array, unfinished: Outcome) -> tuple[Outcome, str]:
-        """Return how the run ended; `lost` are the frames and agents that are not finite."""
-        if len(lost):
-            frame, agent = lost[0]
-            role, when = self._role(agent).lower(), f"by t = {whole.times[frame]:.6g} s"
-            return Outcome.DIVERGED, f"The state of {role} {agent} stopped being finite {when}."
-        if whole.stopped is None and self.complete:
-            return self._completed(whole)
-        reached = float(whole.times[-1]) if len(whole.times) else 0.0
-        # One that stopped did so between two frames; the steps themselves were counted.
-        if whole.stopped:
-            reached = whole.done * self.problem.settings.dt
-        said = whole.stopped or f"The run was {_VERBS[unfinished]}"
-        return unfinished, f"{said} at t = {reached:.6g} s; what was computed is kept."
-
-
-def completed(whole: Stretch) -> Record:
-    """Return the record of a run that reached its horizon, finite and in its chart."""
-    ended = Outcome.COMPLETED, Outcome.COMPLETED.value
-    frames = whole.times, whole.states, whole.inputs, whole.reference
-    return Record(*frames, whole.sums, *ended, whole.seconds)
+def _role(problem: Problem, agent: int) -> str:
+    return "Leader" if agent in problem.graph.leaders else "Follower"
 
 
 def inside_at_last(meter: Meter, inside: Array, last: Array, steps: int) -> Array:
@@ -230,6 +280,7 @@ def join(stretches: Sequence[Stretch]) -> Stretch | None:
     )
 
 
-def _finite(states: Array, inputs: Array) -> Array:
-    """Return which agents are finite in which frames, (T, N)."""
-    return np.logical_and(np.isfinite(states).all(axis=2), np.isfinite(inputs).all(axis=2))
+def _finite(stretch: Stretch) -> Bool[np.ndarray, "T N"]:
+    """Return which agents are finite in which frames."""
+    states, inputs = (np.isfinite(part).all(axis=2) for part in (stretch.states, stretch.inputs))
+    return np.logical_and(states, inputs)

@@ -18,7 +18,6 @@ from echelon.simulation.engine.prepare import Prepared, prepare
 from echelon.simulation.engine.record import Record, Recorder, Stretch, join
 from echelon.simulation.engine.result import Result
 from echelon.simulation.step.drive import Stepper, Stopped
-from echelon.simulation.step.meter import on_host
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
 
@@ -129,14 +128,13 @@ def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -
 
 def _recorder(prepared: Prepared, stepper: Stepper, before: Sequence[Stretch]) -> Recorder:
     problem = prepared.problem
-    grid = ChunkGrid(problem.settings, stepper.longest)
-    return Recorder(problem, grid, on_host(problem.meter.nothing(np)), before)
+    return Recorder([problem], ChunkGrid(problem.settings, stepper.longest), before)
 
 
 def _result(
     prepared: Prepared, recorder: Recorder, stepper: Stepper, unfinished: Outcome
 ) -> Result:
-    record = recorder.close(unfinished)
+    [record] = recorder.close(unfinished)
     return result_of(prepared, record, stepper.engine, stepper.warnings, stepper.work)
 
 

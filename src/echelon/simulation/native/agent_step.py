@@ -16,7 +16,8 @@ from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.codegen import Body, shortened
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
-from echelon.simulation.step.loop import Loop, act_alone, tell, what_limits_did
+from echelon.simulation.step.action import act, feedforward_of, limit_sides
+from echelon.simulation.step.loop import Loop
 
 
 class BlockRows(NamedTuple):
@@ -60,8 +61,10 @@ class BlockRows(NamedTuple):
         """Return the rows of a loop of which so many numbers differ between formations.
 
         Raises:
-            Unsupported: a law remembers what is no number.
+            Unsupported: a law remembers what is no number, or messages take time.
         """
+        if loop.channel is not None:
+            raise Unsupported("a network that is not ideal")
         n, m = len(loop.model.state_names), len(loop.model.input_names)
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None
@@ -104,7 +107,7 @@ def told_by(loop: Loop) -> int:
     # Of what is told alone: a trace of all that a leader does takes as long as the code of it.
     def told(x: Any, v: Any) -> Any:
         follower = loop.follower.facing(x[0]) if turning else loop.follower
-        return tell(follower, loop.model, x, v, loop.leader.init())
+        return feedforward_of(follower, loop.model, x, v, loop.leader.init())
 
     return jax.eval_shape(told, np.zeros(n), np.zeros(m)).shape[0] + turning
 
@@ -166,11 +169,11 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
     law = loop.leader if leads else loop.follower
     model, motion, meter = loop.model, loop.motion, loop.meter
 
-    def act(known: StepInputs) -> StepOutputs:
+    def step(known: StepInputs) -> StepOutputs:
         x, offset = known.x, known.offset
         view = LocalView(known.t, x, offset, known.z, known.told, motion.dt)
-        asked, u, memory, told = act_alone(loop, law, view, known.memory, leads)
-        limited, cut = what_limits_did(u, asked)
+        desired, u, memory, told = act(loop, law, view, known.memory, leads)
+        limited, cut = limit_sides(u, desired)
         read = meter.of_agent(known.step, known.steady, x, offset, known.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
         if known.wanted is not None:
@@ -194,7 +197,7 @@ def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
             saying=_said(loop, law, state, offset, memory),
         )
 
-    return act
+    return step
 
 
 def body_of(

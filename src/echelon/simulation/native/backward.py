@@ -43,8 +43,9 @@ from echelon.simulation.native.transposed_graph import (
 )
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Unsupported
-from echelon.simulation.step.loop import Loop, Moment, begin, signals
+from echelon.simulation.step.loop import Loop, Moment
 from echelon.simulation.step.meter import Sums
+from echelon.simulation.step.sequence import begin, signals
 
 BITS = 64
 _TAPE = 256 * 2**20
@@ -214,7 +215,8 @@ class Backward:
             # The last stretch is the first that is taken back.
             self.stepper.record(self.tape if first + self.stretch >= self.steps else None, first)
             made = self._advance(now, first)
-            now, sums = made.now, made.sums if sums is None else sums.plus(made.sums)
+            now, more = made.now, made.sums.of(0)
+            sums = more if sums is None else sums.plus(more)
             if any_beyond(now.states, BITS):
                 self.moments.clear()
                 return None

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.core.types import Array
-from echelon.simulation.step.loop import Loop, Moment, signals
+from echelon.simulation.step.loop import Loop, Moment
+from echelon.simulation.step.sequence import signals
 
 
 def offsets_of(loops: Sequence[Loop], dtype: np.dtype) -> Array:

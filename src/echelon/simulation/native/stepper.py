@@ -20,8 +20,9 @@ from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.native.wind_draws import draw_holds, holds_at_once
 from echelon.simulation.scalars import needed
 from echelon.simulation.step.drive import Chunk, Stepper
-from echelon.simulation.step.loop import Loop, Moment, begin, begin_forgetful, stretch_at
+from echelon.simulation.step.loop import Loop, Moment, begin_forgetful, stretch_at
 from echelon.simulation.step.meter import ALWAYS, Sums
+from echelon.simulation.step.sequence import begin
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
 """Of a chunk: some hundredths of a second."""
@@ -162,6 +163,11 @@ class NativeStepper(Stepper):
         more = int(_OPERATIONS[self.bits] / (self._work * agents))
         return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
 
+    @property
+    def largest(self) -> float:
+        """The magnitude of states beyond which kernels lose digits."""
+        return _LARGEST[self.bits]
+
     def start(self) -> Moment:
         """Return the moment at which the run begins."""
         states = np.asarray(self.states, self.dtype)
@@ -214,7 +220,7 @@ class NativeStepper(Stepper):
                 self._run(step, count, first, table)
                 self._read(self.rows.input, u[k])
                 step += count
-            elif step == first or counts[k - 1]:
+            elif k == 0 or counts[k - 1]:
                 self._look(step, first, table, u[k])
             else:
                 u[k] = u[k - 1]
@@ -351,7 +357,7 @@ class NativeStepper(Stepper):
             memories_of(self.memories[1], memory[self.followers]),
             cut.astype(np.int8),
         ]
-        return Moment._make(now), self._sums(first, step, kept)
+        return Moment(*now), self._sums(first, step, kept)
 
     def _clear_sums(self) -> None:
         rows = self.rows
@@ -385,7 +391,8 @@ class NativeStepper(Stepper):
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
         )
-        return Sums(*(np.asarray(part, np.float64) for part in found))
+        sums = Sums(*(np.asarray(part, np.float64) for part in found))
+        return sums.split(len(self.loops))
 
 
 def _whole(parted: Array) -> Array:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from echelon.agents.models.model import ControlAffine
+from echelon.agents.network.channel import Channel
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.core.errors import SimulationError
@@ -43,6 +44,7 @@ class Problem(NamedTuple):
         meter: what is measured at each step.
         settings: horizon, step and the like.
         states: (N, n) at the beginning.
+        channel: what the network does to messages; None for the ideal network.
     """
 
     model: ControlAffine
@@ -52,16 +54,17 @@ class Problem(NamedTuple):
     meter: Meter
     settings: Settings
     states: Array
+    channel: Channel | None = None
 
 
 class Chunk(NamedTuple):
-    """A stretch of a run.
+    """A stretch of a run, or of F formations whose agents follow each other.
 
     Attributes:
         now: where it ended.
-        states: (T, N, n) of the stored frames, float64.
-        inputs: (T, N, m) delivered from each of them on, float64.
-        sums: over its steps.
+        states: (T, F N, n) of the stored frames, float64.
+        inputs: (T, F N, m) delivered from each of them on, float64.
+        sums: over its steps, with an axis F in front; F is 1 for a run alone.
         stopped: why no further step can be taken, in words; None where one can.
     """
 

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
@@ -67,6 +68,32 @@ class Sums(NamedTuple):
         last = self.unsettled + (more.unsettled - self.unsettled).clip(0)
         first = self.inside - (self.inside - more.inside).clip(0)
         return total._replace(unsettled=last, inside=first)
+
+    # ---- sums of formations: an axis F in front of each part ----
+
+    def of(self, formation: int) -> "Sums":
+        """Return the sums of one formation."""
+        return Sums(*(part[formation] for part in self))
+
+    def where(self, which: Bool[np.ndarray, " F"], others: "Sums") -> "Sums":
+        """Return these sums of some formations, and other ones of the rest."""
+        shapes = (which.reshape(-1, *[1] * (np.ndim(part) - 1)) for part in self)
+        return Sums(*(np.where(w, a, b) for w, a, b in zip(shapes, self, others, strict=True)))
+
+    def split(self, count: int) -> "Sums":
+        """Return the sums of `count` formations whose agents, leaders and edges follow each other.
+
+        Of one swarm of them all; its steps are those of each.
+        """
+        pairs = ("errors", "tracking")
+        parts = {
+            name: part.reshape(2, count, -1).swapaxes(0, 1)
+            if name in pairs
+            else part.reshape(count, len(part) // count, *part.shape[1:])
+            for name, part in self._asdict().items()
+            if name != "steps"
+        }
+        return Sums(steps=np.stack([self.steps] * count), **parts)
 
 
 def on_host(tree: Any) -> Any:

@@ -40,12 +40,8 @@ class Motion(eqx.Module):
         wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
         return cls(plant, wind, settings.dt, settings.integrator, settings.limits)
 
-    def deliver(self, inputs: Inputs) -> Inputs:
-        """Return what the actuators make of wanted physical inputs (N, m)."""
-        return jax.vmap(self.deliver_one)(inputs)
-
-    def deliver_one(self, u: Input) -> Input:
-        """Return what the actuators make of one agent's wanted physical input (m,)."""
+    def deliver(self, u: Input) -> Input:
+        """Return what the actuators make of one agent's desired physical input (m,)."""
         return self.plant.limit(u) if self.limits else u
 
     def advance(self, states: States, inputs: Inputs, step: jax.Array) -> States:

@@ -104,26 +104,26 @@ def _check_samples(model: ControlAffine, points: Array, velocity: _OfState) -> N
         state = model.state_names[int(np.argmax(np.abs(jump.after - jump.before)[:n]))]
         raise GainError(
             f"`{name}` jumps by {jump.size:.3g} inside the domain, near `{state}` = "
-            f"{jump.after[model.state_names.index(state)]:.4g}, and nothing is promised across a "
+            f"{jump.after[model.state_names.index(state)]:.4g}, and nothing is guaranteed across a "
             "jump; make the domain smaller, or the model continuous."
         )
     gap = find_gap(entries, points[:_SEGMENTS])
     if gap is not None:
         raise GainError(
-            f"the derivative that JAX finds of `{name}` is {gap.said:.4g} inside the domain where "
-            f"its values change by {gap.seen:.4g}, and a promise would rest on it; write the model "
-            "without `stop_gradient` and derivatives of its own."
+            f"the derivative of `{name}` inside the domain is {gap.derivative:.4g} by JAX and "
+            f"{gap.slope:.4g} by its values, so no guarantee can rest on it; write the model "
+            "without `stop_gradient` and without derivatives of its own."
         )
 
 
 def check_secants(model: ControlAffine, domain: Domain, velocity: _OfState, hull: Hull) -> None:
-    """Refuse a hull that a secant of the model leaves: a second look at what is proved.
+    """Reject a hull that a secant of the model leaves: an independent check of the hull.
 
     A matrix H of the hull has H (x - y) = f(x, v) - f(y, v) for all x and y of the domain, so no
     functional of the left side exceeds its largest value at a vertex.
 
     Raises:
-        GainError: one does, which is a fault of echelon.
+        GainError: a secant leaves the hull, which is a fault of echelon.
     """
     n = len(model.state_names)
     inside, corners = _points(domain)
@@ -131,18 +131,17 @@ def check_secants(model: ControlAffine, domain: Domain, velocity: _OfState, hull
     x, y = inside[:, :n], np.where(np.arange(n) % 2, corners[:, :n], inside[::-1, :n])
     value = jax.jit(jax.vmap(velocity))
     v = jnp.asarray(inside[:, n:])
-    moved = np.asarray(value(jnp.asarray(trim + x), v)) - np.asarray(
-        value(jnp.asarray(trim + y), v)
-    )
-    # What was rounded away in trim + x counts as a step that was not made.
+    at_x, at_y = (np.asarray(value(jnp.asarray(trim + part), v)) for part in (x, y))
+    change = at_x - at_y
+    # Steps are those between the rounded points trim + x.
     step = (trim + x) - (trim + y)
-    C = np.random.default_rng(2).normal(size=(32, len(moved[0])))
+    C = np.random.default_rng(2).normal(size=(32, len(change[0])))
     rows = np.einsum("cr,krn->ckn", C, hull.vertices[:, :, :n])
-    reach = np.stack([(each @ step.T).max(axis=0) for each in rows])
+    reach = np.stack([(row @ step.T).max(axis=0) for row in rows])
     slack = np.abs(C) @ hull.error[:, :n] @ np.abs(step).T
-    size = np.abs(C) @ np.abs(np.asarray(value(jnp.asarray(trim + x), v))).T
-    if (C @ moved.T > reach + slack + 1e-9 * (np.abs(reach) + size)).any():
+    size = np.abs(C) @ np.abs(at_x).T
+    if (C @ change.T > reach + slack + 1e-9 * (np.abs(reach) + size)).any():
         raise GainError(
             f"a secant of `{type(model).__name__}` leaves the hull of its slopes, so nothing is "
-            "promised of it; please report this model."
+            "guaranteed for it; please report this model."
         )

@@ -12,7 +12,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.agents.models.heading import heading_index, input_turn, state_turn, turned
+from echelon.agents.models.heading_symmetry import (
+    heading_index,
+    input_turn,
+    rotate_state,
+    state_turn,
+)
 from echelon.agents.models.linearization import Linearization, linearize
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
@@ -79,7 +84,7 @@ class Gain(eqx.Module):
         if heading is None:
             return -K @ model.difference(x, rest)
         # T x* - x turned back, and the input turned forth again.
-        away = model.difference(x, turned(model, rest, heading))
+        away = model.difference(x, rotate_state(model, rest, heading))
         return -input_turn(model)(K @ state_turn(model)(away, -heading), heading)
 
     def feedback(

@@ -1,0 +1,214 @@
+"""The order of a step: agents send, receive, act and move; and many steps one after the other."""
+
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from echelon.agents.network.exchange import Difference, Exchange
+from echelon.core.compiled import cached_jit
+from echelon.core.types import Array, Inputs, States
+from echelon.laws.law import Law, LocalView, Memory
+from echelon.simulation.step.action import Action, act, limit_sides
+from echelon.simulation.step.loop import Loop, Moment, WorldState
+from echelon.simulation.step.meter import Sums, reference_at
+
+
+@cached_jit
+def begin(loop: Loop, states: States) -> Moment:
+    """Return the moment at which a run begins from states (N, n)."""
+
+    def remember(law: Law, agents: Array) -> Memory:
+        return jax.vmap(lambda x: law.begin(loop.model, x))(jnp.asarray(states)[agents])
+
+    moment = Moment(
+        step=jnp.zeros((), jnp.int32),
+        states=jnp.asarray(states),
+        leader_memory=remember(loop.leader, loop.leaders),
+        follower_memory=remember(loop.follower, loop.followers),
+        cut=jnp.zeros((len(states), len(loop.model.input_names)), jnp.int8),
+    )
+    if loop.channel is None:
+        return moment
+    in_flight = loop.channel.begin(loop.exchange.along_edges(_sent(loop, moment)[0]))
+    return moment._replace(world=WorldState(in_flight=in_flight))
+
+
+class Control(NamedTuple):
+    """Delivered inputs (N, m), who was limited (N,), to which side (N, m), and what follows."""
+
+    inputs: Inputs
+    limited: jax.Array
+    cut: jax.Array
+    leader_memory: Memory
+    follower_memory: Memory
+    world: WorldState
+
+
+def control(loop: Loop, now: Moment) -> Control:
+    """Return what all agents do from a moment on."""
+    x, offsets = now.states, jnp.asarray(loop.offsets, now.states.dtype)
+    z, world = _receive(loop, now)
+    # From the step number, since a sum of many dt would gather rounding.
+    t = now.step.astype(x.dtype) * loop.motion.dt
+
+    def act_all(
+        law: Law, agents: Any, forward: jax.Array, memory: Memory, leads: bool = False
+    ) -> Action:
+        # One time for all; of everything else, an agent sees its own row and no other.
+        def one(x: Any, offset: Any, z: Any, forward: Any, memory: Memory) -> Action:
+            view = LocalView(t, x, offset, z, forward, loop.motion.dt)
+            return act(loop, law, view, memory, leads)
+
+        return jax.vmap(one)(x[agents], offsets[agents], z[agents], forward, memory)
+
+    # Nobody is before a leader whose input it could be sent.
+    silence = jnp.zeros((len(loop.leaders), len(loop.model.input_names)), x.dtype)
+    led = act_all(loop.leader, loop.leaders, silence, now.leader_memory, leads=True)
+    if loop.levels is None:
+        forward = led.message[loop.sender]
+        followed = act_all(loop.follower, loop.followers, forward, now.follower_memory)
+    else:
+        followed = _by_depth(loop, now, led, act_all)
+    u = jnp.concatenate([led.input, followed.input])[loop.order]
+    desired = jnp.concatenate([led.desired, followed.desired])[loop.order]
+    limited, cut = limit_sides(u, desired)
+    return Control(u, limited.any(axis=1), cut.astype(jnp.int8), led.memory, followed.memory, world)
+
+
+def _by_depth(loop: Loop, now: Moment, led: Action, act_all: Callable[..., Action]) -> Action:
+    """Let the followers act level by level, each sent what its parent has just done."""
+    followers, parents = jnp.asarray(loop.followers), jnp.asarray(loop.parents)
+    messages = jnp.zeros((len(now.states), led.message.shape[1]), led.message.dtype)
+    messages = messages.at[loop.leaders].set(led.message)
+    nothing = jnp.zeros((len(followers), led.input.shape[1]), led.input.dtype)
+
+    def level(done: tuple[jax.Array, Action], places: jax.Array) -> tuple[Any, None]:
+        messages, actions = done
+        agents = followers[places]
+        memory = jax.tree.map(lambda leaf: leaf[places], now.follower_memory)
+        acted = act_all(loop.follower, agents, messages[parents[agents]], memory)
+        # Where a level repeats an agent, the same is written twice.
+        actions = jax.tree.map(lambda a, b: a.at[places].set(b), actions, acted)
+        return (messages.at[agents].set(acted.message), actions), None
+
+    # Every follower is in one level, so that no zero of these is left.
+    start = Action(nothing, nothing, now.follower_memory, messages[followers])
+    return jax.lax.scan(level, (messages, start), jnp.asarray(loop.levels))[0][1]
+
+
+# ---- what is sent and received -------------------------------------------------------------------
+
+
+@cached_jit
+def signals(
+    loop: Loop, now: Moment, offsets: Float[jax.Array, "N n"]
+) -> Float[jax.Array, "N s"] | None:
+    """Return the signals of all agents (N, s); None where they send their states less offsets."""
+    x = jnp.asarray(now.states)
+
+    def of(law: Law, agents: Array, memory: Memory) -> jax.Array | None:
+        known = x[agents], offsets[agents], memory
+        return jax.vmap(lambda *known: law.signal(loop.model, *known))(*known)
+
+    followers = of(loop.follower, loop.followers, now.follower_memory)
+    if followers is None:
+        return None
+    leaders = of(loop.leader, loop.leaders, now.leader_memory)
+    assert leaders is not None, "a law with a signal takes a leader that gives it"
+    return jnp.concatenate([leaders, followers])[loop.order]
+
+
+def _sent(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], Difference]:
+    """Return what all agents send to their neighbours, and how far two such values are apart."""
+    offsets = jnp.asarray(loop.offsets, now.states.dtype)
+    sent = signals(loop, now, offsets)
+    if sent is not None:
+        return sent, operator.sub
+    return now.states - offsets, jax.vmap(loop.model.difference)
+
+
+def _receive(loop: Loop, now: Moment) -> tuple[Float[jax.Array, "N s"], WorldState]:
+    """Return z of what neighbours receive of each other, and what the world then remembers."""
+    sent, difference = _sent(loop, now)
+    exchange, world = _exchange_at(loop, now.step), now.world
+    received = exchange.along_edges(sent)
+    # The ideal network neither delays nor loses: what is sent is received.
+    if loop.channel is not None:
+        received, in_flight = loop.channel.carry(world.in_flight, received, now.step)
+        world = world._replace(in_flight=in_flight)
+    return exchange(sent, received, difference), world
+
+
+def _exchange_at(loop: Loop, step: jax.Array) -> Exchange:
+    """Return the exchange with the weights that hold at a step."""
+    if loop.switches is None:
+        return loop.exchange
+    steps, rows = map(jnp.asarray, loop.switches)
+    return loop.exchange.during(rows[jnp.searchsorted(steps, step, side="right") - 1])
+
+
+# ---- steps ---------------------------------------------------------------------------------------
+
+
+def step(loop: Loop, now: Moment) -> Moment:
+    """Return the moment one dt later."""
+    return _move(loop, now, control(loop, now))
+
+
+def _move(loop: Loop, now: Moment, acted: Control) -> Moment:
+    """Return the moment one dt later under what all agents do."""
+    states = loop.motion.advance(now.states, acted.inputs, now.step)
+    memories = acted.leader_memory, acted.follower_memory
+    return Moment(now.step + 1, states, *memories, acted.cut, acted.world)
+
+
+def measured_step(
+    loop: Loop, now: Moment, reference: Array | None, first: jax.Array | int
+) -> tuple[Moment, Sums]:
+    """Return the moment one dt later, and the sums of this step.
+
+    `reference` (S, n) is what the leaders follow from the step `first` on.
+    """
+    acted = control(loop, now)
+    followed = reference_at(reference, now.step - first, now.states)
+    chatter = (acted.cut * now.cut < 0).any(axis=1)
+    moment = now.step, now.states, acted.inputs
+    return _move(loop, now, acted), loop.meter.read(*moment, acted.limited, chatter, followed)
+
+
+@cached_jit
+def advance(
+    loop: Loop, now: Moment, counts: jax.Array, reference: Array | None, first: jax.Array | int
+) -> tuple[Moment, tuple[Any, Any], Sums]:
+    """Store a frame and take counts[k] steps, for each k.
+
+    Return the last moment, the stored states and inputs, and the sums over the steps. `reference`
+    (S, n) is what the leaders follow from the step `first` on.
+    """
+
+    def one(_: jax.Array, done: tuple[Moment, Sums]) -> tuple[Moment, Sums]:
+        now, sums = measured_step(loop, done[0], reference, first)
+        return now, done[1].plus(sums)
+
+    def frame(done: tuple[Moment, Sums], count: jax.Array) -> tuple[Any, tuple[Any, Any]]:
+        # The first step computes these inputs again, but after the last frame there is none.
+        stored = (done[0].states, control(loop, done[0]).inputs)
+        return jax.lax.fori_loop(0, count, one, done), stored
+
+    (now, sums), stored = jax.lax.scan(frame, (now, loop.meter.nothing()), counts)
+    return now, stored, sums
+
+
+@cached_jit
+def final_states(loop: Loop, starts: jax.Array, steps: int) -> jax.Array:
+    """Return the states (S, N, n) after `steps` steps from each of the starts (S, N, n)."""
+
+    def last(states: States) -> States:
+        now = begin(loop, states)
+        return jax.lax.fori_loop(0, steps, lambda _, now: step(loop, now), now).states
+
+    return jax.vmap(last)(starts)
