@@ -127,7 +127,7 @@ def test_arrows_go_to_who_hears_and_a_graph_that_switches_has_the_links_of_the_t
             seek(page, round(50 * time))
             assert page.evaluate("echelon.links") == run.edges[run.linked(time)].tolist()
         seek(page, 275)
-        heard = [page.evaluate(f"echelon.player.view.heardBy({k})") for k in range(4)]
+        heard = [page.evaluate(f"echelon.player.view.sendersOf({k})") for k in range(4)]
         assert heard == [[], [], [1, 3], [2]]
         # The head of the arrow from 1 to 2 is wide where its line is not.
         first, second = (np.array(page.evaluate(f"echelon.whereOnScreen({k})")) for k in (1, 2))
@@ -179,7 +179,7 @@ def test_a_click_on_an_agent_tells_its_place_its_error_and_whom_it_hears(browser
         page.mouse.click(box["x"] + x, box["y"] + y)
         until(lambda: page.locator(".card").is_visible())
         card = page.locator(".card").inner_text()
-        assert card.startswith("follower 2\n") and "hears 0" in card
+        assert card.startswith("follower 2\n") and "receives from 0" in card
         error = run.formation_errors[60, 2]
         assert f"{error:.3g}"[:4] in card
 
@@ -205,7 +205,7 @@ def test_keys_the_slider_and_a_chart_move_the_time_and_play_lets_it_run(browser,
 
 def test_the_camera_follows_an_agent(browser, file):
     with opened(browser, file) as page:
-        page.get_by_label("what the camera follows").select_option("3")
+        page.get_by_label("target of the camera").select_option("3")
         places = []
         for frame in (0, 120):
             seek(page, frame)

@@ -7,7 +7,7 @@ import numpy as np
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.swarm import LiveLoop
 from echelon.experiments.results.foreseen import foreseen
-from echelon.experiments.results.recording import InputBounds, Recording
+from echelon.experiments.results.recording import InputBounds
 from echelon.output.plots.space import Space, space_of
 from echelon.output.viewer.replay import header, motor_loads
 from echelon.simulation.step.settings import Settings
@@ -15,7 +15,7 @@ from echelon.simulation.step.settings import Settings
 
 def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any]) -> dict[str, Any]:
     """Return the header of a loop's page."""
-    run = _foreseen(swarm, name, badge)
+    run = foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
     space = space_of(run)
     loads = motor_loads(run, space)
     return {
@@ -35,18 +35,7 @@ def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any])
     }
 
 
-def _foreseen(swarm: LiveLoop, name: str, badge: dict[str, Any]) -> Recording:
-    parts, states = swarm.parts, np.asarray(swarm.states)
-    return foreseen(parts, swarm.settings, states, name, _empty_promise(badge))
-
-
-def _empty_promise(badge: dict[str, Any]) -> dict[str, Any]:
-    """Return an empty promise, since the badge states the guarantee."""
-    empty = {"promised": False, "rate": None, "coupling": None, "theorem": None}
-    return {**empty, "sentence": badge["whole"], "kind": "", "hypotheses": []}
-
-
-def drawn(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
+def scene(swarm: LiveLoop, settings: Settings) -> tuple[Space, InputBounds | None]:
     """Return the space that agents are drawn in, and the bounds of their inputs."""
-    run = _foreseen(swarm, "", {"whole": ""})
+    run = foreseen(swarm.parts, settings, np.asarray(swarm.states), "")
     return space_of(run), run.bounds if settings.limits else None

@@ -3,9 +3,7 @@
 import abc
 import contextlib
 import json
-import struct
 import time
-import zlib
 from http.server import ThreadingHTTPServer
 from typing import Any, Final
 
@@ -17,6 +15,7 @@ from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario
+from echelon.output.viewer.pack import pack
 from echelon.output.viewer.page import page
 from echelon.output.viewer.serve import Handler, serve
 from echelon.simulation.engine.law_drive import Laws
@@ -40,9 +39,7 @@ def live(scenario: Scenario) -> tuple[Session, str]:
     swarm = LiveLoop(parts, settings, panel.live)
     _check_speed(swarm)
     header = live_header(swarm, panel, scenario.name, pending_badge())
-    text = json.dumps({**header, "groups": {}}, allow_nan=False).encode()
-    data = zlib.compress(struct.pack("<I", len(text)) + text, 9)
-    return Session(scenario, panel, swarm), page(f"{scenario.name}, live", data)
+    return Session(scenario, panel, swarm), page(f"{scenario.name}, live", pack(header, {}))
 
 
 def _check_speed(swarm: LiveLoop) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from echelon.apps.live.choices import under
 from echelon.apps.live.guarantee_status import GuaranteeStatus, lost
-from echelon.apps.live.header import drawn
+from echelon.apps.live.header import scene
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel, check_choice
 from echelon.apps.live.promiser import Promiser
@@ -46,7 +46,7 @@ class Session:
         """Check the events of the scenario; nothing runs before `start`."""
         self.scenario, self.panel, self.swarm = scenario, panel, swarm
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
-        self.space, self.bounds = drawn(swarm, swarm.settings)
+        self.space, self.bounds = scene(swarm, swarm.settings)
         self.pending: list[Callable[[], None]] = []
         self.events: list[dict[str, Any]] = []
         self.future = sorted(map(_as_event, scenario.live), key=lambda event: event["at"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -20,9 +21,17 @@ _AHEAD, _PLACES = 60.0, 121
 _BLOCK = 32
 """Frames of which V is found at once: one number, so that no stretch compiles anew."""
 
+_NO_PROMISE = MappingProxyType(
+    {"promised": False, "rate": None, "theorem": None, "sentence": "", "kind": "", "hypotheses": ()}
+)
+
 
 def foreseen(
-    parts: Parts, settings: Settings, states: Array, name: str, promise: Mapping[str, Any]
+    parts: Parts,
+    settings: Settings,
+    states: Array,
+    name: str,
+    promise: Mapping[str, Any] = _NO_PROMISE,
 ) -> Recording:
     """Return a recording of agents that stay on their goals: it says where the scene will be.
 
@@ -31,7 +40,7 @@ def foreseen(
         settings: of it.
         states: (N, n) at the beginning.
         name: of the scenario.
-        promise: as `Promise.as_mapping` gives it.
+        promise: as `Promise.as_mapping` gives it; none by default.
     """
     model, graph = parts.model, parts.graph
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)

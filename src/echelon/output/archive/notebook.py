@@ -42,7 +42,10 @@ def _causes(result: Result) -> str:
 def _table(result: Result) -> str:
     unit = " (m)" if result.unit == "m" else ""
     heads = ("agent", f"error at the start{unit}", f"at the end{unit}", "saturated (% of steps)")
-    rows = "".join(_row(cells) for cells in _cells(result))
+    rows = "".join(
+        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
+        for cells in _cells(result)
+    )
     head = "".join(f"<th>{title}</th>" for title in heads)
     return f"<table><tr>{head}</tr>{rows}</table>"
 
@@ -58,16 +61,11 @@ def _cells(result: Result) -> Iterator[tuple[str, ...]]:
         yield label, *cells, f"{100.0 * row.saturated:.3g}"
 
 
-def _row(cells: tuple[str, ...]) -> str:
-    return f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in cells)}</tr>"
-
-
 def _recorded(result: Result) -> Recording:
     """Return the recording of a run without its promise, which takes seconds to compute."""
-    empty = {"promised": False, "rate": None, "theorem": None, "kind": "", "hypotheses": []}
-    states, guarantee = result.states, {**empty, "sentence": ""}
+    states = result.states
     return dataclasses.replace(
-        foreseen(result.parts, result.settings, states[0], "", guarantee),
+        foreseen(result.parts, result.settings, states[0], ""),
         times=result.times,
         states=states,
         inputs=result.inputs,

@@ -44,9 +44,10 @@ def report_page(run: Recording, folder: Path | None) -> str:
     """
     scenario = _text(folder, KEPT) or str(run.attributes.get("scenario_text", ""))
     text = _text(folder, "report.txt") or str(run.attributes["message"])
+    facts = f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s; "
     parts = [
         f"<h1>{escape(run.name)}</h1>",
-        f'<p class="facts">{escape(_facts(run))}</p>',
+        f'<p class="facts">{escape(facts + run.attributes["message"])}</p>',
         _promise(run),
         _section("Results", _pre(text)),
         _section("Figures", "".join(_figures(run))),
@@ -73,13 +74,6 @@ def citation() -> str:
         "  author = {Enwerem, Clinton and Baras, John S.},\n"
         "  booktitle = {9th International Conference on Control, Decision and Information "
         "Technologies (CoDIT)},\n  year = {2023},\n  note = {arXiv:2309.09156}\n}"
-    )
-
-
-def _facts(run: Recording) -> str:
-    return (
-        f"{run.agents} agents, {run.model}; {run.horizon:g} s in steps of {run.dt:g} s; "
-        f"{run.attributes['message']}"
     )
 
 

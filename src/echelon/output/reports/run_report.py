@@ -64,7 +64,9 @@ def _table(result: Result, numbers: Metrics, printed: bool) -> "Table":
     columns = ["agent", *(quantity.label.format(**texts) for quantity in _COLUMNS.values())]
     if printed:
         columns += ["printed,\nconsensus", "printed,\noptimiz."]
-    title = f"{_title(result)}, {_length(result)}, seed {result.settings.seed}"
+    agents = f"{result.graph.agents} x {type(result.model).__name__}"
+    name = result.provenance.get("scenario") or agents
+    title = f"{name}, {_length(result)}, seed {result.settings.seed}"
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
     for column in columns:
         table.add_column(column, justify="left" if column == "agent" else "right", no_wrap=True)
@@ -79,13 +81,6 @@ def _length(result: Result) -> str:
     if result.outcome.reached:
         return horizon
     return f"{result.times[-1] if len(result.times) else 0.0:g} s of {horizon}"
-
-
-def _title(result: Result) -> str:
-    return (
-        result.provenance.get("scenario")
-        or f"{result.graph.agents} x {type(result.model).__name__}"
-    )
 
 
 def _rows(result: Result, numbers: Metrics, printed: bool) -> list[list[str]]:

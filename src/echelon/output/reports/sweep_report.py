@@ -65,20 +65,14 @@ def _cases(data: "xr.Dataset") -> list[str]:
         return []
     present = (data["outcome"] != data["outcome"].attrs["flag_values"][0]).sum(SEED)
     settled = succeeded(data).sum(SEED).stack(case=keys)
-    return [
-        "- "
-        + ", ".join(f"{key} {_text(value)}" for key, value in zip(keys, _tuple(place)))
-        + f": {_share(int(count), int(present.stack(case=keys)[k]))} settled"
-        for k, (place, count) in enumerate(zip(settled["case"].values, settled.values, strict=True))
-    ]
-
-
-def _tuple(place: Any) -> tuple[Any, ...]:
-    return place if isinstance(place, tuple) else (place,)
-
-
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, int | float | np.number) else str(value)
+    counts = present.stack(case=keys).values
+    lines = []
+    for place, count, total in zip(settled["case"].values, settled.values, counts, strict=True):
+        values = place if isinstance(place, tuple) else (place,)
+        texts = (f"{x:g}" if isinstance(x, int | float | np.number) else str(x) for x in values)
+        case = ", ".join(f"{key} {text}" for key, text in zip(keys, texts, strict=True))
+        lines.append(f"- {case}: {_share(int(count), int(total))} settled")
+    return lines
 
 
 def _share(count: int, total: int) -> str:

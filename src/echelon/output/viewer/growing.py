@@ -2,10 +2,7 @@
 
 import contextlib
 import dataclasses
-import json
-import struct
 import threading
-import zlib
 from http.server import ThreadingHTTPServer
 from typing import Final, final
 
@@ -13,6 +10,7 @@ import numpy as np
 
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import space_of
+from echelon.output.viewer.pack import pack
 from echelon.output.viewer.page import page
 from echelon.output.viewer.replay import header, replay_data, replay_page
 from echelon.output.viewer.serve import Handler, serve
@@ -31,14 +29,8 @@ class Growing:
 
     def __init__(self, run: Recording) -> None:
         """Create the page without frames."""
-        description = {
-            **header(run, space_of(run)),
-            "growing": True,
-            "horizon": run.horizon,
-            "groups": {},
-        }
-        text = json.dumps(description, allow_nan=False).encode()
-        self.html = page(run.name, zlib.compress(struct.pack("<I", len(text)) + text, 9)).encode()
+        more = {"growing": True, "horizon": run.horizon}
+        self.html = page(run.name, pack(header(run, space_of(run)) | more, {})).encode()
         self.blocks, self.done = list[bytes](), False
         self.changed = threading.Condition()
         self.last: Recording | None = None

@@ -43,7 +43,9 @@ def replay_data(run: Recording) -> bytes:
     frames = frames_of(run)
     groups = {"positions": Group(_flat(clipped_places(run, space.axes)[0][frames]))}
     if space.angles:
-        groups["angles"] = Group(_flat(_angles(run, space)[frames]))
+        # Without jumps, so that the page can interpolate.
+        angles = space.sign * np.unwrap(run.states[:, :, list(space.angles)], axis=0)
+        groups["angles"] = Group(_flat(angles[frames]))
     loads, many = motor_loads(run, space), run.agents > FLOCK
     if loads is not None:
         groups["motors"] = Group(_flat(loads[frames]), BYTE if many else COARSE, (0.0, 1.0))
@@ -75,11 +77,6 @@ def _clock(run: Recording, frames: Array) -> dict[str, float]:
     times = run.times[frames]
     step = float(times[1] - times[0]) if len(times) > 1 else 1.0
     return {"start": float(times[0]), "step": step, "last": float(times[-1])}
-
-
-def _angles(run: Recording, space: Space) -> Array:
-    """Return the angles (T, N, 1 or 3) of bodies without jumps, which the page interpolates."""
-    return space.sign * np.unwrap(run.states[:, :, list(space.angles)], axis=0)
 
 
 def motor_loads(run: Recording, space: Space) -> Array | None:
