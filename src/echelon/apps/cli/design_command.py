@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,7 @@ from echelon.apps.cli.options import (
     ScenarioArgument,
     SetOption,
 )
+from echelon.core.types import JsonObject
 from echelon.output.archive.folder import claim_design, write_errors
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def design(
 
     report = study(loaded, method)
     sentence, best, stopping = report.because, report.recommended, report.stopping
-    summary: dict[str, Any] = {"recommended": None}
+    summary: JsonObject = {"recommended": None}
     if best is not None and best.gain is not None and best.parts is not None:
         summary = {"recommended": best.method, "because": sentence}
         if out is not None:

@@ -2,7 +2,9 @@
 
 import sys
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from echelon.core.types import JsonObject
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,9 +40,9 @@ def print_table(table: "Table", sentence: str) -> None:
     out.print(sentence, highlight=False, markup=False, soft_wrap=not out.is_terminal)
 
 
-def design_row(design: "Design") -> dict[str, Any]:
+def design_row(design: "Design") -> JsonObject:
     """Return the numbers of a design; missing ones are None."""
-    row: dict[str, Any] = {"method": design.method, "reason": design.reason}
+    row: JsonObject = {"method": design.method, "reason": design.reason}
     gain, promise = design.gain, design.promise
     if gain is None or promise is None:
         return {**row, "seconds": design.seconds}
@@ -95,7 +97,7 @@ _FOOTNOTES = (
 )
 
 
-def print_designs(rows: list[dict[str, Any]], sentence: str) -> None:
+def print_designs(rows: list[JsonObject], sentence: str) -> None:
     """Print the methods as a table, the reasons of those without a gain, and a recommendation."""
     from rich import box
     from rich.table import Table

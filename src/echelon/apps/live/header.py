@@ -1,11 +1,10 @@
 """The header of the live page: agents, space and controls, before the first picture."""
 
-from typing import Any
-
 import numpy as np
 
 from echelon.apps.live.panel import Panel
 from echelon.apps.live.swarm import LiveLoop
+from echelon.core.types import JsonObject
 from echelon.experiments.results.foreseen import foreseen
 from echelon.experiments.results.recording import InputBounds
 from echelon.output.plots.space import Space, space_of
@@ -13,7 +12,7 @@ from echelon.output.viewer.replay import header, motor_loads
 from echelon.simulation.step.settings import Settings
 
 
-def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: dict[str, Any]) -> dict[str, Any]:
+def live_header(swarm: LiveLoop, panel: Panel, name: str, badge: JsonObject) -> JsonObject:
     """Return the header of a loop's page."""
     run = foreseen(swarm.parts, swarm.settings, np.asarray(swarm.states), name)
     space = space_of(run)

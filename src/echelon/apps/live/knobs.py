@@ -11,7 +11,7 @@ from echelon.agents.models.linearization import linearize
 from echelon.agents.network.graph import Graph
 from echelon.apps.live.choices import shapes_of
 from echelon.core.numerics import precision
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
 from echelon.laws.stopping_point import StoppingPoint
@@ -68,7 +68,7 @@ class LiveParts:
         self._gains: dict[str | None, Gain | None] = {None: self.parts.drive.gain}
         self._weighted: tuple[tuple[str | None, float], Gain] | None = None
 
-    def data(self) -> dict[str, Any]:
+    def data(self) -> JsonObject:
         """Return a copy of the scenario's data, without its live events."""
         data = copy.deepcopy(self.scenario.data)
         data.pop("live", None)

@@ -8,6 +8,7 @@ import numpy as np
 from echelon.apps.live.choices import AS_GIVEN
 from echelon.apps.live.knobs import Knobs, LiveParts
 from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.types import JsonObject
 from echelon.experiments.scenario import registry
 from echelon.experiments.scenario.build import Experiment
 from echelon.experiments.scenario.override import named_files
@@ -42,7 +43,7 @@ class Slider(NamedTuple):
     label: str
     unit: str
     range: Callable[[LiveParts], Range | None]
-    write: Callable[[LiveParts, Knobs, dict[str, Any]], None]
+    write: Callable[[LiveParts, Knobs, JsonObject], None]
 
 
 def _coupling_range(live: LiveParts) -> Range | None:
@@ -50,7 +51,7 @@ def _coupling_range(live: LiveParts) -> Range | None:
     return None if c is None else Range(0.02 * c, 8.0 * c, True)
 
 
-def _write_coupling(live: LiveParts, knobs: Knobs, data: dict[str, Any]) -> None:
+def _write_coupling(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
     # On another graph a method would choose another coupling, so it is written there too.
     if knobs.coupling is None or (not knobs.cut and knobs.coupling == live.start.coupling):
         return
@@ -70,7 +71,7 @@ def _weight_range(live: LiveParts) -> Range | None:
     return Range(0.02, 50.0, True) if computed else None
 
 
-def _write_weight(live: LiveParts, knobs: Knobs, data: dict[str, Any]) -> None:
+def _write_weight(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
     gain = live.unweighted_gain(knobs)
     if knobs.weight != 1.0 and gain is not None:
         section = data.setdefault("follower", {}).setdefault("gain", {})
@@ -81,7 +82,7 @@ def _feedforward_range(live: LiveParts) -> Range | None:
     return Range(0.0, 1.0) if str(live.parts.drive.feedforward.name) != "NONE" else None
 
 
-def _write_feedforward(live: LiveParts, knobs: Knobs, data: dict[str, Any]) -> None:
+def _write_feedforward(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
     if not knobs.feedforward:
         data.setdefault("follower", {})["feedforward"] = "none"
 
@@ -96,7 +97,7 @@ def _turn_range(live: LiveParts) -> Range | None:
     return Range(-180.0, 180.0) if in_plane else None
 
 
-def _write_formation(live: LiveParts, knobs: Knobs, data: dict[str, Any]) -> None:
+def _write_formation(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
     if (knobs.size, knobs.turn, knobs.shape) != (1.0, 0.0, None):
         offsets = live.offsets(knobs)
         agents = np.flatnonzero(offsets.any(axis=1))
@@ -107,7 +108,7 @@ def _wind_range(live: LiveParts) -> Range | None:
     return None if live.wind_state is None else Range(-3.0, 3.0)
 
 
-def _write_wind(live: LiveParts, knobs: Knobs, data: dict[str, Any]) -> None:
+def _write_wind(live: LiveParts, knobs: Knobs, data: JsonObject) -> None:
     if knobs.wind and live.wind_state is not None:
         name = live.parts.model.state_names[live.wind_state]
         constant = data.setdefault("disturbance", {}).setdefault("constant", {})
@@ -161,7 +162,7 @@ class Panel:
         lists = {k: [AS_GIVEN, *names] if names else [] for k, names in self.options.items()}
         return {"law": list(self.laws), **lists}
 
-    def sliders(self) -> list[dict[str, Any]]:
+    def sliders(self) -> list[JsonObject]:
         """Return the sliders as the page reads them."""
         state = self.live.wind_state
         unit = "" if state is None else self.live.parts.model.state_units[state]
@@ -249,10 +250,10 @@ class Panel:
             data["graph"] = self._graph(knobs)
         return scenario_from_mapping(data, self.scenario.folder)
 
-    def _graph(self, knobs: Knobs) -> dict[str, Any]:
+    def _graph(self, knobs: Knobs) -> JsonObject:
         """Return the graph without the cut edges as a scenario states it."""
         graph, schedule = self.live.parts.graph, self.live.parts.graph.schedule
-        section: dict[str, Any] = {"leaders": list(graph.leaders), "agents": graph.agents}
+        section: JsonObject = {"leaders": list(graph.leaders), "agents": graph.agents}
         section |= {"directed": True} if graph.directed else {}
         weights = [graph.weights] if schedule is None else schedule.weights
         edges = [self.live.edges(knobs, row) for row in weights]

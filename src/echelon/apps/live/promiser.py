@@ -2,11 +2,12 @@
 
 import threading
 from collections.abc import Callable
-from typing import Any, final
+from typing import final
 
 from echelon.apps.live.knobs import Knobs
 from echelon.apps.live.panel import Panel
 from echelon.core.errors import EchelonError
+from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import build
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.output.reports.causes import beyond
@@ -24,7 +25,7 @@ class Promiser:
         answer: called with the badge of the page.
     """
 
-    def __init__(self, answer: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, answer: Callable[[JsonObject], None]) -> None:
         """Start the thread, which waits for a request."""
         self.answer = answer
         self.request: tuple[Panel, Knobs] | None = None
@@ -62,7 +63,7 @@ class Promiser:
                 self.answer(badge)
 
 
-def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
+def badge_of(panel: Panel, knobs: Knobs) -> JsonObject:
     """Return the badge at a position of the knobs: `holds`, `edge` or `lost`, with the causes."""
     try:
         unchanged = knobs == panel.start
@@ -71,7 +72,7 @@ def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
         # A scenario that is refused has no guarantee, such as one with a disconnected graph.
         cause = str(error).removeprefix("mapping: ")
         return {"state": "lost", "short": "no guarantee", "whole": cause, "causes": [cause]}
-    badge: dict[str, Any] = promise_badge(guarantee.as_mapping())
+    badge: JsonObject = promise_badge(guarantee.as_mapping())
     badge["causes"] = [cause.sentence() for cause in guarantee.causes]
     badge["edge"] = guarantee.edge
     badge["rate"], certified = guarantee.rate, guarantee.certified
@@ -85,13 +86,13 @@ def badge_of(panel: Panel, knobs: Knobs) -> dict[str, Any]:
     return badge
 
 
-def pending_badge(short: str = "guarantee \u2026") -> dict[str, Any]:
+def pending_badge(short: str = "guarantee \u2026") -> JsonObject:
     """Return the badge while the guarantee is computed."""
     whole = "The guarantee of the present loop is being computed."
     return {"state": "pending", "short": short, "whole": whole, "causes": []}
 
 
-def first_look(panel: Panel, knobs: Knobs) -> dict[str, Any]:
+def first_look(panel: Panel, knobs: Knobs) -> JsonObject:
     """Return a badge with the slowest mode at the trim; a growing mode rules out a guarantee."""
     slowest = panel.live.slowest(knobs)
     if slowest is None:

@@ -5,7 +5,7 @@ import contextlib
 import json
 import time
 from http.server import ThreadingHTTPServer
-from typing import Any, Final
+from typing import Final
 
 from echelon.apps.live.header import live_header
 from echelon.apps.live.panel import Panel
@@ -13,6 +13,7 @@ from echelon.apps.live.promiser import pending_badge
 from echelon.apps.live.session import Session
 from echelon.apps.live.swarm import LiveLoop
 from echelon.core.errors import EchelonError, SimulationError
+from echelon.core.types import JsonObject
 from echelon.experiments.scenario.build import build
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.pack import pack
@@ -96,7 +97,7 @@ class _Live(Handler, abc.ABC):
         except (EchelonError, ValueError, AttributeError) as error:
             self._answer(400, {"fault": str(error)})
 
-    def _request(self) -> dict[str, Any]:
+    def _request(self) -> JsonObject:
         length = int(self.headers.get("Content-Length") or 0)
         if self.path != "/knob" or not 0 < length <= _LONGEST:
             raise SimulationError("a request must be a JSON mapping sent to `/knob`.")
@@ -105,7 +106,7 @@ class _Live(Handler, abc.ABC):
             raise SimulationError("a request must be a JSON mapping.")
         return request
 
-    def _answer(self, code: int, answer: dict[str, Any]) -> None:
+    def _answer(self, code: int, answer: JsonObject) -> None:
         self.send(json.dumps(answer).encode(), "application/json", code)
 
     def _stream(self) -> None:

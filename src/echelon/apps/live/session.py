@@ -18,7 +18,7 @@ from echelon.apps.live.panel import Panel, check_choice
 from echelon.apps.live.promiser import Promiser
 from echelon.apps.live.swarm import LiveLoop, Picture
 from echelon.core.errors import EchelonError, SimulationError
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.foreseen import heard_in
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.output.viewer.replay import heard_by
@@ -48,7 +48,7 @@ class Session:
         self.knobs, self.paused, self.watchers, self.ended = panel.start, False, 0, False
         self.space, self.bounds = scene(swarm, swarm.settings)
         self.pending: list[Callable[[], None]] = []
-        self.events: list[dict[str, Any]] = []
+        self.events: list[JsonObject] = []
         self.future = sorted(map(_as_event, scenario.live), key=lambda event: event["at"])
         self.picture, self.number, self.messages = b"", 0, list[bytes]()
         self.changed, self.lost, self.factor = threading.Condition(), False, 1.0
@@ -211,7 +211,7 @@ class Session:
             with self.changed:
                 self.watchers -= 1
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> JsonObject:
         """Return the positions of all controls."""
         graph = self.swarm.parts.graph
         knobs = {name: getattr(self.knobs, name) for name in self.panel.ranges}
@@ -219,14 +219,14 @@ class Session:
         chosen = {"law": self.panel.law, "method": self.knobs.method, "shape": self.knobs.shape}
         return {"knobs": knobs, "chosen": chosen, "cut": cut, "paused": self.paused}
 
-    def _panel_message(self) -> dict[str, Any]:
+    def _panel_message(self) -> JsonObject:
         """Return the controls and the information flow of the present law."""
         panel, heard = self.panel, heard_by(heard_in(self.swarm.parts))
         return {"panel": panel.sliders(), "choices": panel.choices(), "heard": heard}
 
     # ---- changes --------------------------------------------------------------------------------
 
-    def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
+    def ask(self, request: Mapping[str, Any]) -> JsonObject:
         """Apply the request of a page before the next picture, and return the event.
 
         Raises:
@@ -253,7 +253,7 @@ class Session:
         with self.changed:
             self.pending.append(action)
 
-    def _event(self, name: str, value: Any) -> dict[str, Any]:
+    def _event(self, name: str, value: Any) -> JsonObject:
         if name == "kick":
             if type(value) is not int or not 0 <= value < self.swarm.parts.graph.agents:
                 raise SimulationError(f"`kick` got `{value}`, and must be the number of an agent.")
@@ -341,7 +341,7 @@ class Session:
         self.swarm.restart(self.origin)
         self.status.restart()
         self.lost, self.events, self.future = False, [], []
-        start: dict[str, Any] = {} if self.panel is self.first else {"law": self.panel.law}
+        start: JsonObject = {} if self.panel is self.first else {"law": self.panel.law}
         for name in ("method", "shape", *self.panel.ranges):
             if getattr(self.knobs, name) != getattr(self.panel.start, name):
                 start[name] = getattr(self.knobs, name)
@@ -353,7 +353,7 @@ class Session:
         self.show(self.swarm.advance(still=True))
 
 
-def _as_event(spec: "LiveSpec") -> dict[str, Any]:
+def _as_event(spec: "LiveSpec") -> JsonObject:
     """Return an event of a scenario as one that was recorded."""
     return {name: value for name, value in spec.model_dump().items() if value is not None}
 

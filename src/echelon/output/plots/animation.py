@@ -1,7 +1,7 @@
 """The moving parts of a video: links, goals, trails and bodies."""
 
 import abc
-from typing import Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 
@@ -11,12 +11,15 @@ from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.camera import Camera
 from echelon.output.plots.space import Space, body_width
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 _FEW = 60
 """Agents that are drawn as vehicles; more are drawn as dots, all of a kind by one artist."""
 _LINK, _GOAL, _SHADOW = "#4f5b68", "#d99000", "#d3d9e0"
 
 
-def moving_of(ax: Any, run: Recording, space: Space, camera: Camera) -> "MovingScene":
+def moving_of(ax: "Axes", run: Recording, space: Space, camera: Camera) -> "MovingScene":
     """Return the moving scene of a run, on axes of pixels."""
     return (_Vehicles if run.agents <= _FEW else _Dots)(ax, run, space, camera)
 
@@ -33,7 +36,7 @@ class MovingScene(abc.ABC):
     trail: ClassVar[float]
     points: ClassVar[int]
 
-    def __init__(self, ax: Any, run: Recording, space: Space, camera: Camera) -> None:
+    def __init__(self, ax: "Axes", run: Recording, space: Space, camera: Camera) -> None:
         """Create the artists."""
         from matplotlib.colors import to_rgba_array
 
@@ -183,14 +186,14 @@ class _Dots(MovingScene):
         dots.set_sizes((2.0 * points * (beside - middle)[:, 0]) ** 2)
 
 
-def _heads_on(ax: Any) -> Any:
+def _heads_on(ax: "Axes") -> Any:
     """Return the artist of arrow heads."""
     from matplotlib.collections import PolyCollection
 
     return ax.add_collection(PolyCollection([], facecolors=_LINK, edgecolors="none", zorder=1.1))
 
 
-def _stroke(ax: Any, **pen: Any) -> Any:
+def _stroke(ax: "Axes", **pen: Any) -> Any:
     """Return the artist of many lines, drawn as one with gaps."""
     return ax.plot([], [], **{"zorder": 1, **pen})[0]
 

@@ -1,7 +1,7 @@
 """Figures of a comparison, with one line per method."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -131,6 +131,6 @@ def _approach(runs: _Runs) -> "Figure | None":
     return draw.finish(figure, cut)
 
 
-def _pen(k: int) -> dict[str, Any]:
+def _pen(k: int) -> draw.Style:
     dash = "-" if k < len(draw.COLOURS) else (0, (3, 1.2))
     return {"color": draw.COLOURS[k % len(draw.COLOURS)], "linestyle": dash}

@@ -1,7 +1,7 @@
 """Figures of a run over time: errors, V, inputs, states, distances."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from echelon.output.plots.agent_style import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _LINKS = 20_000  # links whose distances are computed, evenly spread over all
@@ -89,7 +90,7 @@ def formation(run: Recording) -> "Figure":
     return draw.finish(figure)
 
 
-def _bands(ax: Any, times: Array, values: Array, of: str = "follower") -> None:
+def _bands(ax: "Axes", times: Array, values: Array, of: str = "follower") -> None:
     """Draw quantiles of values (T, N) and the median."""
     with np.errstate(invalid="ignore"):
         # At times at which all values are 0 there is nothing to draw, and no warning.
@@ -102,7 +103,7 @@ def _bands(ax: Any, times: Array, values: Array, of: str = "follower") -> None:
     draw.plot(ax, times, ends[2], label=f"median {of}", color=draw.COLOURS[0])
 
 
-def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) -> None:
+def _worst(ax: "Axes", run: Recording, times: Array, errors: Array, keep: Array) -> None:
     """Draw the follower with the largest steady error, and the largest error at each time.
 
     A run that ended before its steady window is evaluated as a whole.
@@ -119,7 +120,7 @@ def _worst(ax: Any, run: Recording, times: Array, errors: Array, keep: Array) ->
     draw.plot(ax, times, largest, label="largest at each time", **pen, **dash)
 
 
-def _slope(ax: Any, run: Recording, values: Array, times: float) -> None:
+def _slope(ax: "Axes", run: Recording, values: Array, times: float) -> None:
     """Draw the guaranteed slope from the largest of values (T,) on."""
     rate, finite = run.rate, np.where(np.isfinite(values), values, 0.0)
     if rate is None or len(run.times) < 2 or finite.max() <= 0.0:
@@ -225,7 +226,7 @@ def _inputs(run: Recording) -> dict[str, Array]:
     return {draw.label(*pair): run.inputs[:, :, k] for k, pair in enumerate(pairs)}
 
 
-def _limits(ax: Any, values: Array) -> None:
+def _limits(ax: "Axes", values: Array) -> None:
     """Draw the limits 0 and 100 %, and shade the area beyond."""
     for value in (0.0, 100.0):
         look = {"color": draw.COLOURS[1], "linewidth": 0.9, "linestyle": (0, (4, 2)), "zorder": 2}
@@ -236,7 +237,7 @@ def _limits(ax: Any, values: Array) -> None:
     ax.set_ylim(low, high)
 
 
-def _agents_over(ax: Any, run: Recording, times: Array, values: Array) -> None:
+def _agents_over(ax: "Axes", run: Recording, times: Array, values: Array) -> None:
     """Draw a number of each agent (T, N) as lines, or as quantiles of a large swarm."""
     if run.agents > draw.NAMED:
         keep = draw.thin(len(times), run.agents)
@@ -309,7 +310,7 @@ def distances(run: Recording) -> "Figure | None":
     return draw.finish(figure)
 
 
-def _edges(ax: Any, run: Recording, times: Array, apart: Array, desired: Array) -> None:
+def _edges(ax: "Axes", run: Recording, times: Array, apart: Array, desired: Array) -> None:
     """Draw the distance of each edge, or quantiles of the errors of many."""
     if len(run.edges) > draw.NAMED:
         errors = np.abs(apart - desired)
@@ -334,5 +335,5 @@ def _least(places: Array) -> Array:
     return np.array([KDTree(row).query(row, k=2)[0][:, 1].min() for row in finite])
 
 
-def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Any]]":
+def _panels(run: Recording, rows: int, height: float) -> "tuple[Figure, list[Axes]]":
     return draw.panels(run.times, run.horizon, rows, height)

@@ -27,6 +27,7 @@ from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _MOST = 500
@@ -93,7 +94,7 @@ def _certified_set(
     return figure, radii
 
 
-def _starts(ax: Any, run: Trial, plane: StateSlice, half: Array) -> None:
+def _starts(ax: "Axes", run: Trial, plane: StateSlice, half: Array) -> None:
     """Colour a grid of starts by whether they converge."""
     from matplotlib.colors import ListedColormap
 
@@ -109,7 +110,7 @@ def _starts(ax: Any, run: Trial, plane: StateSlice, half: Array) -> None:
     ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
 
 
-def _ellipses(ax: Any, plane: StateSlice, radii: Radii, half: Array) -> None:
+def _ellipses(ax: "Axes", plane: StateSlice, radii: Radii, half: Array) -> None:
     """Draw the certified and the observed set, if they fit into the axes."""
     ellipses: list[Any] = [(radii.observed, _OBSERVED, (0, (5, 2)), "none")]
     if radii.certified and radii.certified < np.inf:
@@ -124,7 +125,7 @@ def _ellipses(ax: Any, plane: StateSlice, radii: Radii, half: Array) -> None:
             ax.fill(*points.T, color=fill, alpha=0.25, linewidth=0.0, zorder=2)
 
 
-def _legend(figure: "Figure", ax: Any, radii: Radii, run: Trial) -> None:
+def _legend(figure: "Figure", ax: "Axes", radii: Radii, run: Trial) -> None:
     """Draw the legend above the panels."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

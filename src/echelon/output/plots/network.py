@@ -11,6 +11,7 @@ from echelon.output.plots import style as draw
 from echelon.output.plots.agent_style import MOST, count_title, pen_of
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _NUMBERED = 60
@@ -54,18 +55,18 @@ def poles(loop: LoopPoles) -> "Figure":
     return figure
 
 
-def _name_slowest(ax: Any, slowest: float) -> None:
+def _name_slowest(ax: "Axes", slowest: float) -> None:
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.8}
-    near = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "bbox": box}
-    look = {"va": "bottom", "size": draw.page().letters - 1.0, "color": draw.COLOURS[1]}
+    near: draw.Style = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+    look: draw.Style = {"va": "bottom", "size": draw.page().letters - 1.0, "bbox": box}
     # Above the axes, on the side with more room.
     place = float(ax.transAxes.inverted().transform(ax.transData.transform((slowest, 0.0)))[0])
-    side = {"ha": "right" if place > 0.5 else "left"}
+    look |= {"color": draw.COLOURS[1], "ha": "right" if place > 0.5 else "left"}
     text = f"slowest: {slowest:.3g} 1/s".replace("-", "\u2212")
-    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near, **side)
+    ax.annotate(text, (slowest, 1.0), (0, 2), **look, **near)
 
 
-def _wide_axis(ax: Any, real: Array, imaginary: Array) -> None:
+def _wide_axis(ax: "Axes", real: Array, imaginary: Array) -> None:
     """Choose scales that show slow and fast poles, with a margin right of the imaginary axis."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
@@ -183,7 +184,7 @@ def _dot(run: Recording, columns: int) -> float:
 
 
 def _agents_and_links(
-    ax: Any, run: Recording, places: Array, lines: list[Array], weights: Array, columns: int
+    ax: "Axes", run: Recording, places: Array, lines: list[Array], weights: Array, columns: int
 ) -> None:
     small = _dot(run, columns) / 12.0
     _links(ax, run, places, lines, weights, small)
@@ -193,7 +194,7 @@ def _agents_and_links(
         draw.plot(ax, places[agent][None], **look)
     for agent in range(run.agents if run.agents <= _NUMBERED else 0):
         text = {"color": "white", "size": 7.0 * small**0.5, "zorder": 5}
-        ax.annotate(str(agent), places[agent], ha="center", va="center", **text)
+        ax.annotate(str(agent), tuple(places[agent]), ha="center", va="center", **text)
 
 
 def _places(run: Recording) -> tuple[Array, tuple[str, ...]]:
@@ -259,7 +260,7 @@ def _gap(places: Array, edge: Array, line: Array) -> float:
 
 
 def _links(
-    ax: Any, run: Recording, places: Array, curves: list[Array], weights: Array, small: float
+    ax: "Axes", run: Recording, places: Array, curves: list[Array], weights: Array, small: float
 ) -> None:
     """Draw the edges, with widths by their weights."""
     from matplotlib.collections import LineCollection, PolyCollection
@@ -281,7 +282,7 @@ def _links(
     for (first, second), line, way in zip(arrows, pens, ways, strict=True):
         arrow = {"arrowstyle": "-|>", "color": "0.35", "linewidth": line, "shrinkB": 8.0 * small}
         arrow["connectionstyle"] = f"arc3,rad={_bulge(places[first], places[second], way)}"
-        ax.annotate("", places[second], places[first], arrowprops=arrow, zorder=2)
+        ax.annotate("", tuple(places[second]), tuple(places[first]), arrowprops=arrow, zorder=2)
 
 
 def _bulge(first: Array, second: Array, line: Array) -> float:
@@ -306,7 +307,7 @@ def _heads(ends: Array, tall: float) -> list[Array]:
     return list(np.stack([tip, back + out, back - out], axis=1))
 
 
-def _finish_network(ax: Any, places: Array, units: tuple[str, ...]) -> None:
+def _finish_network(ax: "Axes", places: Array, units: tuple[str, ...]) -> None:
     low, high = places.min(axis=0), places.max(axis=0)
     margin = 0.08 * float((high - low).max()) or 1.0
     low, high = low - margin, high + margin

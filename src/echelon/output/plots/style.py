@@ -4,13 +4,14 @@ import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
 from echelon.core.types import Array
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Okabe and Ito's palette, which colour-blind readers can distinguish; without black, which is the
@@ -28,6 +29,10 @@ _TOP = 1e9  # of a logarithmic axis; above it the interesting part would be flat
 _HIGHEST = 9.0  # inches: a page of a journal, less a caption
 _POINTS = 2000  # of a line, more than the pixels that it covers
 _ALL_POINTS = 200_000  # of all lines of one figure
+
+
+Style: TypeAlias = dict[str, Any]
+"""Keywords of matplotlib."""
 
 
 class FigureSize(NamedTuple):
@@ -75,10 +80,9 @@ def style(page: FigureSize = SCREEN) -> Iterator[None]:
     import matplotlib
 
     large, small = ("font.size", "axes.labelsize"), ("xtick", "ytick")
-    letters: dict[Any, Any] = dict.fromkeys(large, page.letters) | {
-        "legend.fontsize": page.letters - 1.0
-    }
+    letters: dict[Any, Any] = dict.fromkeys(large, page.letters)
     letters |= {f"{axis}.labelsize": page.letters - 1.0 for axis in small}
+    letters["legend.fontsize"] = page.letters - 1.0
     token = _page.set(page)
     try:
         with matplotlib.rc_context(_STYLE | letters), np.errstate(over="ignore", invalid="ignore"):
@@ -104,14 +108,14 @@ def crowding(agents: int) -> float:
 _DASHES = ("-", (0, (5.0, 1.5)), (0, (1.2, 1.2)), (0, (5.0, 1.5, 1.2, 1.5)))
 
 
-def leader_pen(place: int, agents: int) -> dict[str, Any]:
+def leader_pen(place: int, agents: int) -> Style:
     """Return the line style of a leader, by its place among the leaders."""
     order = 2.5 if crowding(agents) == 1.0 else 5.0
     dash = _DASHES[place % len(_DASHES)]
     return {"color": LEADER, "linewidth": 1.4, "zorder": order, "linestyle": dash}
 
 
-def pen(place: int, agents: int) -> dict[str, Any]:
+def pen(place: int, agents: int) -> Style:
     """Return the line style of a follower, by its place among the followers."""
     if (crowd := crowding(agents)) < 1.0:
         look = {"linewidth": 1.1 * crowd**0.22, "alpha": crowd**0.35, "rasterized": agents > 100}
@@ -120,7 +124,7 @@ def pen(place: int, agents: int) -> dict[str, Any]:
     return {"color": COLOURS[hue], "linestyle": _DASHES[again % len(_DASHES)]}
 
 
-def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> dict[str, Any]:
+def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> Style:
     """Return the style of markers without a line."""
     return {
         "linestyle": "none",
@@ -134,7 +138,7 @@ def dots(shape: str, colour: str, size: float = 5.0, hollow: bool = False) -> di
     }
 
 
-def plot(ax: Any, *columns: Array, **look: Any) -> None:
+def plot(ax: "Axes", *columns: Array, **look: Any) -> None:
     """Draw a line through points, given as arrays (T, k) of coordinates; one point as a dot."""
     points = np.column_stack(columns)
     if len(points) == 1 and "marker" not in look:
@@ -182,7 +186,7 @@ def raised(unit: str) -> str:
 
 def panels(
     times: Array, horizon: float, count: int, height: float, columns: int = 1
-) -> "tuple[Figure, list[Any]]":
+) -> "tuple[Figure, list[Axes]]":
     """Return panels row by row with a common time axis, `height` inches each if they fit."""
     from matplotlib.figure import Figure
 
@@ -202,7 +206,7 @@ def panels(
     return figure, axes[:count]
 
 
-def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Any]]]":
+def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Axes]]]":
     """Return panels with a common value axis per row and a common time axis per column."""
     from matplotlib.figure import Figure
 
@@ -212,7 +216,7 @@ def grid(rows: int, columns: int, height: float) -> "tuple[Figure, list[list[Any
     return figure, [list(row) for row in axes]
 
 
-def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
+def canvas(labels: Sequence[str]) -> "tuple[Figure, Axes]":
     """Return axes in the plane or in space, for two or three labels."""
     from matplotlib.figure import Figure
 
@@ -231,7 +235,7 @@ def canvas(labels: Sequence[str]) -> "tuple[Figure, Any]":
     return figure, ax
 
 
-def frame(ax: Any, points: Array, alike: bool = True) -> None:
+def frame(ax: "Axes", points: Array, alike: bool = True) -> None:
     """Fit axes around points (..., 2 or 3), with one scale for all directions if `alike`."""
     points = points.reshape(-1, points.shape[-1])
     points = points[np.isfinite(points).all(axis=1)]
@@ -246,8 +250,8 @@ def frame(ax: Any, points: Array, alike: bool = True) -> None:
         _fit_box(ax, half)
     elif alike:
         ax.set_aspect("equal")
-        wide = page().width / 1.4
-        ax.figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
+        wide, figure = page().width / 1.4, cast("Figure", ax.figure)
+        figure.set_figheight(np.clip(0.7 + wide * half[1] / half[0], 2.0, 1.04 * wide))
 
 
 def _fit_box(ax: Any, half: Array) -> None:
@@ -304,7 +308,7 @@ def say_zero(name: str | None, values: Array) -> str | None:
     return f"{name} (always 0)" if empty else name
 
 
-def logarithmic(ax: Any, *values: Array) -> None:
+def logarithmic(ax: "Axes", *values: Array) -> None:
     """Make the value axis logarithmic, with limits around the finite values."""
     from matplotlib.ticker import LogLocator, NullLocator
 
@@ -348,7 +352,7 @@ def finish(figure: "Figure", cut: bool = False, once: bool = False, corner: Any 
     return figure
 
 
-def _label_power(ax: Any) -> None:
+def _label_power(ax: "Axes") -> None:
     """Put the power of ten of a value axis into its label, since the legend is above the axis."""
     from matplotlib.ticker import ScalarFormatter
 
@@ -356,7 +360,7 @@ def _label_power(ax: Any) -> None:
     if ax.name == "3d" or not isinstance(formatter, ScalarFormatter):
         return
     formatter.set_useOffset(False)
-    formatter.set_locs(ax.get_yticks())
+    formatter.set_locs(list(ax.get_yticks()))
     offset = formatter.get_offset().replace("\u2212", "-")
     if offset:
         ax.yaxis.get_offset_text().set_visible(False)
@@ -365,7 +369,7 @@ def _label_power(ax: Any) -> None:
         ax.set_ylabel(f"{name} ({power} {unit}" if unit else f"{name} ({power})")
 
 
-def _add_legend(figure: "Figure", ax: Any) -> None:
+def _add_legend(figure: "Figure", ax: "Axes") -> None:
     """Add a legend beside the axes, or above them on a narrow page."""
     narrow = page().narrow
     if not narrow and ax.name == "3d":
@@ -379,13 +383,13 @@ def _add_legend(figure: "Figure", ax: Any) -> None:
         ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=_columns(ax), **look)
 
 
-def _columns(ax: Any) -> int:
+def _columns(ax: "Axes") -> int:
     """Return how many entries of a legend fit side by side in one column of a page."""
     longest = max(len(text) for text in ax.get_legend_handles_labels()[1])
     return max(1, min(4, int(66 / (longest + 6))))
 
 
-def _legend_above_space(figure: "Figure", ax: Any) -> None:
+def _legend_above_space(figure: "Figure", ax: "Axes") -> None:
     """Add a legend above a space, in a higher figure."""
     columns = _columns(ax)
     rows = -(-len(ax.get_legend_handles_labels()[1]) // columns)

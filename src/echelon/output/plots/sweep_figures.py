@@ -1,7 +1,7 @@
 """Figures of a sweep: distributions of errors, and the share of runs that settle over keys."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from echelon.output.plots.figure_files import save
 
 if TYPE_CHECKING:
     import xarray as xr
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -48,7 +49,7 @@ def _is_line(data: "xr.Dataset", key: str) -> bool:
     return data.sizes[key] > 1 and np.issubdtype(data[key].dtype, np.number)
 
 
-def _canvas(columns: int) -> "tuple[Figure, list[Any]]":
+def _canvas(columns: int) -> "tuple[Figure, list[Axes]]":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 2.8), layout="constrained")
@@ -114,7 +115,7 @@ def _region(data: "xr.Dataset", first: str, second: str) -> "Figure":
     return draw.finish(figure)
 
 
-def _scale(ax: Any, which: str, values: Array) -> None:
+def _scale(ax: "Axes", which: str, values: Array) -> None:
     """Choose a logarithmic axis for values over more than a decade."""
     if values.min() > 0.0 and values.max() >= 30.0 * values.min():
         getattr(ax, f"set_{which}scale")("log")

@@ -1,7 +1,7 @@
 """Figures of paths: in space, from above, in a phase plane."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from echelon.output.plots.agent_style import label, name_of, pen_of, reference_o
 from echelon.output.plots.curves import states_over_time
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _SNAPSHOTS = 6  # times at which a small graph is drawn
@@ -71,7 +72,7 @@ def _paths(run: Recording, axes: list[int]) -> "Figure":
     return draw.finish(figure, cut)
 
 
-def _snapshots(ax: Any, run: Recording, agents: list[int], paths: Array) -> None:
+def _snapshots(ax: "Axes", run: Recording, agents: list[int], paths: Array) -> None:
     """Draw the graph at a few times, agents hollow at the start and square at the end."""
     crowd, last = len(agents), len(paths) - 1
     # More snapshots of a large swarm would hide each other.
@@ -92,7 +93,7 @@ def _snapshots(ax: Any, run: Recording, agents: list[int], paths: Array) -> None
         draw.plot(ax, nowhere, label=name, **look)
 
 
-def _graph(ax: Any, run: Recording, places: Array, times: Array) -> None:
+def _graph(ax: "Axes", run: Recording, places: Array, times: Array) -> None:
     """Draw the graph's edges between places (S, N, k) at S times, the later the darker."""
     ends = places[:, run.edges]
     # NaN interrupts a line, so that all edges of a time are one line instead of thousands.
@@ -128,5 +129,5 @@ def _space(run: Recording) -> list[int]:
     return [0, 1] if len(run.state_names) == 2 else []
 
 
-def _canvas(run: Recording, axes: Sequence[int]) -> "tuple[Figure, Any]":
+def _canvas(run: Recording, axes: Sequence[int]) -> "tuple[Figure, Axes]":
     return draw.canvas([label(run, k) for k in axes])

@@ -5,7 +5,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Final, final
+from typing import IO, TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from echelon.output.plots.agent_style import pen_of
 from echelon.output.plots.animation import MovingScene, moving_of
 from echelon.output.plots.camera import Camera, camera_for
 from echelon.output.plots.space import Space, clipped_places, space_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _SIZE: Final = (960, 540)
 _SCENE: Final = 620
@@ -165,7 +168,7 @@ def scene_places(run: Recording, space: Space) -> Array:
     return places
 
 
-def draw_floor(ax: Any, camera: Camera, space: Space) -> None:
+def draw_floor(ax: "Axes", camera: Camera, space: Space) -> None:
     """Draw a grid under the agents, with its step as a text."""
     from matplotlib.collections import LineCollection
 

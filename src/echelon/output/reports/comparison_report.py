@@ -2,9 +2,10 @@
 
 import io
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from echelon.core.errors import Outcome
+from echelon.core.types import JsonObject
 from echelon.experiments.studies.compare import Comparison, ComparisonRow
 from echelon.guarantees.promises.promise import Promise
 from echelon.output.reports.printed import PRINTED, ROUNDING, is_papers_experiment
@@ -273,7 +274,7 @@ def _listed(labels: Sequence[str]) -> str:
 # ---- data ---------------------------------------------------------------------------------------
 
 
-def comparison_mapping(comparison: Comparison) -> dict[str, Any]:
+def comparison_mapping(comparison: Comparison) -> JsonObject:
     """Return a comparison ready for JSON; missing numbers are None."""
     return {
         "scenario": comparison.scenario,
@@ -288,7 +289,7 @@ def comparison_mapping(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _row_mapping(row: ComparisonRow) -> dict[str, Any]:
+def _row_mapping(row: ComparisonRow) -> JsonObject:
     if row.flight is None or row.numbers is None:
         return {"reason": row.reason}
     result, numbers = row.flight.result, row.numbers

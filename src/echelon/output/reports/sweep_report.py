@@ -1,11 +1,11 @@
 """The text report of a sweep: number of runs, outcomes, and quantiles of errors."""
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.sweeps.axes import SEED
 from echelon.experiments.sweeps.numbers import NUMBERS, SUMMARIZED
 from echelon.experiments.sweeps.sweep_dataset import share_bounds, succeeded
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _LINES, _WARNINGS = 20, 5
 
 
-def sweep_mapping(data: "xr.Dataset") -> dict[str, Any]:
+def sweep_mapping(data: "xr.Dataset") -> JsonObject:
     """Return the numbers of a sweep, ready for JSON."""
     outcome = data["outcome"]
     names = outcome.attrs["flag_meanings"].split()

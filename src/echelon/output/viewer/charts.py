@@ -1,10 +1,10 @@
 """The charts of the page: formation error, V and inputs over time."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.metrics import SETTLED
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots import style as draw
@@ -19,7 +19,7 @@ _POINTS = 1200
 class Charts(NamedTuple):
     """Charts: their descriptions in the header, times (P,), and curves (P, C)."""
 
-    descriptions: list[dict[str, Any]]
+    descriptions: list[JsonObject]
     times: list[float]
     group: Group
 
@@ -38,7 +38,7 @@ class _Sheet:
         colour: int | str,
         log: bool,
         floor: float = FLOOR,
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         curve = np.asarray(values, np.float64)[self.frames]
         if log:
             # A logarithm has no 0, and values below the floor are rounding errors.
@@ -63,7 +63,7 @@ def _frames(run: Recording) -> Array:
     return np.unique(np.concatenate([even, early]).round().astype(int))
 
 
-def _errors(run: Recording, sheet: _Sheet) -> dict[str, Any]:
+def _errors(run: Recording, sheet: _Sheet) -> JsonObject:
     errors, followers = run.formation_errors, list(run.followers)
     if 0 < len(followers) <= NAMED:
         lines = [
@@ -81,7 +81,7 @@ def _errors(run: Recording, sheet: _Sheet) -> dict[str, Any]:
     return _chart("formation error", run.unit, True, lines, marks)
 
 
-def _slope(run: Recording, begin: float, times: float) -> list[dict[str, Any]]:
+def _slope(run: Recording, begin: float, times: float) -> list[JsonObject]:
     """Return the line of the guaranteed rate from the first value on, if there is one."""
     rate = run.promise["rate"] if run.promise["promised"] else None
     if not rate or begin <= 0.0 or not np.isfinite(begin):
@@ -94,7 +94,7 @@ def _slope(run: Recording, begin: float, times: float) -> list[dict[str, Any]]:
     ]
 
 
-def _lyapunov(run: Recording, sheet: _Sheet) -> list[dict[str, Any]]:
+def _lyapunov(run: Recording, sheet: _Sheet) -> list[JsonObject]:
     if run.lyapunov is None:
         return []
     # V is a square, and so are its rounding errors.
@@ -103,7 +103,7 @@ def _lyapunov(run: Recording, sheet: _Sheet) -> list[dict[str, Any]]:
     return [_chart("Lyapunov function V", "", True, lines, [])]
 
 
-def _inputs(run: Recording, sheet: _Sheet) -> dict[str, Any]:
+def _inputs(run: Recording, sheet: _Sheet) -> JsonObject:
     loads = run.loads
     if loads is not None:
         percent = 100.0 * loads.reshape(len(loads), -1)
@@ -132,6 +132,6 @@ def _input_name(run: Recording, k: int, mixed: bool) -> str:
 
 
 def _chart(
-    title: str, unit: str, log: bool, lines: list[dict[str, Any]], marks: list[dict[str, Any]]
-) -> dict[str, Any]:
+    title: str, unit: str, log: bool, lines: list[JsonObject], marks: list[JsonObject]
+) -> JsonObject:
     return {"title": title, "unit": unit, "log": log, "lines": lines, "marks": marks}

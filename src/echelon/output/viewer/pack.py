@@ -6,11 +6,11 @@ Each channel is rounded to a 65535th of its range: 0.3 mm of 20 m.
 import json
 import struct
 import zlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 
 FINE, COARSE, BYTE = 65535, 1023, 255
 GAP = 65535
@@ -33,7 +33,7 @@ class Group(NamedTuple):
     gaps: bool = False
 
 
-def pack(header: dict[str, Any], groups: dict[str, Group]) -> bytes:
+def pack(header: JsonObject, groups: dict[str, Group]) -> bytes:
     """Return a compressed block: the header's length, its JSON, and the numbers.
 
     The header gets the key `groups`: by name, extremes, steps, frames and bytes per number.
@@ -48,7 +48,7 @@ def pack(header: dict[str, Any], groups: dict[str, Group]) -> bytes:
     return zlib.compress(b"".join([struct.pack("<I", len(text)), text, *blocks]), 9)
 
 
-def _pack_group(group: Group) -> tuple[bytes, dict[str, Any]]:
+def _pack_group(group: Group) -> tuple[bytes, JsonObject]:
     values = np.asarray(group.values, np.float64)
     low, high = _extremes(values, group.limits)
     levels = group.levels - 1 if group.gaps else group.levels

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from echelon.core.errors import OutputError
-from echelon.core.types import Array
+from echelon.core.types import Array, JsonObject
 from echelon.experiments.results.recording import Recording
 from echelon.output.plots.space import Space, body_width, clipped_places, space_of
 from echelon.output.plots.style import raised
@@ -103,7 +103,7 @@ def _check_size(run: Recording, groups: Mapping[str, Group], frames: int) -> Non
 # ---- texts and space ----------------------------------------------------------------------------
 
 
-def header(run: Recording, space: Space) -> dict[str, Any]:
+def header(run: Recording, space: Space) -> JsonObject:
     """Return the header of the replay and live pages: all of a run but its frames."""
     size, note = _size(run, space)
     return {
@@ -138,7 +138,7 @@ def heard_by(heard: Array) -> list[int]:
     return (heard @ (2, 1)).tolist()
 
 
-def _schedule(run: Recording) -> dict[str, Any] | None:
+def _schedule(run: Recording) -> JsonObject | None:
     """Return the schedule of edges, each graph as a text of 1 and 0."""
     if run.schedule is None:
         return None
