@@ -1,4 +1,4 @@
-"""What every test runs under: no silent broadcasting, checked shapes, repeatable examples."""
+"""Settings of every test: no silent broadcasting, checked shapes, repeatable draws, time limits."""
 
 import gc
 import os
@@ -28,23 +28,57 @@ gc.set_threshold(20_000, 10, 10)
 
 QUICKLY_COMPILED = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 
+LIMIT = 5.0
+"""Seconds of a processor that a test may take unless it is marked `slow` or `study`."""
+
 
 def pytest_configure(config):
-    """Let the quick tests compile quickly.
+    """Let XLA compile quickly where studies are left out.
 
     Most of the time of the tests is that of compiling programs which run for a millisecond. Without
-    its optimizer, and by the older of its two emitters, XLA needs a third of the time for one. What
-    is not only the quick tests (`-m slow`, `-m ""`) compiles as it does for users.
+    its optimizer, and by the older of its two emitters, XLA needs a third of the time for one. With
+    another selection (`-m study`, `-m ""`) it compiles as for users.
     """
-    if config.option.markexpr == "not slow and not study":
+    if "not study" in config.option.markexpr:
         os.environ.setdefault("XLA_FLAGS", QUICKLY_COMPILED)  # which JAX reads when it first runs
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests that need a browser, so that a machine without one can leave them out."""
+    """Mark what needs a browser, and keep in one process what shares fixtures or compiled code."""
     for item in items:
         if "browser" in item.fixturenames:
             item.add_marker("page")
+        if not is_long(item) or shares_fixtures(item):
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
+def is_long(item):
+    return bool(item.get_closest_marker("slow") or item.get_closest_marker("study"))
+
+
+def shares_fixtures(item):
+    """Whether a test uses a fixture of its file that other tests use too."""
+    fixtures = item._fixtureinfo.name2fixturedefs.values()
+    return any(each[-1].scope == "module" for each in fixtures)
+
+
+def processor_time():
+    """Seconds of processors that this process and the ended ones that it started have taken."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Fail a test without a mark that takes too long; on a loaded machine it may take longer."""
+    begin = processor_time()
+    result = yield
+    spent = processor_time() - begin
+    item.user_properties.append(("processor_time", spent))
+    load = os.getloadavg()[0] / os.cpu_count() if hasattr(os, "getloadavg") else 1.0
+    if spent > LIMIT * max(1.0, load) and not is_long(item):
+        pytest.fail(f"took {spent:.1f} s of a processor; make it quicker or mark it `slow`")
+    return result
 
 
 check_shapes()

@@ -143,7 +143,7 @@ def test_the_wind_has_its_rms_and_neither_time_nor_agents_repeat_it():
 GUSTS = Disturbance(rms={"velocity": 1.0}, input_rms={"ax": 0.3}, hold=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_same_scenario_has_the_same_wind_whatever_is_asked_of_the_run():
     run = drift(disturbance=GUSTS)
     assert np.array_equal(run.states, drift(disturbance=GUSTS).states)
@@ -233,7 +233,7 @@ def test_noise_enters_by_the_normalized_input_behind_the_limits():
     assert not run.states[..., 5].any(), "none on the torque"
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_integrator_keeps_its_order_in_wind():
     wind = Disturbance(constant={"rate": 1.0}, rms={"rate": 3.0}, hold=0.2)
 

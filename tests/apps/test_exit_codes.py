@@ -122,17 +122,22 @@ def test_a_reader_that_has_left_is_no_fault(tmp_path):
     assert left_by_reader(tmp_path, "check", "integrators") == (141, "")
 
 
-@pytest.mark.slow
+COMMANDS = [
+    "--help",
+    "check integrators --json",
+    "design integrators --out again.json",
+    "verify gain.json",
+    "compare integrators --horizon 0.5 --no-figures --out compared",
+    "schema",
+    "doctor",
+]
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--help"],
-        ["check", "integrators", "--json"],
-        ["design", "integrators", "--out", "again.json"],
-        ["verify", "gain.json"],
-        ["compare", "integrators", "--horizon", "0.5", "--no-figures", "--out", "compared"],
-        ["schema"],
-        ["doctor"],
+        pytest.param(line.split(), marks=pytest.mark.slow if "again" in line else pytest.mark.study)
+        for line in COMMANDS
     ],
     ids=lambda words: words[0],
 )

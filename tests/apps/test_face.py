@@ -43,7 +43,7 @@ def run(file):
     [({"a": ("x", [True, False])}, {}), ({}, {"a": ["one", "two"]}), ({}, {"a": True})],
 )
 def test_only_what_a_file_holds_as_it_is_is_written_without_xarray(variables, attributes):
-    with pytest.raises(AssertionError, match="`a` is of"):
+    with pytest.raises(AssertionError, match="`a` has type"):
         Labelled(variables, {}, attributes).netcdf()
 
 

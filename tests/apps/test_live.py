@@ -90,7 +90,7 @@ def test_a_live_loop_is_the_loop_of_a_run_and_tells_its_v(panel, swarm, native):
     assert swarm.advance(still=True).lyapunov == pytest.approx(lyapunov(whole).value[-1], rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_law_that_remembers_and_signals_is_live_too():
     own = ech.load_scenario("paper-global", ["simulation.horizon=0.4", "simulation.engine=jax"])
     found = Panel(own, build(own))
@@ -316,7 +316,7 @@ def test_the_promise_holds_stands_on_its_edge_or_is_lost_with_its_number(panel):
 
 LOOKS = [
     {"coupling": 0.3},
-    pytest.param({}, marks=pytest.mark.slow),
+    pytest.param({}, marks=pytest.mark.study),
     pytest.param({"cut": frozenset({3})}, marks=pytest.mark.slow),
 ]
 

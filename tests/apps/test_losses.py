@@ -106,7 +106,7 @@ def wandering(**settings):
     "settings",
     [
         {"store_every": 7},
-        pytest.param({"store_every": 3000}, marks=pytest.mark.slow),
+        pytest.param({"store_every": 3000}, marks=pytest.mark.study),
         pytest.param({"precision": "float32"}, marks=pytest.mark.slow),
     ],
     ids=["frames", "rare frames", "float32"],
@@ -206,14 +206,14 @@ def test_sigterm_is_an_interrupt(here):
     assert "was interrupted at t = " in out and (here / "o" / "run.nc").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_second_interrupt_ends_at_once_and_keeps_the_chunks(here, echelon):
     code, out, _ = interrupted(here, signal.SIGINT, presses=2)
     assert code == 130 and ech.load_run("o").outcome is ech.Outcome.STOPPED
     assert echelon("run", "--resume", "o", "--no-figures")[0] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_signal_before_anything_is_computed_leaves_no_trace(here):
     with started(EAGER, "run", "mine.yaml", "--out", "o") as process:
         time.sleep(0.5)

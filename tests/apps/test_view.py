@@ -15,8 +15,7 @@ from recordings import flown, swinging
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
-from echelon.experiments.results.dataset import dataset
-from echelon.experiments.results.recording import recording
+from echelon.experiments.results.dataset import recording_of
 from echelon.output.plots.space import space_of
 from echelon.output.viewer.growing import Growing, serve_growing
 from echelon.output.viewer.pack import Group, pack
@@ -418,7 +417,7 @@ def stored(tmp_path_factory):
 
 def test_what_is_read_from_a_file_is_what_ran(stored):
     result, _ = stored
-    run = recording(dataset(result))
+    run = recording_of(result)
     np.testing.assert_array_equal(run.states, result.states)
     np.testing.assert_array_equal(run.errors, result.errors)
     assert run.position == (0, 1) and run.unit == "m"

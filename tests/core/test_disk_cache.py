@@ -23,7 +23,7 @@ from echelon.core import compiled, disk_cache, memoize
 from echelon.core.compiled import CompiledFunction
 from echelon.core.memoize import load_or_compute
 from echelon.core.numerics import precision
-from echelon.experiments.scenario.user_code import own_class
+from echelon.experiments.scenario.user_code import user_class
 
 
 @pytest.fixture(autouse=True)
@@ -299,7 +299,7 @@ def test_nothing_is_kept_once_a_users_file_is_loaded(tmp_path, monkeypatch):
         "from echelon.agents.models import VanDerPol\nclass Mine(VanDerPol):\n    pass\n"
     )
     assert place(1) is not None
-    own_class(tmp_path, "mine.py:Mine", ControlAffine)
+    user_class(tmp_path, "mine.py:Mine", ControlAffine)
     assert place(1) is None and not disk_cache.is_open()
 
 

@@ -115,7 +115,7 @@ def test_the_scenario_s_own_law_is_always_a_row(changes, labels):
         assert told[row.label]["promise"] == ech.promise(result.parts, result.settings).as_mapping()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_law_of_ones_own_flies_beside_the_methods():
     given = {
         "name": "pendulums",

@@ -71,7 +71,15 @@ def test_a_run_among_many_has_the_bits_that_it_has_alone(name, precision):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "planar-quadrotor", "paper-literal", "paper-line"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "paper",
+        pytest.param("planar-quadrotor", marks=pytest.mark.study),
+        "paper-literal",
+        pytest.param("paper-line", marks=pytest.mark.study),
+    ],
+)
 def test_every_run_among_many_has_the_bits_that_it_has_alone(name):
     runs = seeds(built(name), 20, engine="native", store_every=200)
     found = list(Batch().fly(runs))
@@ -239,7 +247,9 @@ def test_a_start_that_a_law_refuses_is_refused_among_many():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [[], ["simulation.dt=0.4"]])
+@pytest.mark.parametrize(
+    "changes", [pytest.param([], marks=pytest.mark.study), ["simulation.dt=0.4"]]
+)
 def test_promises_of_many_seeds_are_those_of_each(changes):
     experiment = built("van-der-pol", "simulation.horizon=4", "report.steady_window=1", *changes)
     parts, chosen = experiment

@@ -135,7 +135,7 @@ def test_a_drift_that_contracts_by_itself_takes_any_coupling():
     ("count", "least"),
     [
         (8, 0),
-        pytest.param(30, 3, marks=pytest.mark.slow),
+        pytest.param(30, 3, marks=pytest.mark.study),
         pytest.param(100, 10, marks=pytest.mark.study),
     ],
 )

@@ -33,7 +33,7 @@ def test_a_yaw_that_loses_the_formation_is_not_promised_unless_the_law_turns(yaw
 
 QUICK = {"paper", "van-der-pol"}
 BUNDLED = [
-    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.study)
     for name in sorted(ech.bundled_scenarios())
 ]
 
@@ -82,7 +82,7 @@ def test_a_step_too_long_for_the_starts_alone_takes_no_promise_away():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.study) for k in (1, 2))])
 def test_the_inner_loop_does_not_chatter_at_the_papers_own_step(seed):
     changes = ["follower.gain={method: inner-loop}", "simulation.horizon=10", f"seed={seed}"]
     run = ech.run(ech.load_scenario("paper", [*changes, "report.steady_window=2"]))

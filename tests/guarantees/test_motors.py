@@ -174,10 +174,10 @@ def hovering():
     return parts, settings, promise(parts, settings)
 
 
-def test_said_briefly_a_promise_is_the_same_but_for_motors_and_arrival(hovering):
+def test_a_brief_promise_is_the_same_but_for_motors_and_arrival(hovering):
     parts, settings, whole = hovering
     # Of other parts, since a promise is kept for those of which it was asked.
-    [brief] = promises(parts.replace(), [settings], briefly=True)
+    [brief] = promises(parts.replace(), [settings], brief=True)
     assert whole.tube.strain is not None and whole.tube.arrival is not None
     assert brief.tube == whole.tube._replace(strain=None, arrival=None)
     assert "motors" not in brief.sentence() and "within 1 cm" not in brief.sentence()

@@ -229,7 +229,7 @@ def test_a_model_has_the_chains_that_it_states(model):
     check_chains(model)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("model", LONG_MODELS, ids=name_of)
 def test_a_vehicle_has_the_chains_that_it_states(model):
     check_chains(model)
@@ -367,7 +367,7 @@ def test_the_farthest_stopping_point_never_moves_away(hears):
     ].max()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_local_rate_is_the_slower_of_root_and_agreement():
     for c, rate in ((20.0, 2.0), (2.0, 2.0 * PAPER_TREE.spectrum().low)):
         result = fly(flight(roots=(2.0,), coupling=c, spread=0.05, observer=False), 8.0, dt=0.005)
@@ -376,7 +376,7 @@ def test_the_local_rate_is_the_slower_of_root_and_agreement():
         assert np.log(late / later) / 2.0 == pytest.approx(rate, rel=0.12)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_told_by_its_parent_each_link_is_alone():
     # e' = -sigma(c e) on every link of a chain, whatever its length: 8 links take no longer than 2.
     ends = []

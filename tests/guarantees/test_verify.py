@@ -64,8 +64,9 @@ def test_the_checker_loads_nothing_of_the_synthesis():
     assert "guarantees.verifier.exact_minors" in ours
     assert not ours & {"agents.models.linearization", "agents.models.model_check"}
     # `core.compiled` and `core.disk_cache` save what is computed; the verifier never uses them.
-    shared = {"core", "core.errors", "core.memoize", "core.limits", "core.numerics"}
-    shared |= {"core.compiled", "core.disk_cache", "core.types", "agents", "guarantees"}
+    shared = {"core", "core.errors", "core.identity", "core.memoize", "core.limits"}
+    shared |= {"core.compiled", "core.disk_cache", "core.numerics", "core.types"}
+    shared |= {"agents", "guarantees"}
     packages = ("agents.models", "guarantees.verifier")
     assert {name for name in ours if not name.startswith(packages)} <= shared
 

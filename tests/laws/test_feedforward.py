@@ -386,7 +386,7 @@ def test_a_scenario_may_ask_for_it_and_is_told_where_it_cannot():
 # ---- T4: why long branches want more than the coupling that suffices ----
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_coupling_that_suffices_for_any_line_loses_quadrotors_on_a_long_one():
     model = Quadrotor()
 

@@ -104,7 +104,7 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
 @pytest.mark.parametrize(
     "spoiled",
     [
-        {"limited": np.array([0.0, 0.1, 0.0, 0.0])},
+        {"saturated": np.array([0.0, 0.1, 0.0, 0.0])},
         {"metric": None},
         {"promise": CERTIFIED | {"theorem": "T2"}},
         {"promise": CERTIFIED | {"hypotheses": []}},

@@ -10,6 +10,7 @@ import pytest
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 GALLERY = DOCS / "assets" / "gallery"
 BOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+ONE_BOOK = [BOOKS[0], *(pytest.param(book, marks=pytest.mark.study) for book in BOOKS[1:])]
 
 
 def script(name, monkeypatch):
@@ -23,7 +24,7 @@ def script(name, monkeypatch):
 LIGHT = ["flock.yaml", "oscillators.yaml", "ring.yaml", "sweep"]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_gallery_s_script_draws(tmp_path, monkeypatch):
     made = drawn(tmp_path, monkeypatch, *LIGHT)
     assert len(made) == 11 and made < committed()
@@ -56,7 +57,7 @@ def test_pictures_are_many_and_small():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("book", BOOKS, ids=lambda book: book.stem)
+@pytest.mark.parametrize("book", ONE_BOOK, ids=lambda book: book.stem)
 def test_a_notebook_runs_and_shows_what_its_page_shows(book, monkeypatch):
     found, pictures = script("render_notebooks", monkeypatch).render(book)
     assert found == book.with_suffix(".md").read_text("utf-8")

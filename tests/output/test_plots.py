@@ -23,9 +23,8 @@ from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
 from echelon.agents.references import Circle, Lemniscate
 from echelon.core.errors import Outcome
-from echelon.experiments.results.dataset import dataset, summary
+from echelon.experiments.results.dataset import recording_of, summary
 from echelon.experiments.results.lyapunov import lyapunov
-from echelon.experiments.results.recording import recording
 from echelon.laws import Consensus, Tracking, TrimInput
 from echelon.output.plots.run_figures import figures, save_figures
 from echelon.output.plots.style import COLOURS, thin
@@ -47,9 +46,9 @@ RUNS = {
 }
 
 
-# A run in space, one without positions, one on a line; the others are drawn by the slow tests.
+# A run in space, one without positions, one on a line; the others are a study.
 QUICK = {"quadrotor", "van-der-pol", "one-axis"}
-FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in RUNS]
+FEW = [n if n in QUICK else pytest.param(n, marks=pytest.mark.study) for n in RUNS]
 
 
 def close(model, graph, method, reference, spread):
@@ -280,7 +279,7 @@ def test_v_and_its_derivative_are_drawn_as_given(runs):
 
 def with_v(result, value, rate):
     """The recording of a run with another V."""
-    return dataclasses.replace(recording(dataset(result)), lyapunov=value, lyapunov_rate=rate)
+    return dataclasses.replace(recording_of(result), lyapunov=value, lyapunov_rate=rate)
 
 
 def test_a_rising_v_is_told_apart(runs):

@@ -39,7 +39,7 @@ def test_the_literal_law_names_its_cause(literal):
     assert "Warning" not in text and "Assumption 5 fails" in text
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_lag_without_feed_forward_is_told():
     text = " ".join(
         ech.report(run("paper", "follower.feedforward=none", "simulation.horizon=20")).split()
@@ -93,7 +93,7 @@ def test_a_weak_coupling_is_named_as_the_cause_of_growth():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_swarm_shows_best_median_and_worst():
     model, graph = ech.models.SingleIntegrator(2), ech.Graph.star(30)
     result = simulate(
@@ -147,7 +147,7 @@ def test_a_horizon_shorter_than_the_slowest_mode_is_told():
     assert "`simulation.horizon`" in remedy and "`echelon design`" in remedy
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
     found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
     [text] = [each for each in found if "the leader stays" in each]

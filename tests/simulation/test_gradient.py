@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.core.memoize import BoundedCache
 from echelon.simulation.engine import gradient as gradients
+from echelon.simulation.engine.content import content_of
 from echelon.simulation.engine.gradient import gradient
 from echelon.simulation.native import backward
 
@@ -141,11 +143,16 @@ def test_native_slopes_are_those_of_jax_for_vehicles_and_the_distances_between_t
     check_equal(parts, SHORT, with_distances, WRT)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_native_slopes_are_those_of_jax_for_a_law_that_remembers():
     parts = points(ech.Graph.ring(5), "relay", dimension=1)
     parts = parts.replace(drive=ech.Laws(ech.laws.StoppingLeader(), ech.laws.StoppingPoint()))
     check_equal(parts, SHORT, all_terms, ("initial", "offsets"))
+
+
+def ready_runs(room=128 * 2**20):
+    """No run that is ready, and room for so many bytes."""
+    return BoundedCache(4, lambda ready: ready.size, room)
 
 
 def test_a_run_is_taken_back_in_stretches_as_in_one(monkeypatch):
@@ -153,7 +160,7 @@ def test_a_run_is_taken_back_in_stretches_as_in_one(monkeypatch):
     once = ech.gradient(parts, settings, with_distances, WRT)
     monkeypatch.setattr(backward, "_TAPE", 1)
     # The run that is ready has a tape already.
-    monkeypatch.setattr(gradients, "_ready", {})
+    monkeypatch.setattr(gradients, "_ready", ready_runs())
     again = ech.gradient(parts, settings, with_distances, WRT)
     for name in WRT:
         np.testing.assert_array_equal(once.slopes[name], again.slopes[name])
@@ -174,7 +181,7 @@ def test_a_run_that_is_ready_is_differentiated_anew_for_each_gain(monkeypatch, e
     gains = ((1.5, 0.8, 2.0), (1.2, 0.9, 2.0), (1.5, 0.8, 2.0), (1.5, 0.8, 1.0))
     ready = [ech.gradient(regained(parts, *gain), settings, squares, wrt) for gain in gains]
     for gain, found in zip(gains, ready, strict=True):
-        monkeypatch.setattr(gradients, "_ready", {})
+        monkeypatch.setattr(gradients, "_ready", ready_runs())
         alone = ech.gradient(regained(parts, *gain), settings, squares, wrt)
         assert found.value == alone.value and found.engine == engine
         for name in wrt:
@@ -210,7 +217,7 @@ class Waning(ech.models.SingleIntegrator):
 
 
 def test_a_run_of_a_user_s_class_is_made_anew(monkeypatch):
-    monkeypatch.setattr(gradients, "_ready", {})
+    monkeypatch.setattr(gradients, "_ready", ready_runs())
     parts = integrators(0.5).replace(model=Waning(1))
     settings = ech.Settings(0.2, 0.1, integrator="euler", engine="native")
 
@@ -224,7 +231,7 @@ def test_a_run_of_a_user_s_class_is_made_anew(monkeypatch):
 
 
 def test_offsets_written_to_are_another_formation_and_equal_ones_the_same(monkeypatch):
-    monkeypatch.setattr(gradients, "_ready", {})
+    monkeypatch.setattr(gradients, "_ready", ready_runs())
     parts, settings = integrators(0.5), ech.Settings(0.2, 0.1, integrator="euler", engine="jax")
 
     def value(offsets):
@@ -242,22 +249,23 @@ def test_offsets_written_to_are_another_formation_and_equal_ones_the_same(monkey
 
 
 def test_what_is_kept_has_a_bound_in_bytes_and_holds_no_moments(monkeypatch):
-    monkeypatch.setattr(gradients, "_ready", {})
+    monkeypatch.setattr(gradients, "_ready", ready_runs())
     settings = ech.Settings(0.2, 0.1, engine="native")
 
     def differentiate(start):
-        ech.gradient(integrators(0.5, start=start), settings, squares, ("coupling",))
+        parts = integrators(0.5, start=start)
+        ech.gradient(parts, settings, squares, ("coupling",))
+        return content_of(parts, settings, ("coupling",))
 
-    differentiate(0.7)
-    (ready,) = gradients._ready.values()
+    ready = gradients._ready.pop(differentiate(0.7))
     assert not any(way.moments for way in ready._native._ways.values())
     way = next(iter(ready._native._ways.values()))
     assert ready.size > way.tape.nbytes + way.felt.nbytes
-    monkeypatch.setattr(gradients, "_ROOM", 2 * ready.size)
+    monkeypatch.setattr(gradients, "_ready", ready_runs(2 * ready.size))
     for start in (0.8, 0.9, 0.6):
         differentiate(start)
     assert 1 <= len(gradients._ready) <= 2
-    monkeypatch.setattr(gradients, "_ROOM", 10)
+    monkeypatch.setattr(gradients, "_ready", ready_runs(10))
     differentiate(0.7)
     assert not gradients._ready
 

@@ -99,7 +99,7 @@ def test_quadrotors_close_up_within_their_motors_limits():
     assert figures.failures == 0 and figures.solves == 4 * 80
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_wind_does_not_add_up_as_it_does_open_loop():
     wind = ech.Disturbance(constant={"vx": 1.0})
     given = {"horizon": 0.6, "initial": None, "disturbance": wind, "store_every": 10}
@@ -111,7 +111,7 @@ def test_wind_does_not_add_up_as_it_does_open_loop():
     assert closed.world.disturbance is wind
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_agents_renamed_fly_the_same():
     order = [0, 3, 1, 2]
     renamed = relabelled(TREE, order)
@@ -145,7 +145,7 @@ def test_each_plans_after_those_before_it_with_the_plans_they_have_just_made(mon
         assert np.array_equal(last[place][1].inputs, last[before][2].inputs)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_in_single_precision_it_flies_the_same():
     double, single = (swarm(precision=name) for name in ("float64", "float32"))
     assert single.states == pytest.approx(double.states, abs=1e-3)

@@ -55,7 +55,7 @@ def test_undisturbed_it_flies_its_plan():
     assert result.inputs[:-1, 0] == pytest.approx(LAW.inputs, abs=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_between_its_times_the_plan_is_the_motion_from_the_last_one():
     # The state at the end of an interval, reached from its beginning, is the next one planned.
     with precision("float64"):
@@ -93,7 +93,7 @@ def test_it_is_planned_once():
     assert LAW.prepared(QUADROTOR, TREE) is LAW
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_in_single_precision_it_leads_the_same():
     double, single = (led(LAW, precision=p) for p in ("float64", "float32"))
     assert single.states == pytest.approx(double.states, abs=2e-3)

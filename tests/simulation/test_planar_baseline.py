@@ -95,7 +95,7 @@ def test_the_leader_as_printed_deviates_by_what_was_found_for_it(changes, pinned
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("terminal", ["origin", "none"])
+@pytest.mark.parametrize("terminal", ["origin", pytest.param("none", marks=pytest.mark.study)])
 def test_a_solver_of_another_kind_finds_the_same_flight(terminal):
     _, found = leader(terminal=terminal)
     wanted = leader_by_least_squares(100, terminal == "origin")
@@ -103,7 +103,7 @@ def test_a_solver_of_another_kind_finds_the_same_flight(terminal):
     assert deviation(found.states) == pytest.approx(deviation(wanted), abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_the_thrust_is_the_whole_thrust_since_as_a_deviation_it_deviates_by_something_else():
     # Weighing the whole thrust lets the agent sink a little; weighing its deviation does not.
     as_deviation = leader_by_least_squares(100, False, thrust_is_a_deviation=True)
@@ -172,7 +172,7 @@ def test_repaired_followers_keep_the_distance_and_arrive_with_their_neighbours()
     assert all((np.abs(plan.inputs) <= limit * (1 + 1e-6)).all() for plan in plans)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_squared_penalty_keeps_the_distance_nearly():
     plans = PlanarBaseline.repaired(separation="penalty").plans(TREE, OFFSETS)
     assert all(plan.solved for plan in plans)

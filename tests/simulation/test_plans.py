@@ -201,7 +201,7 @@ def test_an_agent_knows_the_plans_before_it_and_no_others():
         assert not np.allclose(same.plans[agent].states, moved.plans[agent].states, atol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_plans_keep_to_the_motors_and_without_limits_do_better():
     states = starts(a1=(-0.193, 0, 0))
     within, free = planned(states), planned(states, limits=False)
@@ -213,7 +213,7 @@ def test_plans_keep_to_the_motors_and_without_limits_do_better():
     assert free.plans[0].cost < within.plans[0].cost
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_followers_arrive_at_their_offsets_or_at_their_distances():
     states = starts(a1=(-0.193, 0, 0), a3=(0, 0.18, 0))
     offset = planned(states, limits=False)
@@ -252,7 +252,7 @@ def test_the_replay_of_plans_is_the_plans():
     assert not result.saturated.any()
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_replay_is_a_result_like_any_other(tmp_path):
     states = starts(a1=(-0.193, 0, 0))
     fast = ech.references.FigureEight(amplitude=(1.0, 0.5), rate=6.0)
@@ -272,7 +272,7 @@ def test_a_replay_is_a_result_like_any_other(tmp_path):
     assert [w for w in warned.warnings if "times what the actuators leave" in w]
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_open_loop_a_wrong_mass_and_wind_add_up():
     states = starts()
     still, heavy, windy = (

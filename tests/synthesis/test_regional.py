@@ -114,7 +114,7 @@ def test_where_g_varies_the_rate_holds_with_the_g_of_each_state(tilt):
     assert tilt > 0.3 or region is not None
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_gain_is_made_for_the_turning_thrust_and_not_for_the_trim_s():
     model, low = ech.models.QuadrotorEuler(), LINE.spectrum().low
     domain = Domain.about(model, TILT)
@@ -207,7 +207,7 @@ def test_nilpotent_drifts_have_no_monotone_metric_and_the_block_is_named(model):
     assert "has a Jordan block on the imaginary axis, at 0" in told and "`vx`" in told
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_a_contraction_gain_is_the_weakest_and_keeps_its_rate():
     model = ech.models.Pendulum()
     gain = ech.synthesize(model, LINE, ech.gains.Contraction({"angle": 1.0}, rate=0.5))

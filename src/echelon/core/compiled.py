@@ -5,7 +5,7 @@ import functools
 import os
 import pickle
 import threading
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Generic, NamedTuple, TypeVar, final
 
 import equinox as eqx
@@ -13,10 +13,14 @@ import jax
 from jax.core import Tracer
 
 from echelon.core import disk_cache
+from echelon.core.identity import digest
+from echelon.core.memoize import BoundedCache
 
 _R = TypeVar("_R")
 _LEAST, _NEVER = "jax_persistent_cache_min_compile_time_secs", 1e9
 """Of compiling, s, from which on JAX keeps what it compiles."""
+_MOST: Final = 256
+"""Compiled programs held of each function."""
 _COMPILING: Final = threading.Lock()
 _OTHER: Final = b""
 """Is kept where a program is left to JAX."""
@@ -42,14 +46,11 @@ class _CallArguments(NamedTuple):
     leaves: tuple[Any, ...]
     tree: Any
 
-    def key(self) -> Hashable:
-        """Return what is equal for calls of one program."""
-        kinds = tuple(map(type, self.leaves))
-        return self.tree, self.leaves, kinds, self.forms(), disk_cache.jax_settings()
-
-    def forms(self) -> tuple[Hashable, ...]:
-        """Return the shapes and types of the arrays."""
-        return tuple(map(_form, self.arrays))
+    def digest(self) -> bytes | None:
+        """Return what is equal for calls of one program; None where JAX alone can tell."""
+        # Places stand for what is traced; other arrays are known by their numbers.
+        arguments = jax.tree.unflatten(self.tree, self.leaves)
+        return digest((arguments, tuple(map(_form, self.arrays)), disk_cache.jax_settings()))
 
     def arguments(self, arrays: Sequence[Any]) -> Any:
         """Return the arguments with other arrays in the places of theirs."""
@@ -68,26 +69,23 @@ class CompiledFunction(Generic[_R]):
         """Wrap a function of a module."""
         functools.update_wrapper(self, function)
         self._function, self._plain = function, eqx.filter_jit(function)
-        self._made: dict[Hashable, _Compiled | None] = {}
+        self._programs = BoundedCache[_Compiled | None](_MOST)
 
     def __call__(self, *args: Any, **named: Any) -> _R:
         """Return what the function returns."""
         call = _call_of((args, named)) if disk_cache.is_open() else None
-        if call is None:
+        key = None if call is None else call.digest()
+        if call is None or key is None:
             return self._plain(*args, **named)
-        key = call.key()
-        if key not in self._made:
-            self._made[key] = self._make(call)
-        made = self._made[key]
-        if made is None:
+        compiled = self._programs.get_or_make(key, lambda: self._load_or_compile(call, key))
+        if compiled is None:
             return self._plain(*args, **named)
-        return _filled(made.tree, made.run(*call.arrays))
+        return _filled(compiled.tree, compiled.run(*call.arrays))
 
-    def _make(self, call: _CallArguments) -> _Compiled | None:
-        """Return what is kept for a call, or compile and keep it; None where JAX is to do it."""
+    def _load_or_compile(self, call: _CallArguments, key: bytes) -> _Compiled | None:
+        """Return what is stored for a call, or compile and store it; None where JAX is to do it."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
-        # Places stand for what is traced; other arrays are known by their numbers.
-        file = disk_cache.file_for(name, call.forms(), jax.tree.unflatten(call.tree, call.leaves))
+        file = disk_cache.file_for(name, key)
         if file is None:
             return None
         stored = disk_cache.read(file)

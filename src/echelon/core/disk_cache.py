@@ -7,8 +7,6 @@ these sources would not make.
 """
 
 import contextlib
-import dataclasses
-import enum
 import functools
 import hashlib
 import os
@@ -20,8 +18,8 @@ import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from types import FunctionType
-from typing import Any, Final
+
+from echelon.core.identity import digest
 
 _SETTINGS, _IDLE = ("xla_", "jax_"), ("cache", "log")
 """What the names of settings begin with that may change what JAX makes, and hold if they do not."""
@@ -29,10 +27,6 @@ _BEGAN = time.time() - 1.0
 """When this process began, s, or before: a file's clock is coarser, and some were loaded first."""
 _folder: Path | None = None
 _closed = threading.Event()
-
-
-class _Foreign(Exception):
-    """A value of a class that is not echelon's."""
 
 
 @contextlib.contextmanager
@@ -59,7 +53,7 @@ def close() -> None:
     _closed.set()
 
 
-def file_for(what: str, *values: Any) -> Path | None:
+def file_for(what: str, *values: object) -> Path | None:
     """Return the file for what is made of some values; None where nothing may be kept.
 
     Args:
@@ -69,13 +63,10 @@ def file_for(what: str, *values: Any) -> Path | None:
     folder, ground = _folder, _ground() if is_open() else None
     if folder is None or ground is None:
         return None
-    made = hashlib.sha256(ground)
-    try:
-        for part in _told((what, jax_settings(), values)):
-            made.update(b"%d:" % len(part) + part)
-    except _Foreign:
+    identity = digest((what, jax_settings(), values))
+    if identity is None:
         return None
-    return folder / f"{made.hexdigest()}-made-cache"
+    return folder / f"{hashlib.sha256(ground + identity).hexdigest()}-made-cache"
 
 
 def jax_settings() -> tuple[str, ...]:
@@ -86,19 +77,6 @@ def jax_settings() -> tuple[str, ...]:
     # Of some, JAX knows but the value that all threads have.
     of_all = jax.config.values
     return tuple(f"{name}={getattr(jax.config, name, of_all[name])}" for name in _switches())
-
-
-def is_ours(value: Any) -> bool:
-    """Tell whether a tree of values is of echelon's own classes, and of such as never change.
-
-    What others define may be defined anew, or read what changes, as long as a process runs.
-    """
-    try:
-        for _ in _told(value):
-            pass
-    except _Foreign:
-        return False
-    return True
 
 
 def read(file: Path) -> bytes | None:
@@ -203,63 +181,3 @@ def _processor() -> str:
         named = ("model name", "flags", "CPU part", "Features")
         return "\n".join(line for line in lines if line.startswith(named))
     return " ".join((platform.machine(), platform.processor(), platform.platform()))
-
-
-def _told(value: Any) -> Iterator[bytes]:
-    """Yield what a tree of values is known by, each part with its class."""
-    if isinstance(value, type | FunctionType):
-        yield b"named " + _name_of(value).encode()
-        return
-    if hasattr(value, "dtype") and hasattr(value, "shape"):
-        yield from _bits(value)
-        return
-    yield _name_of(type(value)).encode()
-    if isinstance(value, enum.Enum):
-        yield value.name.encode()
-    elif value is None or isinstance(value, bool | int | str | bytes | float | complex):
-        # `repr` of a float has all its digits, and the sign of 0.
-        yield repr(value).encode()
-    else:
-        for part in _parts(value):
-            yield from _told(part)
-        yield b"."
-
-
-def _parts(value: Any) -> Iterator[Any]:
-    """Yield what a value is made of."""
-    if isinstance(value, tuple | list):
-        yield from value
-    elif isinstance(value, dict):
-        yield from value.items()
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            # Equinox leaves out what is an attribute of the class.
-            yield field.name, getattr(value, field.name)
-    else:
-        raise _Foreign
-
-
-def _bits(array: Any) -> Iterator[bytes]:
-    import numpy as np
-
-    values = np.asarray(array)
-    if values.dtype.hasobject:
-        raise _Foreign
-    yield f"{type(array).__name__} {values.dtype.str}{values.shape}".encode()
-    yield values.tobytes()
-
-
-_OURS: Final = {"echelon", "builtins", "numpy", "jax"}
-
-
-def _name_of(named: Any) -> str:
-    """Return the name of a class or function that stands in echelon or below it."""
-    home, name = named.__module__, named.__qualname__
-    found: Any = sys.modules.get(home)
-    for part in name.split("."):
-        found = getattr(found, part, None)
-    # What cannot be found by its name, as a class that is made in a function, is nobody's.
-    known = named is type(None) or found is named
-    if home.partition(".")[0] not in _OURS or not known:
-        raise _Foreign
-    return f"{home}.{name}"

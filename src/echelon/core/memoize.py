@@ -1,25 +1,76 @@
-"""What is computed once and then kept, since JAX compiles for every new function."""
+"""Results that are computed once and then held, since JAX compiles for every new function."""
 
 import contextlib
-import dataclasses
 import functools
-import hashlib
 import pickle
+import sys
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import Any, ParamSpec, TypeVar, final
-
-import jax
-import numpy as np
+from typing import Generic, ParamSpec, TypeVar, final
 
 from echelon.core import disk_cache
+from echelon.core.identity import process_key
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_V = TypeVar("_V")
 
 _MOST = 256
-"""Answers remembered of each function: a sweep over parameters must not fill the memory."""
-_LARGE = 4096
-"""Bytes of an array of which a digest is remembered."""
+"""Results held of each function: a sweep over parameters must not fill the memory."""
+
+
+@final
+class BoundedCache(Generic[_V]):
+    """Values by their keys, of which the least recently used is dropped when there are too many.
+
+    Args:
+        most: how many are held.
+        size: of a value, such as its bytes; without it only their number counts.
+        room: how much of that size is held.
+    """
+
+    def __init__(
+        self, most: int, size: Callable[[_V], int] | None = None, room: int = sys.maxsize
+    ) -> None:
+        """Begin with none."""
+        self._most, self._size, self._room = most, size, room
+        self._values: OrderedDict[Hashable, _V] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def get_or_make(self, key: Hashable | None, make: Callable[[], _V]) -> _V:
+        """Return the value of a key, made where there is none; without a key it is made anew."""
+        if key is not None:
+            with self._lock:
+                if key in self._values:
+                    self._values.move_to_end(key)
+                    return self._values[key]
+        # Not under the lock: what takes long must not keep other threads waiting.
+        value = make()
+        if key is not None:
+            self.put(key, value)
+        return value
+
+    def pop(self, key: Hashable) -> _V | None:
+        """Return the value of a key, which is held no longer; None where there is none."""
+        with self._lock:
+            return self._values.pop(key, None)
+
+    def put(self, key: Hashable, value: _V) -> None:
+        """Hold a value as the latest used."""
+        with self._lock:
+            self._values[key] = value
+            self._values.move_to_end(key)
+            while len(self._values) > self._most or self.total() > self._room:
+                self._values.popitem(last=False)
+
+    def total(self) -> int:
+        """Return the size of all values together."""
+        # Anew each time, since what is held may grow.
+        return 0 if self._size is None else sum(map(self._size, self._values.values()))
 
 
 def memoize(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -29,76 +80,32 @@ def memoize(function: Callable[_P, _R]) -> Callable[_P, _R]:
     nothing. What cannot be hashed is computed for anew each time. What is returned is shared
     between callers, so it must be read-only.
     """
-
-    @functools.lru_cache(_MOST)
-    def answer(call: "_MemoKey") -> _R:
-        name = f"{function.__module__}.{function.__qualname__}"
-        return load_or_compute(
-            lambda: function(*call.args, **call.named), name, call.args, call.named
-        )
+    name, results = f"{function.__module__}.{function.__qualname__}", BoundedCache[_R](_MOST)
 
     @functools.wraps(function)
     def once(*args: _P.args, **named: _P.kwargs) -> _R:
-        call = _MemoKey(identify((args, named)), args, named)
-        try:
-            hash(call)
-        except TypeError:
-            return function(*args, **named)
-        return answer(call)
+        def compute() -> _R:
+            return load_or_compute(lambda: function(*args, **named), name, args, named)
+
+        return results.get_or_make(process_key((args, named)), compute)
 
     return once
 
 
-def load_or_compute(make: Callable[[], _R], what: str, *values: Any) -> _R:
-    """Return what is made of values, or what another process has made and kept of the same."""
+def load_or_compute(compute: Callable[[], _R], what: str, *values: object) -> _R:
+    """Return what is computed of values, or what another process has computed of the same."""
     file = disk_cache.file_for(what, *values)
     if file is None:
-        return make()
+        return compute()
     packed = disk_cache.read(file)
-    # What cannot be read is made again, and what cannot be written is not kept.
+    # What cannot be read is computed again, and what cannot be written is not stored.
     if packed is not None:
         with contextlib.suppress(Exception):
             body, *buffers = pickle.loads(packed)
             return pickle.loads(body, buffers=buffers)
-    made, parts = make(), list[pickle.PickleBuffer]()
+    result, parts = compute(), list[pickle.PickleBuffer]()
     with contextlib.suppress(Exception):
         # Arrays apart, so that they are read-only when they come back.
-        body = pickle.dumps(made, 5, buffer_callback=parts.append)
+        body = pickle.dumps(result, 5, buffer_callback=parts.append)
         disk_cache.write_if_unchanged(file, pickle.dumps([body, *(bytes(part) for part in parts)]))
-    return made
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class _MemoKey:
-    """Arguments, equal to others where the class and the value of each part are."""
-
-    value: Hashable
-    args: tuple[Any, ...] = dataclasses.field(compare=False)
-    named: dict[str, Any] = dataclasses.field(compare=False)
-
-
-def identify(value: Any) -> Any:
-    """Return what is equal, and hashable, for values of the same types and bits alone.
-
-    What is no value of a known kind stands for itself. Where that cannot be hashed, nor can this.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = dataclasses.fields(value)
-        return type(value), tuple(identify(getattr(value, field.name)) for field in fields)
-    if isinstance(value, tuple | list):
-        return type(value), tuple(map(identify, value))
-    if isinstance(value, dict):
-        return dict, tuple((identify(key), identify(each)) for key, each in value.items())
-    # Numbers by their bytes too, since 0.0 equals -0.0, and NaN not itself.
-    if isinstance(value, float | complex | np.ndarray | jax.Array):
-        array = np.asarray(value)
-        # Those of objects would be addresses, which say nothing of what stands there.
-        if not array.dtype.hasobject:
-            return type(value), array.dtype.str, array.shape, bits_of(array)
-    return type(value), value
-
-
-def bits_of(array: np.ndarray) -> bytes:
-    """Return the bits of an array; of a large one, such as a graph's, a digest that is held."""
-    return array.tobytes() if array.nbytes < _LARGE else hashlib.sha256(array.tobytes()).digest()
+    return result

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from echelon.core.errors import EchelonError
-from echelon.core.types import Array
+from echelon.core.identity import array_bits
 
 
 class Trace(NamedTuple):
@@ -46,10 +46,10 @@ def trace(function: Callable[..., Any], *arguments: Any) -> Trace:
 
 def _steps(jaxpr: Any) -> Iterator[tuple[str, list[bytes], bool]]:
     """Yield all equations, inner ones too: name, the numbers in it, and whether it rounds."""
-    yield "constants", [_bits(value) for value in getattr(jaxpr, "consts", ())], False
+    yield "constants", [array_bits(value) for value in getattr(jaxpr, "consts", ())], False
     for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         name = equation.primitive.name
-        numbers = [_bits(v.val) for v in equation.invars if hasattr(v, "val")]
+        numbers = [array_bits(v.val) for v in equation.invars if hasattr(v, "val")]
         yield name, numbers, name == "convert_element_type" and _shortens(equation)
         for inner in _inner(equation.params.values()):
             yield from _steps(inner)
@@ -72,14 +72,6 @@ def _shortens(equation: Any) -> bool:
         and jax.numpy.issubdtype(kinds[1], jax.numpy.floating)
         and (kinds[1].itemsize < kinds[0].itemsize)
     )
-
-
-def _bits(value: Any) -> bytes:
-    # Keys of random numbers are no numbers of NumPy's.
-    if jax.numpy.issubdtype(getattr(value, "dtype", np.dtype(float)), jax.dtypes.extended):
-        value = jax.random.key_data(value)
-    array: Array = np.asarray(value)
-    return array.tobytes()
 
 
 def check_function(

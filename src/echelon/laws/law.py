@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Iterator
-from typing import Any, TypeAlias, final
+from typing import Any, ClassVar, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -68,12 +68,14 @@ class Law(eqx.Module):
         feedforward: which feed-forward the law needs, none unless replaced by a field, an
             attribute or a property.
         leaderward: whether followers hear those neighbours alone that are nearer to a leader.
+        prover: the `Promise` of followers under the law, as `module:class`.
         turning: whether a follower is told the heading that its leader follows.
     """
 
     feedforward = Feedforward.NONE
     leaderward = False
     turning = False
+    prover: ClassVar[str] = "echelon.guarantees.promises.metric_promise:MetricPromise"
 
     @property
     def information(self) -> tuple[str, ...]:
@@ -94,6 +96,10 @@ class Law(eqx.Module):
 
     def metric(self, model: ControlAffine) -> Array | None:
         """Return P (n, n) of the paper's Lyapunov function for this law; None if it has none."""
+        return None
+
+    def strength(self, period: Scalar | float) -> Scalar | float | None:
+        """Return the coupling c where inputs are held for a period (s); None if it has none."""
         return None
 
     def prepared(self, model: ControlAffine, graph: Graph) -> "Law":

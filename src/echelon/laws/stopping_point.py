@@ -107,6 +107,7 @@ class StoppingPoint(FlatLaw):
         ahead: (r, m) how the leader's path begins; taken over by `following`.
     """
 
+    prover = "echelon.guarantees.stopping.stopping_promise:StoppingPromise"
     feedforward: Feedforward = eqx.field(
         default=Feedforward.RELAY, static=True, converter=Feedforward.named
     )

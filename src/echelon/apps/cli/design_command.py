@@ -49,7 +49,7 @@ def design(
     from echelon.synthesis.gains.gain_file import save_gain
 
     report = study(loaded, method)
-    sentence, best, stopping = report.because, report.recommended, report.stopping
+    sentence, best, law_design = report.because, report.recommended, report.law_design
     summary: JsonObject = {"recommended": None}
     if best is not None and best.gain is not None and best.parts is not None:
         summary = {"recommended": best.method, "because": sentence}
@@ -59,15 +59,15 @@ def design(
             radii = _draw(best.parts, report.settings, figures, slice_)
             sentence += f"\n{radii}" if radii else ""
             summary["radii"] = radii
-    if stopping is not None:
-        sentence += f"\n{stopping.sentence()}"
-        summary["stopping_point"] = stopping.as_mapping()
+    if law_design is not None:
+        sentence += f"\n{law_design.sentence()}"
+        summary[law_design.name] = law_design.as_mapping()
     summary["methods"] = [tables.design_row(row) for row in report.designs]
     if as_json:
         print(json.dumps(summary, indent=2))
     else:
         tables.print_designs(summary["methods"], sentence)
-    raise typer.Exit(0 if best is not None or stopping is not None else 1)
+    raise typer.Exit(0 if best is not None or law_design is not None else 1)
 
 
 def _draw(parts: "Parts", settings: "Settings", folder: Path, states: str | None) -> str | None:

@@ -14,7 +14,7 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array, JsonObject
 from echelon.experiments.scenario.build import Experiment, build
 from echelon.experiments.scenario.scenario import Scenario, scenario_from_mapping
-from echelon.laws.stopping_point import StoppingPoint
+from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.gains.gain import Gain
 from echelon.synthesis.gains.riccati import Riccati
 
@@ -178,5 +178,5 @@ def _coupling(experiment: Experiment) -> float | None:
     drive, dt = experiment.parts.drive, experiment.settings.dt
     if drive.gain is not None:
         return drive.gain.coupling
-    law = getattr(drive, "follower", None)
-    return float(law.strength(dt)) if isinstance(law, StoppingPoint) else None
+    coupling = drive.follower.strength(dt) if isinstance(drive, Laws) else None
+    return None if coupling is None else float(coupling)

@@ -23,7 +23,7 @@ from echelon.experiments.results.metrics import (
     representatives,
     steady_error,
 )
-from echelon.experiments.results.recording import FORMAT
+from echelon.experiments.results.recording import FORMAT, Recording, recording
 from echelon.guarantees.promises.promise import promise
 from echelon.simulation.engine.result import Result
 
@@ -84,6 +84,12 @@ def labelled(result: Result) -> Labelled:
         "output_unit": ("output", _output_units(model)),
     }
     return Labelled(variables, coordinates, _attributes(result))
+
+
+def recording_of(result: Result) -> Recording:
+    """Return a run as figures draw it."""
+    data = labelled(result)
+    return recording(data.arrays(), data.attributes)
 
 
 def _edges(result: Result) -> dict[str, Any]:

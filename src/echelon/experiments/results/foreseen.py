@@ -1,12 +1,13 @@
-"""A run before it is computed, and while it is: what a page is told of either."""
+"""Recordings of a run before it is computed, and of each part while it is computed."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from echelon.agents.network.hearing import heard_along
 from echelon.core.numerics import precision
@@ -17,9 +18,9 @@ from echelon.simulation.engine.record import Stretch
 from echelon.simulation.step.settings import Settings
 
 _AHEAD, _PLACES = 60.0, 121
-"""Seconds of the reference that the scene makes room for, and at how many times it is asked."""
+"""Seconds of the reference by which the scene is sized, and the number of times in them."""
 _BLOCK = 32
-"""Frames of which V is found at once: one number, so that no stretch compiles anew."""
+"""Frames for which V is computed at once: a constant, so that it is compiled once."""
 
 _NO_PROMISE = MappingProxyType(
     {"promised": False, "rate": None, "theorem": None, "sentence": "", "kind": "", "hypotheses": ()}
@@ -29,23 +30,22 @@ _NO_PROMISE = MappingProxyType(
 def foreseen(
     parts: Parts,
     settings: Settings,
-    states: Array,
+    states: Float[Array, "N n"],
     name: str,
     promise: Mapping[str, Any] = _NO_PROMISE,
 ) -> Recording:
-    """Return a recording of agents that stay on their goals: it says where the scene will be.
+    """Return a recording of agents that stay at their goals, by which the scene is sized.
 
     Args:
         parts: of the run, with its drive completed.
-        settings: of it.
-        states: (N, n) at the beginning.
+        settings: of the run.
+        states: at the beginning.
         name: of the scenario.
-        promise: as `Promise.as_mapping` gives it; none by default.
+        promise: as `Promise.as_mapping` returns it; none by default.
     """
     model, graph = parts.model, parts.graph
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
     ahead = _ahead(parts, states, times)
-    y = ahead - parts.formation.offsets
     limits = model.input_limits if settings.limits else None
     return Recording(
         name=name,
@@ -56,7 +56,7 @@ def foreseen(
             np.asarray(model.trim[1], float), (_PLACES, graph.agents, len(model.input_names))
         ),
         reference=None,
-        errors=y - y[:, list(graph.nearest_leader())],
+        errors=_errors(ahead, parts.formation.offsets, graph.nearest_leader()),
         offsets=parts.formation.offsets,
         leaders=graph.leaders,
         nearest=np.array(graph.nearest_leader()),
@@ -73,7 +73,7 @@ def foreseen(
         lyapunov=None,
         lyapunov_rate=None,
         metric=None,
-        limited=np.zeros(graph.agents),
+        saturated=np.zeros(graph.agents),
         tracking=None,
         modes=None,
         promise=promise,
@@ -83,22 +83,32 @@ def foreseen(
     )
 
 
-def heard_in(parts: Parts) -> Array:
-    """Return whether each end of each edge hears the other under what drives the agents, (E, 2)."""
+def heard_in(parts: Parts) -> Bool[Array, "E 2"]:
+    """Return whether each end of each edge receives from the other under the laws."""
     drive = parts.drive
     reacts = drive.reacts or "neighbours' states" in drive.information.leader
-    # A drive without laws, such as plans, asks for all neighbours.
+    # A drive without laws, such as plans, uses all neighbours.
     leaderward = getattr(getattr(drive, "follower", None), "leaderward", False)
     return heard_along(parts.graph, leaderward, reacts)
 
 
-def _ahead(parts: Parts, start: Array, times: Array) -> Array:
-    """Return where agents start, and their goals from then on, (T, N, n)."""
+def _errors(
+    states: Float[Array, "T N n"], offsets: Float[Array, "N n"], nearest: Sequence[int] | Array
+) -> Float[Array, "T N n"]:
+    """Return the deviations from the goals relative to each agent's nearest leader."""
+    y = states - offsets
+    return y - y[:, np.asarray(nearest)]
+
+
+def _ahead(
+    parts: Parts, start: Float[Array, "N n"], times: Float[Array, " T"]
+) -> Float[Array, "T N n"]:
+    """Return the states at the start, and the goals from then on."""
     with precision("float64"):
-        wanted = parts.drive.reference_states(parts.model, jnp.asarray(times))
-    if wanted is None:
+        path = parts.drive.reference_states(parts.model, jnp.asarray(times))
+    if path is None:
         return np.broadcast_to(start, (len(times), *np.shape(start))).copy()
-    states = np.asarray(wanted)[:, None] + parts.formation.offsets
+    states = np.asarray(path)[:, None] + parts.formation.offsets
     states[0] = start
     return states
 
@@ -106,26 +116,25 @@ def _ahead(parts: Parts, start: Array, times: Array) -> Array:
 def so_far(
     run: Recording, stretch: Stretch, potential: Callable[[Array], Array] | None
 ) -> Recording:
-    """Return a stretch of a run as a recording of its own.
+    """Return a part of a run as a recording.
 
     Args:
-        run: as it was foreseen.
-        stretch: of it, all its numbers finite.
-        potential: V (T,) of states less their offsets (T, N, n); None where there is none.
+        run: as returned by `foreseen`.
+        stretch: the part, with finite numbers.
+        potential: V (T,) of states minus offsets (T, N, n); None where there is none.
     """
-    y = stretch.states - run.offsets
     return dataclasses.replace(
         run,
         times=stretch.times,
         states=stretch.states,
         inputs=stretch.inputs,
-        errors=y - y[:, run.nearest],
-        lyapunov=None if potential is None else _in_blocks(potential, y),
+        errors=_errors(stretch.states, run.offsets, run.nearest),
+        lyapunov=None if potential is None else _in_blocks(potential, stretch.states - run.offsets),
     )
 
 
-def _in_blocks(potential: Callable[[Array], Array], y: Array) -> Array:
-    """Return V (T,) of states less their offsets (T, N, n), the last block filled with copies."""
+def _in_blocks(potential: Callable[[Array], Array], y: Float[Array, "T N n"]) -> Float[Array, " T"]:
+    """Return V of states minus offsets, block by block, the last one padded with copies."""
     whole = -(-len(y) // _BLOCK) * _BLOCK
     padded = np.concatenate([y, np.repeat(y[-1:], whole - len(y), axis=0)])
     return np.concatenate([potential(part) for part in np.split(padded, whole // _BLOCK)])[: len(y)]

@@ -1,4 +1,4 @@
-"""Labelled arrays as netCDF, without what labels can do beyond that and takes long to load."""
+"""Labelled arrays: as plain arrays, as netCDF, or as an `xarray.Dataset`, which is slow to load."""
 
 import io
 from collections.abc import Mapping
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 
 class Labelled(NamedTuple):
-    """What an `xarray.Dataset` is made of.
+    """The arguments of `xarray.Dataset`.
 
     Attributes:
         variables: name -> (dimensions, values) or (dimensions, values, attributes).
-        coordinates: the same; what has its name for its one dimension may be values alone.
-        attributes: of the whole.
+        coordinates: the same; one with the name of its only dimension may be values alone.
+        attributes: of the dataset.
     """
 
     variables: Mapping[str, Any]
@@ -27,37 +27,42 @@ class Labelled(NamedTuple):
     attributes: Mapping[str, Any]
 
     def dataset(self) -> "xr.Dataset":
-        """Return it with all that labels can do."""
+        """Return the dataset."""
         import xarray as xr
 
         return xr.Dataset(*self)
 
+    def arrays(self) -> dict[str, Array]:
+        """Return the values of all variables and coordinates by name."""
+        parts = {**self.variables, **self.coordinates}
+        return {name: _whole(name, part)[1] for name, part in parts.items()}
+
     def netcdf(self) -> bytes:
-        """Return the file that `xarray` writes of the dataset, and reads as it."""
-        # Here, since it takes long to load; `xarray` takes five times as long.
+        """Return the same file that `xarray` writes of the dataset."""
+        # Here, since it is slow to load; `xarray` takes five times as long.
         import h5netcdf
 
         file, labels = io.BytesIO(), set(self._labels())
         with h5netcdf.File(file, "w") as written:
             for name, part in {**self.variables, **self.coordinates}.items():
-                dimensions, values, told = _whole(name, part)
-                if name in self.variables and (mine := self._labels(dimensions)):
-                    told["coordinates"], labels = " ".join(mine), labels - {*mine}
-                _write(written, name, dimensions, values, told)
-            # Labels that no variable names are named by the whole.
+                dimensions, values, attributes = _whole(name, part)
+                if name in self.variables and (own := self._labels(dimensions)):
+                    attributes["coordinates"], labels = " ".join(own), labels - {*own}
+                _write(written, name, dimensions, values, attributes)
+            # Labels that no variable names are attributes of the dataset.
             rest = {"coordinates": " ".join(sorted(labels))} if labels else {}
             for name, value in {**self.attributes, **rest}.items():
-                known = value if isinstance(value, str) else _known(name, np.atleast_1d(value))
-                written.attrs[name] = known
+                plain = value if isinstance(value, str) else _numeric(name, np.atleast_1d(value))
+                written.attrs[name] = plain
         return file.getvalue()
 
     def _labels(self, dimensions: tuple[str, ...] | None = None) -> list[str]:
-        """Return which coordinates label dimensions, or any, under another name."""
-        owns = {name: _whole(name, part)[0] for name, part in self.coordinates.items()}
+        """Return the coordinates whose name is not that of their dimension, of these dimensions."""
+        labels = {name: _whole(name, part)[0] for name, part in self.coordinates.items()}
         return [
             name
-            for name, own in owns.items()
-            if name not in own and (dimensions is None or set(own) <= set(dimensions))
+            for name, over in labels.items()
+            if name not in over and (dimensions is None or set(over) <= set(dimensions))
         ]
 
 
@@ -78,19 +83,19 @@ def _write(
     for dimension, size in zip(dimensions, values.shape, strict=True):
         if dimension not in file.dimensions:
             file.dimensions[dimension] = size
-    # Of text no file knows the length beforehand, and what is NaN in a float is missing.
+    # Text has variable length, and NaN marks a missing float.
     text = values.dtype.kind in "UO"
-    kind: Any = _text() if text else _known(name, values).dtype
+    kind: Any = _text() if text else _numeric(name, values).dtype
     missing = values.dtype.type(np.nan) if values.dtype.kind == "f" else None
-    made = file.create_variable(name, dimensions, kind, fillvalue=missing)
-    made[...] = values.astype(object) if text else values
+    variable = file.create_variable(name, dimensions, kind, fillvalue=missing)
+    variable[...] = values.astype(object) if text else values
     for key, value in attributes.items():
-        made.attrs[key] = value
+        variable.attrs[key] = value
 
 
-def _known(name: str, values: Array) -> Array:
-    """Return numbers of a kind that stands in a file as it is."""
-    assert values.dtype.kind in "iuf", f"`{name}` is of {values.dtype}, which `xarray` turns first"
+def _numeric(name: str, values: Array) -> Array:
+    """Return numbers of a type that netCDF stores unchanged."""
+    assert values.dtype.kind in "iuf", f"`{name}` has type {values.dtype}, which netCDF lacks"
     return values
 
 

@@ -1,6 +1,6 @@
-"""A run as its dataset has it: arrays and names, read from `run.nc` without a model's code.
+"""A run as plain arrays and names, from its dataset or from `run.nc`, without the model's code.
 
-Whatever draws a run draws this, so that what is drawn again is what was drawn first.
+All figures draw a recording, so that a stored run gives the same figures as the run itself.
 """
 
 import dataclasses
@@ -8,41 +8,39 @@ import functools
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
 
 from echelon.agents.network.switching import Schedule
 from echelon.core.errors import OutputError
 
-if TYPE_CHECKING:
-    import xarray as xr
-
 FORMAT = 3
-"""Of `run.nc`; another one lacks what is read here."""
+"""Version of the format of `run.nc`; files of other versions are refused."""
 
 
 class InputBounds(NamedTuple):
-    """What actuators can deliver, low <= G u <= high: G (k, m), and (k,) twice."""
+    """Limits of the actuators, low <= G u <= high."""
 
-    matrix: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    matrix: Float[np.ndarray, "k m"]
+    low: Float[np.ndarray, " k"]
+    high: Float[np.ndarray, " k"]
 
 
 class TrackingErrors(NamedTuple):
-    """Leaders' outputs minus their references', (T, L, q), with the outputs' names and units."""
+    """Outputs of the L leaders minus their references', with the outputs' names and units."""
 
-    error: np.ndarray
+    error: Float[np.ndarray, "T L q"]
     names: tuple[str, ...]
     units: tuple[str, ...]
 
 
 class LoopPoles(NamedTuple):
-    """Poles (K, n) of the modes looked at, each with its eigenvalue of the graph (K,)."""
+    """Poles of the checked modes, each mode with its eigenvalue of the graph."""
 
-    poles: np.ndarray
-    eigenvalues: np.ndarray
+    poles: Complex[np.ndarray, "K n"]
+    eigenvalues: Float[np.ndarray, " K"]
 
 
 @final
@@ -53,44 +51,44 @@ class Recording:
     Attributes:
         name: of the scenario, or of the model.
         model: the name of its class.
-        times: (T,) s.
-        states: (T, N, n).
-        inputs: (T, N, m), as delivered.
-        reference: (T, n), what the leaders follow; None where that is nothing.
-        errors: (T, N, n), deviation from the goal relative to the nearest leader.
-        offsets: (N, n).
+        times: s.
+        states: of all agents.
+        inputs: as delivered by the actuators.
+        reference: the leaders' reference state; None without one.
+        errors: deviation of each agent from its goal relative to its nearest leader.
+        offsets: each agent's goal relative to its leader.
         leaders: their numbers.
-        nearest: (N,), each agent's nearest leader.
-        edges: (E, 2), with `weights` (E,); of a graph that switches, all that are there at times.
-        heard: (E, 2), whether each end of an edge hears the other.
-        schedule: when which weights hold; None where they never change.
+        nearest: each agent's nearest leader.
+        edges: with `weights`; of a graph that switches, all edges that exist at some time.
+        heard: whether each end of an edge receives from the other.
+        schedule: the weights over time; None where they are constant.
         state_names, state_units, input_names, input_units: as texts.
         position: indices of the coordinates that a picture shows; none of an abstract agent.
-        bounds: of the inputs; None where nothing limits them.
-        lyapunov: V (T,); None where the law has none.
-        lyapunov_rate: its derivative (T,).
-        metric: P (n, n) of V, where there is a gain; else None.
-        limited: (N,), the part of the steps in which a limit acted.
+        bounds: of the inputs; None without limits.
+        lyapunov: V; None where the law has none.
+        lyapunov_rate: its derivative.
+        metric: P of V, where there is a gain; else None.
+        saturated: fraction of steps in which a limit changed the agent's input.
         tracking: of the leaders; None without a reference.
         modes: None where the laws have no linearization.
-        promise: as `Promise.as_mapping` gives it.
+        promise: as `Promise.as_mapping` returns it.
         horizon, dt: s.
-        attributes: provenance and settings, as they were stored.
+        attributes: provenance and settings, as stored.
     """
 
     name: str
     model: str
-    times: np.ndarray
-    states: np.ndarray
-    inputs: np.ndarray
-    reference: np.ndarray | None
-    errors: np.ndarray
-    offsets: np.ndarray
+    times: Float[np.ndarray, " T"]
+    states: Float[np.ndarray, "T N n"]
+    inputs: Float[np.ndarray, "T N m"]
+    reference: Float[np.ndarray, "T n"] | None
+    errors: Float[np.ndarray, "T N n"]
+    offsets: Float[np.ndarray, "N n"]
     leaders: tuple[int, ...]
-    nearest: np.ndarray
-    edges: np.ndarray
-    weights: np.ndarray
-    heard: np.ndarray
+    nearest: Int[np.ndarray, " N"]
+    edges: Int[np.ndarray, "E 2"]
+    weights: Float[np.ndarray, " E"]
+    heard: Bool[np.ndarray, "E 2"]
     schedule: Schedule | None
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
@@ -98,10 +96,10 @@ class Recording:
     input_units: tuple[str, ...]
     position: tuple[int, ...]
     bounds: InputBounds | None
-    lyapunov: np.ndarray | None
-    lyapunov_rate: np.ndarray | None
-    metric: np.ndarray | None
-    limited: np.ndarray
+    lyapunov: Float[np.ndarray, " T"] | None
+    lyapunov_rate: Float[np.ndarray, " T"] | None
+    metric: Float[np.ndarray, "n n"] | None
+    saturated: Float[np.ndarray, " N"]
     tracking: TrackingErrors | None
     modes: LoopPoles | None
     promise: Mapping[str, Any]
@@ -111,30 +109,30 @@ class Recording:
 
     @property
     def agents(self) -> int:
-        """How many there are."""
+        """The number of agents."""
         return self.states.shape[1]
 
     @functools.cached_property
-    def arrows(self) -> np.ndarray:
-        """Edges (K, 2) along which only the second hears the first, turned so where need be."""
+    def arrows(self) -> Int[np.ndarray, "K 2"]:
+        """Edges along which only one end receives, as (sender, receiver)."""
         one = self.heard.sum(axis=1) == 1
         return np.where(self.heard[one, 1:], self.edges[one], self.edges[one, ::-1])
 
-    def linked(self, time: float) -> np.ndarray:
-        """Return which edges are there at a time (s), (E,)."""
+    def linked(self, time: float) -> Bool[np.ndarray, " E"]:
+        """Return which edges exist at a time (s)."""
         if self.schedule is None:
             return np.ones(len(self.edges), bool)
         return self.schedule.weights[self.schedule.row(time)] > 0.0
 
     @functools.cached_property
     def followers(self) -> tuple[int, ...]:
-        """Those who do not lead."""
-        leads = {*self.leaders}
-        return tuple(k for k in range(self.agents) if k not in leads)
+        """The agents that do not lead."""
+        leaders = {*self.leaders}
+        return tuple(k for k in range(self.agents) if k not in leaders)
 
     @property
     def measured(self) -> tuple[int, ...]:
-        """Indices of the states that errors are measured on: the position if any, else all."""
+        """Indices of the states in formation errors: the position if any, else all."""
         return self.position or tuple(range(len(self.state_names)))
 
     @property
@@ -143,39 +141,39 @@ class Recording:
         return "m" if self.position else ""
 
     @functools.cached_property
-    def formation_errors(self) -> np.ndarray:
-        """Each agent's distance from its goal, (T, N)."""
+    def formation_errors(self) -> Float[np.ndarray, "T N"]:
+        """Each agent's distance from its goal."""
         with np.errstate(over="ignore", invalid="ignore"):
             return np.linalg.norm(self.errors[:, :, list(self.measured)], axis=2)
 
     @property
     def rate(self) -> float | None:
-        """At what rate errors are promised to shrink, 1/s; None where nothing is, or no rate."""
+        """The rate at which errors are guaranteed to decay, 1/s; None where none is guaranteed."""
         return self.promise["rate"] or None if self.promise["promised"] else None
 
-    def error_bound(self) -> np.ndarray | None:
-        """Return what a theorem bounds every formation error by, (T,); None where none does.
+    def error_bound(self) -> Float[np.ndarray, " T"] | None:
+        """Return the bound of a theorem on every formation error; None where no theorem applies.
 
-        Theorem 1 has S = sum_i delta_i'P delta_i shrink as e^(-2 alpha t), from starts in the
-        certified set, without what the scenario adds and while no limit acts. Of a delta with
-        delta'P delta <= S the measured part is no longer than the root of S times the largest
+        By Theorem 1, S = sum_i delta_i'P delta_i decays as e^(-2 alpha t) from starts in the
+        certified set, if no limit acts and the scenario adds no wind or mismatch. If
+        delta'P delta <= S, the norm of the measured part is at most the root of S times the largest
         eigenvalue of that block of P^-1.
         """
-        told, found = self.promise, self.promise.get("certified_set")
-        held = {x["statement"] for x in told["hypotheses"] if x["verdict"] == "holds"}
-        proved = told["theorem"] == "T1" and found is not None and self.rate is not None
-        if not proved or "starts in the certified set" not in held or self.metric is None:
+        promise, certified = self.promise, self.promise.get("certified_set")
+        satisfied = {x["statement"] for x in promise["hypotheses"] if x["verdict"] == "holds"}
+        proved = promise["theorem"] == "T1" and certified is not None and self.rate is not None
+        if not proved or "starts in the certified set" not in satisfied or self.metric is None:
             return None
-        if self.limited.any() or "without what the scenario adds" in told["sentence"]:
+        if self.saturated.any() or "without what the scenario adds" in promise["sentence"]:
             return None
-        begin = float(np.einsum("ia,ab,ib->", self.errors[0], self.metric, self.errors[0]))
+        start = float(np.einsum("ia,ab,ib->", self.errors[0], self.metric, self.errors[0]))
         block = np.linalg.inv(self.metric)[np.ix_(self.measured, self.measured)]
-        widest = float(np.linalg.eigvalsh(block)[-1])
-        return np.sqrt(begin * widest) * np.exp(-(self.rate or 0.0) * self.times)
+        largest = float(np.linalg.eigvalsh(block)[-1])
+        return np.sqrt(start * largest) * np.exp(-(self.rate or 0.0) * self.times)
 
     @property
-    def loads(self) -> np.ndarray | None:
-        """Rows of G u as fractions of their range, (T, N, k); None where a row has none."""
+    def loads(self) -> Float[np.ndarray, "T N k"] | None:
+        """Rows of G u as fractions of their range; None where a row has a single bound."""
         if self.bounds is None:
             return None
         matrix, low, high = self.bounds
@@ -188,13 +186,15 @@ def read_recording(file: Path) -> Recording:
     """Return the run in a netCDF file.
 
     Raises:
-        OutputError: it cannot be read, is damaged, or was written by another version.
+        OutputError: the file cannot be read, is damaged, or has another format.
     """
     import xarray as xr
 
     try:
         with xr.open_dataset(file, engine="h5netcdf") as data:
-            return recording(data.load())
+            data.load()
+            arrays = {str(name): variable.values for name, variable in data.variables.items()}
+            return recording(arrays, {str(key): value for key, value in data.attrs.items()})
     except OutputError as error:
         raise OutputError(f"`{file}`: {error}") from error
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
@@ -204,66 +204,65 @@ def read_recording(file: Path) -> Recording:
         ) from error
 
 
-def recording(data: "xr.Dataset") -> Recording:
-    """Return a dataset of `echelon.dataset` as arrays and names.
+def recording(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> Recording:
+    """Return a run from the arrays and the attributes of its dataset.
 
     Raises:
-        OutputError: the dataset is of another version.
-        KeyError: it is no dataset of a run.
+        OutputError: the dataset has another format.
+        KeyError: it is not a dataset of a run.
     """
-    _check_format(data)
-    told, values = data.attrs, {str(name): part.values for name, part in data.items()}
-    names = tuple(str(name) for name in data["state"].values)
-    # As text, since netCDF keeps an empty list as nothing.
-    shown = str(told["position"]).split()
+    _check_format(arrays, attributes)
+    names = _texts(arrays, "state")
     return Recording(
-        name=str(told.get("scenario") or told["model"]),
-        model=str(told["model"]),
-        times=data["time"].values,
-        states=values["states"],
-        inputs=values["inputs"],
-        reference=values.get("reference"),
-        errors=values["error"],
-        offsets=values["offset"],
-        leaders=tuple(int(k) for k in np.flatnonzero(values["is_leader"])),
-        nearest=values["nearest_leader"].astype(int),
-        edges=values["edge_agents"].astype(int),
-        weights=values["edge_weight"],
-        heard=values["edge_heard"].astype(bool),
-        schedule=_schedule(values),
+        name=str(attributes.get("scenario") or attributes["model"]),
+        model=str(attributes["model"]),
+        times=arrays["time"],
+        states=arrays["states"],
+        inputs=arrays["inputs"],
+        reference=arrays.get("reference"),
+        errors=arrays["error"],
+        offsets=arrays["offset"],
+        leaders=tuple(int(k) for k in np.flatnonzero(arrays["is_leader"])),
+        nearest=arrays["nearest_leader"].astype(int),
+        edges=arrays["edge_agents"].astype(int),
+        weights=arrays["edge_weight"],
+        heard=arrays["edge_heard"].astype(bool),
+        schedule=_schedule(arrays),
         state_names=names,
-        state_units=_texts(data, "state_unit"),
-        input_names=_texts(data, "input"),
-        input_units=_texts(data, "input_unit"),
-        position=tuple(names.index(name) for name in shown),
-        bounds=_bounds(values),
-        lyapunov=values.get("lyapunov"),
-        lyapunov_rate=values.get("lyapunov_rate"),
-        metric=values.get("P"),
-        limited=values["saturated"],
-        tracking=_tracking(data, values),
-        modes=_modes(values),
-        promise=json.loads(told["promise"]),
-        horizon=float(told["horizon"]),
-        dt=float(told["dt"]),
-        attributes=dict(told),
+        state_units=_texts(arrays, "state_unit"),
+        input_names=_texts(arrays, "input"),
+        input_units=_texts(arrays, "input_unit"),
+        # As text, since netCDF stores an empty list as nothing.
+        position=tuple(names.index(name) for name in str(attributes["position"]).split()),
+        bounds=_bounds(arrays),
+        lyapunov=arrays.get("lyapunov"),
+        lyapunov_rate=arrays.get("lyapunov_rate"),
+        metric=arrays.get("P"),
+        saturated=arrays["saturated"],
+        tracking=_tracking(arrays),
+        modes=_modes(arrays),
+        promise=json.loads(attributes["promise"]),
+        horizon=float(attributes["horizon"]),
+        dt=float(attributes["dt"]),
+        attributes=dict(attributes),
     )
 
 
-def _check_format(data: "xr.Dataset") -> None:
-    if "states" not in data or "model" not in data.attrs:
-        raise KeyError("it holds no states of agents")
-    found = int(data.attrs.get("format", 1))
-    if found != FORMAT:
-        by = data.attrs.get("version_echelon", "an unknown version")
+def _check_format(arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
+    if "states" not in arrays or "model" not in attributes:
+        raise KeyError("it has no states of agents")
+    version = int(attributes.get("format", 1))
+    if version != FORMAT:
+        by = attributes.get("version_echelon", "an unknown version")
         raise OutputError(
-            f"the run was written in format {found} by echelon {by}, and this version reads format "
-            f"{FORMAT}; `echelon run FOLDER --out OTHER` computes it again from its scenario."
+            f"the run was written in format {version} by echelon {by}, but this version reads "
+            f"format {FORMAT}; `echelon run FOLDER --out OTHER` computes it again from its "
+            "scenario."
         )
 
 
-def _texts(data: "xr.Dataset", name: str) -> tuple[str, ...]:
-    return tuple(str(text) for text in data[name].values)
+def _texts(arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
+    return tuple(str(text) for text in arrays[name])
 
 
 def _schedule(values: Mapping[str, np.ndarray]) -> Schedule | None:
@@ -280,11 +279,11 @@ def _bounds(values: Mapping[str, np.ndarray]) -> InputBounds | None:
     return InputBounds(values["limit_matrix"], values["limit_low"], values["limit_high"])
 
 
-def _tracking(data: "xr.Dataset", values: Mapping[str, np.ndarray]) -> TrackingErrors | None:
+def _tracking(values: Mapping[str, np.ndarray]) -> TrackingErrors | None:
     if "tracking_error" not in values:
         return None
     return TrackingErrors(
-        values["tracking_error"], _texts(data, "output"), _texts(data, "output_unit")
+        values["tracking_error"], _texts(values, "output"), _texts(values, "output_unit")
     )
 
 

@@ -87,8 +87,8 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     if reference is not None:
         found = asked(parts.model, reference, settings.horizon)
         yield _reference_line(parts.model, found, settings)
-    if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
-        yield from _flat_lines()
+    if promise.paper_lines:
+        yield from promise.paper_lines
         return
     monotone = _monotone_line(parts, promise)
     yield monotone
@@ -106,7 +106,7 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
 
 def _leader_line(promise: Promise) -> Statement:
     """Assumption 4: the leader tracks its reference, by linearization."""
-    name, slow = Topic.LEADER_TRACKING, promise.own
+    name, slow = Topic.LEADER_TRACKING, promise.leader_mode
     if slow is None:
         return unneeded(name, _PROOF, "it follows nothing")
     if not promise.linear:
@@ -159,16 +159,6 @@ def _monotone_line(parts: Parts, promise: Promise) -> Statement:
     text = f"no P > 0 can: mode at {eigenvalue_text(found.eigenvalue)} 1/s along {names}"
     remedy = "an `inner-loop` gain makes it hold, `riccati` does without"
     return fails(name, _LINEAR, text, *number, remedy=remedy)
-
-
-def _flat_lines() -> Iterator[Statement]:
-    """Assumption 5, Lemma 4 and the conditions on P where stopping points agree (T5)."""
-    text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
-    yield holds(Topic.MONOTONE, _PROOF, text, 0.0, "0")
-    text = "for offsets of every flat output: they are symmetries of the chains"
-    yield holds(Topic.DRIFT_ALONG_Z, _PROOF, text)
-    for name in (Topic.LMI_AS_PRINTED, Topic.FINITE):
-        yield unneeded(name, _PROOF, "T5 asks nothing of a P")
 
 
 def _printed_line(parts: Parts, promise: Promise) -> Statement:

@@ -41,6 +41,6 @@ def check(parts: Parts, settings: Settings) -> CheckResult:
             *drift_lines(parts, settings, found),
             *found.hypotheses.values(),
             killing_line(parts, found),
-            *margin_lines(parts, settings, found),
+            *margin_lines(parts, found),
         )
     return CheckResult(lines, found)

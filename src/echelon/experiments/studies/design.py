@@ -24,8 +24,7 @@ from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.scenario import Scenario
 from echelon.experiments.scenario.yaml import Fault
 from echelon.experiments.studies.speedup import speedup
-from echelon.experiments.studies.stopping_design import StoppingDesign, design_stopping
-from echelon.guarantees.promises.promise import Promise, promise
+from echelon.guarantees.promises.promise import LawDesign, Promise, promise, prover_of
 from echelon.laws.consensus import Consensus
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
@@ -94,15 +93,15 @@ _RANK = {Theorem.T1: 3, Theorem.T2: 2, Theorem.A5: 1}
 class Designs(NamedTuple):
     """The methods that were tried, the one that is recommended if any, and why.
 
-    `settings` are those that all were tried under. Of followers under the law `stopping-point`,
-    `stopping` is what motors are certified with, if anything is.
+    `settings` are those that all were tried under. `law_design` is what else the followers' own law
+    can be guaranteed with, if it seeks anything.
     """
 
     designs: tuple[Design, ...]
     recommended: Design | None
     because: str
     settings: Settings
-    stopping: StoppingDesign | None = None
+    law_design: LawDesign | None = None
 
 
 def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = None) -> Designs:
@@ -133,8 +132,8 @@ def design(scenario: Scenario | tuple[Parts, Settings], method: str | None = Non
     )
     best, dt = recommended(tried, built.settings.dt), built.settings.dt
     why = "No method gives a stable loop here." if best is None else because(best, tried, dt)
-    stopping = design_stopping(*built) if method is None else None
-    return Designs(tried, best, why, built.settings, stopping)
+    own = prover_of(built.parts.drive).design(*built) if method is None else None
+    return Designs(tried, best, why, built.settings, own)
 
 
 _ALWAYS = GainSpec(method=FixedGain.name, P="identity")

@@ -17,13 +17,10 @@ from echelon.core.statement import (
     vacuous,
 )
 from echelon.core.types import Array
-from echelon.core.words import Feedforward, Kind, Verdict
+from echelon.core.words import Feedforward, Kind
 from echelon.guarantees.promises.closed_loop import LinearLoop
-from echelon.guarantees.promises.promise import Promise
-from echelon.guarantees.stopping.stopping_run import agreement_modes
-from echelon.laws.stopping_point import StoppingPoint
+from echelon.guarantees.promises.promise import AgreementModes, Promise
 from echelon.simulation.engine.parts import Parts
-from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates import margins
 from echelon.synthesis.certificates.bounds import invariant_ellipsoid, peak_gain
 
@@ -34,16 +31,16 @@ _STIFF = 1e10
 """Beyond it the slowest mode has less than six digits, since rounding is of the fastest."""
 
 
-def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[Statement]:
+def margin_lines(parts: Parts, promise: Promise) -> Iterator[Statement]:
     """Yield the margins of a loop that decays."""
     loop = promise.loop
     if parts.graph.schedule is not None:
         yield from _turns_lines(promise)
         return
-    if promise.hypotheses[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED:
+    if promise.agreement is not None:
         text = "any coupling; what delay is left depends on c and the graph alone"
         yield unneeded(Topic.MARGINS, _KIND, text)
-        yield from _stopping_lines(parts, settings)
+        yield from _agreement_lines(promise.agreement)
         return
     if not promise.linear:
         text = "the model bends at the trim, and has no modes there"
@@ -75,7 +72,7 @@ def margin_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator
 def _turns_lines(promise: Promise) -> Iterator[Statement]:
     """Yield what is known of graphs that take turns: how weak the coupling may get (T8)."""
     edge, lines = promise.edge, promise.hypotheses
-    anywhere = lines[Hypothesis.SMOOTH].verdict is Verdict.NOT_NEEDED
+    anywhere = promise.agreement is not None
     if not anywhere and edge is not None and not lines[Hypothesis.DISAGREEMENT_DECAY].fails:
         low = edge / promise.loop.closed.coupling
         what = "factors on the coupling with which one P serves all graphs, whenever they switch"
@@ -101,15 +98,13 @@ def _spread_line(low: float, high: float, delay: float, best: float) -> Statemen
     return fails(Topic.EIGENVALUE_RATIO, _KIND, text, ratio, f"{ratio:.3g}", remedy=remedy)
 
 
-def _stopping_lines(parts: Parts, settings: Settings) -> Iterator[Statement]:
+def _agreement_lines(agreement: AgreementModes) -> Iterator[Statement]:
     """Yield what delay agreement bears where zeta' = -c L zeta: pi/2 - |arg lambda| by c |lambda|.
 
     A root s = i w of s + c lambda e^(-s tau) has w = c |lambda|, and reaches the axis first at that
     delay.
     """
-    law, dt = getattr(parts.drive, "follower", None), settings.dt
-    assert isinstance(law, StoppingPoint)
-    c, values = float(law.strength(dt)), agreement_modes(parts.graph, law)
+    c, values = agreement
     delays = (0.5 * np.pi - np.abs(np.angle(values))) / (c * np.abs(values))
     at, sizes = int(delays.argmin()), np.abs(values)
     text = f"uniform delay of z, lost at lambda = {values[at]:.3g}"

@@ -95,4 +95,4 @@ def _promised(built: Sequence[Experiment]) -> Iterator[Promise | EchelonError]:
     for _, alike in groupby(built, key=lambda each: id(each.parts)):
         runs = list(alike)
         # A dataset has no place for what motors give.
-        yield from promises(runs[0].parts, [each.settings for each in runs], briefly=True)
+        yield from promises(runs[0].parts, [each.settings for each in runs], brief=True)

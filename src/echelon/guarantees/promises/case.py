@@ -23,7 +23,7 @@ class Case(NamedTuple):
         loop: the closed loop near the trim.
         leaders: what they do by themselves.
         region: what is promised on a domain; None for nothing.
-        beside: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
+        slopes: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
             they could be found; else None.
         frozen: the law along the leader's path and at the starts; None where it is not asked.
     """
@@ -32,9 +32,9 @@ class Case(NamedTuple):
     settings: Settings
     loop: LinearLoop
     leaders: Leaders
-    region: RegionCertificate | None
-    beside: Array | None
-    frozen: FrozenLaws | None
+    region: RegionCertificate | None = None
+    slopes: Array | None = None
+    frozen: FrozenLaws | None = None
 
     @property
     def domain(self) -> Domain | None:

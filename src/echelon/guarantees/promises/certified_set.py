@@ -31,6 +31,11 @@ class CertifiedSet(NamedTuple):
     why: str
     remedy: str = ""
 
+    def as_mapping(self) -> dict[str, object]:
+        """Return it ready for JSON, where an infinite radius is None."""
+        radius = self.radius if self.radius < float("inf") else None
+        return {"radius": radius, "kind": str(self.kind), "why": self.why}
+
 
 def certified_set(
     parts: Parts, settings: Settings, leaders: Leaders, region: RegionCertificate | None
@@ -103,22 +108,31 @@ def size_of(parts: Parts, states: Array) -> float:
     return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
 
 
-def set_lines(
-    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
-) -> list[Statement]:
-    """Return the set as a line, and whether the starts (N, n) lie in it."""
+def set_line(region: RegionCertificate | None, found: CertifiedSet | None) -> Statement:
+    """Say which set of starts is certified."""
     if found is None:
-        local = region is not None and region.theorem is Theorem.T2
-        text = "T2 is local and certifies no set" if local else "needs a region"
-        return [unneeded(each, Kind.PROOF, text) for each in (Hypothesis.SET, Hypothesis.STARTS)]
-    size, radius, kind = size_of(parts, states), found.radius, found.kind
-    if radius > 0.0:
-        line = holds(Hypothesis.SET, kind, found.why, radius, f"radius {radius:.3g}")
-    else:
-        line = fails(Hypothesis.SET, kind, found.why, radius, "empty", remedy=found.remedy)
-    number = size, f"{size:.3g} of {radius:.3g}"
-    if size <= radius:
+        return unneeded(Hypothesis.SET, Kind.PROOF, _no_set(region))
+    if found.radius > 0.0:
+        number = found.radius, f"radius {found.radius:.3g}"
+        return holds(Hypothesis.SET, found.kind, found.why, *number)
+    return fails(Hypothesis.SET, found.kind, found.why, found.radius, "empty", remedy=found.remedy)
+
+
+def starts_line(
+    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
+) -> Statement:
+    """Say whether starts (N, n) lie in the set."""
+    if found is None:
+        return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
+    size = size_of(parts, states)
+    number = size, f"{size:.3g} of {found.radius:.3g}"
+    if size <= found.radius:
         text = "from there no follower leaves the domain"
-        return [line, holds(Hypothesis.STARTS, kind, text, *number)]
+        return holds(Hypothesis.STARTS, found.kind, text, *number)
     text, remedy = "what the set promises does not reach them", "start nearer to the goals"
-    return [line, fails(Hypothesis.STARTS, kind, text, *number, remedy=remedy)]
+    return fails(Hypothesis.STARTS, found.kind, text, *number, remedy=remedy)
+
+
+def _no_set(region: RegionCertificate | None) -> str:
+    local = region is not None and region.theorem is Theorem.T2
+    return "T2 is local and certifies no set" if local else "needs a region"

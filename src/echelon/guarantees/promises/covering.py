@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from echelon.core.statement import Hypothesis
 from echelon.core.types import Array
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import Promise
@@ -39,25 +38,7 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     if against:
         yield f"The {what} does not cover this run: {against}; {remedy}."
     else:
-        yield f"The {what} covers this run: {_stayed(promise)}."
-
-
-def _stayed(promise: Promise) -> str:
-    """Return why a run is covered that stayed in the domain."""
-    if promise.theorem is Theorem.T5:
-        return f"no limit acted, and from these starts {promise.hypotheses[Hypothesis.STARTS].text}"
-    if promise.theorem is Theorem.T2:
-        return "the leader stayed in the domain, and small errors about it shrink"
-    starts = promise.hypotheses[Hypothesis.STARTS]
-    if starts.fails:
-        return (
-            f"the starts lie outside of the certified set ({starts.number_text}), but all agents "
-            "stayed in the domain at every stored frame"
-        )
-    return (
-        f"the starts lie in the certified set ({starts.number_text}), and all agents "
-        "stayed in the domain"
-    )
+        yield f"The {what} covers this run: {promise.why_covered()}."
 
 
 def first_exit(result: Result, promise: Promise) -> Exit | None:

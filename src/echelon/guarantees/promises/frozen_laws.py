@@ -135,21 +135,32 @@ class FrozenLaws(NamedTuple):
     """The laws frozen away from the trim.
 
     Attributes:
-        times: (K,) s; none where the leader rests at its trim or follows no known path.
+        path: the leader's; without any states where it rests at its trim or follows none that is
+            known.
         along: the followers' law along the leader's path.
         leader: the leader's own law there; None where it is not known.
         starts: the followers' law where agents start.
         blamed: what takes the law out of where it stabilizes, in words; empty where nothing does.
-        turns: the least and the largest rate of the heading along the path, rad/s, in whose axes
-            all slopes are; none where it does not turn, or the law does not.
     """
 
-    times: Array
+    path: LeaderPath
     along: ModeMatrices
     leader: ModeMatrices | None
     starts: ModeMatrices
-    blamed: str
-    turns: tuple[float, ...] = ()
+    blamed: str = ""
+
+    @property
+    def times(self) -> Array:
+        """Of the path, (K,) s."""
+        return self.path.times
+
+    @property
+    def turns(self) -> tuple[float, ...]:
+        """The least and the largest rate of the heading along the path, rad/s.
+
+        All slopes are in its axes; none where it does not turn, or the law does not.
+        """
+        return self.path.extreme_rates()
 
     @property
     def travelled(self) -> tuple[ModeMatrices, ...]:
@@ -198,31 +209,25 @@ def frozen_of(
     path = route_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
-    few = starts[_few(starts)]
-    both = zip(path.rows, path.at_start(parts.model, few), strict=True)
-    rows = PathSamples._make(map(np.concatenate, both))
-    count, all_ = len(path.times), _followers(parts, loop, rows)
-    along, begun = (
-        ModeMatrices(*(x[part] for x in all_)) for part in (slice(count), slice(count, None))
-    )
-    turns = path.extreme_rates()
+    begun = frozen_at(parts, loop, path, states[None])
+    if not len(path.times):
+        none = ModeMatrices(*(part[:0] for part in begun))
+        return FrozenLaws(path, none, None, begun)
+    along = _followers(parts, loop, path.rows)
     own = _leader(parts, path.own_headings(parts), along)
-    found = FrozenLaws(path.times, along, own, begun, "", turns)
-    if not count or not found.growth().lost:
+    found = FrozenLaws(path, along, own, begun)
+    if not found.growth().lost:
         return found
     return found._replace(blamed=_blamed(parts, loop, path, found))
 
 
-def frozen_at(
-    parts: Parts, settings: Settings, loop: LinearLoop, leaders: Leaders, states: Array
-) -> ModeMatrices:
+def frozen_at(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
     """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
 
-    They are those of `frozen_of`, the same number of each run after the other.
+    It is the same number of each run after the other.
     """
     starts = states - parts.formation.offsets
     starts = starts[:, _few(starts[0])]
-    path = route_of(parts, settings, leaders)
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
     found = [

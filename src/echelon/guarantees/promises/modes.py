@@ -47,16 +47,16 @@ def _bent(case: Case) -> Iterator[Statement]:
         text = "by the slopes of all sides of the trim, where the model bends"
         rate = -region.rate
         yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{rate:.3g} 1/s")
-    yield _held_beside(case)
+    yield _sampled_bend(case)
 
 
-def _held_beside(case: Case) -> Statement:
+def _sampled_bend(case: Case) -> Statement:
     """Whether each side of a bend decays in steps of the integrator, as if it were all around."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     shown = f"dt {settings.dt:g} s"
-    if case.region is None or case.beside is None:
+    if case.region is None or case.slopes is None:
         return vacuous(name, Kind.SAMPLES, _BENT, None, shown)
-    A, dt = case.beside[:, None], settings.dt
+    A, dt = case.slopes[:, None], settings.dt
     radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
     text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
     if radius < 1.0:

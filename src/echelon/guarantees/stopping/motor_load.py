@@ -147,7 +147,7 @@ class _MotorCase(NamedTuple):
         return cls(frame, chain, path, led, speeds, base, starts)
 
 
-def motors_bear(run: StoppingRun) -> bool:
+def motors_suffice_for(run: StoppingRun) -> bool:
     """Tell whether the motors are certified from the starts of a run."""
     frame = run.parts.model.airframe
     if frame is None or _beyond(run):

@@ -120,11 +120,10 @@ class StoppingRun(NamedTuple):
         return min(self.leader.speed_of(output), c * float(away))
 
 
-def stopping_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun | None:
-    """Return what T5 speaks of; None under another law."""
+def stopping_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun:
+    """Return a run of prepared parts under the law, from states (N, n)."""
     drive = parts.drive
-    if not isinstance(drive, Laws) or not isinstance(drive.follower, StoppingPoint):
-        return None
+    assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
     assert isinstance(drive.leader, StoppingLeader)
     offsets = jnp.asarray(parts.formation.offsets)
     flat = np.asarray(_flat(parts.model, drive.follower, jnp.asarray(states), offsets))

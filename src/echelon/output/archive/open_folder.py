@@ -27,11 +27,10 @@ def open_run(place: PathLike) -> Recording:
         return read_recording(path / DATA)
     if path.is_dir() and Chunks(path).exist:
         # Here, since building the scenario's parts loads JAX.
-        from echelon.experiments.results.dataset import dataset
-        from echelon.experiments.results.recording import recording
+        from echelon.experiments.results.dataset import recording_of
         from echelon.output.archive.run_folder import load_run
 
-        return recording(dataset(load_run(path)))
+        return recording_of(load_run(path))
     if not path.exists():
         raise OutputError(f"`{path}` does not exist; give the folder of a run, or its `{DATA}`.")
     if (path / "comparison.json").is_file():

@@ -84,4 +84,4 @@ def write_findings(result: Result, folder: Path, figures: bool = True) -> None:
             # Here, since matplotlib takes long to load and only figures need it.
             from echelon.output.plots.run_figures import save_figures
 
-            save_figures(recording(data.dataset()), folder)
+            save_figures(recording(data.arrays(), data.attributes), folder)

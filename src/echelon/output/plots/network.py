@@ -158,7 +158,7 @@ def _near_leaders(run: Recording) -> Recording:
     return dataclasses.replace(
         run,
         **{name: getattr(run, name)[:, agents] for name in ("states", "inputs", "errors")},
-        **{name: getattr(run, name)[agents] for name in ("offsets", "limited")},
+        **{name: getattr(run, name)[agents] for name in ("offsets", "saturated")},
         leaders=tuple(np.flatnonzero(np.isin(agents, run.leaders)).tolist()),
         nearest=np.zeros(len(agents), int),
         edges=np.searchsorted(agents, run.edges[links]),

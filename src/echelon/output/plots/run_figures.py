@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from echelon.core.errors import OutputError, did_you_mean, listing
-from echelon.experiments.results.dataset import dataset
-from echelon.experiments.results.recording import Recording, recording
+from echelon.experiments.results.dataset import recording_of
+from echelon.experiments.results.recording import Recording
 from echelon.output.plots import curves, network, trajectories
 from echelon.output.plots import style as draw
 from echelon.output.plots.figure_files import save
@@ -69,7 +69,7 @@ def figures(
             )
     if not len(run.times):
         return {}
-    data = recording(dataset(run)) if isinstance(run, Result) else run
+    data = recording_of(run) if isinstance(run, Result) else run
     with draw.style(page):
         drawings = {name: make(data) for name, make in _MAKERS.items() if name in what}
     return {name: figure for name, figure in drawings.items() if figure is not None}

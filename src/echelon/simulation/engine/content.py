@@ -8,34 +8,23 @@ import jax
 import numpy as np
 
 from echelon.agents.network.formation import Formation
-from echelon.core.disk_cache import is_ours
-from echelon.core.memoize import identify
+from echelon.core.identity import digest
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.step.settings import Settings
 
 
-def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable:
-    """Return all that a run rests on but the followers' gain; None where that cannot be told.
+def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable | None:
+    """Return what is equal for the same run but for the followers' gain.
 
-    By its bits: what somebody changes in place is another run.
+    By its bits: what somebody changes in place is another run. None where the same content may be
+    another run, since nobody can tell what a user's classes read.
     """
     if not isinstance(parts, Parts):
         return None
-    try:
-        key = identify((_acting(parts), parts.graph, parts.formation.offsets, settings, wrt))
-        hash(key)
-    except TypeError:
-        return None
-    return key
-
-
-def lasts(parts: Parts, settings: Settings) -> bool:
-    """Tell whether the same content is the same run; what a user's classes read, nobody can tell.
-
-    It is the same for all of one content, which says the classes too.
-    """
-    return is_ours((_acting(parts), settings))
+    acting = digest((_acting(parts), settings, parts.formation.offsets))
+    # A graph never changes, so that it is known by who it is.
+    return None if acting is None else (acting, parts.graph, wrt)
 
 
 def _acting(parts: Parts) -> Any:

@@ -11,11 +11,12 @@ import numpy as np
 
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, did_you_mean, listing
+from echelon.core.identity import digest
 from echelon.core.jaxpr import used_leaves
-from echelon.core.memoize import identify, memoize
+from echelon.core.memoize import BoundedCache, memoize
 from echelon.core.numerics import precision
 from echelon.core.types import Array
-from echelon.simulation.engine.content import content_of, copied, lasts
+from echelon.simulation.engine.content import content_of, copied
 from echelon.simulation.engine.law_drive import Laws, choose_engine
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
@@ -104,28 +105,22 @@ class DifferentiableRun(NamedTuple):
 
 _READY, _ROOM = 4, 128 * 2**20
 """Runs that are kept for other calls, and the bytes of all of them together."""
-_ready: dict[Hashable, "_Ready"] = {}
+_ready = BoundedCache["_Ready"](_READY, lambda ready: ready.size, _ROOM)
 
 
 def _taken(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> "_Ready":
     """Return a run for a caller's own use, made ready unless it was before."""
     key = content_of(parts, settings, wrt)
-    ready = _ready.pop(key, None) if key is not None else None
+    ready = _ready.pop(key)
     if ready is None or not ready.turn(parts):
-        lasting = key is not None and lasts(parts, settings)
-        ready = _Ready(parts, settings, wrt, key if lasting else None)
+        ready = _Ready(parts, settings, wrt, key)
     return ready
 
 
 def _give(ready: "_Ready") -> None:
     """Keep a run for the next caller."""
-    if ready.key is None:
-        return
-    _ready[ready.key], held = ready, 0
-    for k, (key, each) in enumerate(reversed(list(_ready.items()))):
-        held += each.size
-        if k >= _READY or held > _ROOM:
-            _ready.pop(key, None)
+    if ready.key is not None:
+        _ready.put(ready.key, ready)
 
 
 @final
@@ -133,7 +128,7 @@ class _Ready:
     """A run that is checked and made ready, and is differentiated one time after the other."""
 
     def __init__(
-        self, parts: Parts, settings: Settings, wrt: tuple[str, ...], key: Hashable
+        self, parts: Parts, settings: Settings, wrt: tuple[str, ...], key: Hashable | None
     ) -> None:
         self.key, self.wrt, prepared = key, wrt, prepare(parts, settings)
         self.problem, self.drive = copied((prepared.problem, prepared.parts.drive))
@@ -141,15 +136,15 @@ class _Ready:
         loop = assemble(self.problem, self.drive.leader, self.drive.follower)
         reference = sample_reference(prepared, 0, settings.steps)
         self.run = DifferentiableRun(loop, values, self.problem.states, reference)
-        self.gain, self._native = identify(parts.drive.gain), None
+        self.gain, self._native = digest(parts.drive.gain), None
 
     def turn(self, parts: Parts) -> bool:
         """Take the same parts with another gain; tell whether that is all that changes.
 
         What a law of the same form does is as it was when that was checked.
         """
-        gain = identify(parts.drive.gain)
-        if gain == self.gain:
+        gain = digest(parts.drive.gain)
+        if gain is not None and gain == self.gain:
             return True
         problem, leader, given = self.problem, self.drive.leader, copied(parts.drive)
         follower = given.follower.prepared(problem.model, problem.graph)

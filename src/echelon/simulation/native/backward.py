@@ -6,13 +6,13 @@ made of what they heard is gathered as they gathered it, from the transposed gra
 """
 
 import math
-from collections.abc import Hashable
 from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array
 from echelon.simulation.codegen import SLOTS, Body, aligned, fed_widths
 from echelon.simulation.native.agent_step import BlockRows, signals_of
@@ -20,8 +20,8 @@ from echelon.simulation.native.blocks import SwarmBlocks
 from echelon.simulation.native.kernel_cache import (
     KERNELS,
     LANES,
+    MOST,
     Kernel,
-    add_to,
     compiled,
     follows,
     plan_of,
@@ -69,7 +69,7 @@ class _Pair(NamedTuple):
     felt: CotangentRows
 
 
-_pairs: dict[Hashable, _Pair] = {}
+_pairs = BoundedCache[_Pair](MOST)
 
 
 def _pair(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:
@@ -77,12 +77,7 @@ def _pair(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:
     wind, signature = own.loop.motion.wind, own.signature
     # The signature is of all but the wind's numbers, which have rows where there is one.
     key = (signature, wind is None, wind is None or wind.noise is None, lines, wants)
-    found = None if signature is None else _pairs.get(key)
-    if found is None:
-        found = _made(own, lines, wants)
-        if signature is not None:
-            add_to(_pairs, key, found)
-    return found
+    return _pairs.get_or_make(None if signature is None else key, lambda: _made(own, lines, wants))
 
 
 def _made(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:

@@ -1,12 +1,13 @@
 """The code that steps loops, made once for those that are alike but for their numbers."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias, final
 
 import jax
 import numpy as np
 
+from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.codegen import Code, Plan, program, shared, winds
 from echelon.simulation.native.agent_step import BlockRows, body_of, signals_of
@@ -15,7 +16,7 @@ from echelon.simulation.step.loop import Loop
 
 LANES = {64: 8, 32: 16}
 """Vectors of 512 bits; where a processor's are shorter, LLVM takes two."""
-_KEPT = 8
+MOST = 8
 """Kernels, and codes, that are kept for other runs."""
 
 
@@ -74,15 +75,7 @@ def plan_of(
     return plan._replace(width=plan.width + winds(plan), ahead=ahead)
 
 
-def add_to(kept: dict[Any, Any], key: Hashable, made: Any) -> None:
-    """Keep what was made among what is kept for other runs; the oldest goes."""
-    # A sweep over models has one after the other.
-    for old in list(kept)[: 1 - _KEPT]:
-        kept.pop(old, None)
-    kept[key] = made
-
-
-def compiled(rows: BlockRows, plan: Plan, codes: dict[str, Code]) -> Kernel:
+def compiled(rows: BlockRows, plan: Plan, codes: BoundedCache[Code]) -> Kernel:
     """Return the code of a plan, and with it what is known of it.
 
     `codes` are those that were made, by their texts: other graphs are other numbers in the same.
@@ -90,8 +83,7 @@ def compiled(rows: BlockRows, plan: Plan, codes: dict[str, Code]) -> Kernel:
     # Where JAX was told to keep what it compiles, so that one setting rules both.
     cache = getattr(jax.config, "jax_compilation_cache_dir", None)
     text = program(plan)
-    code = codes.pop(text, None) or Code(text, Path(cache) if cache else None)
-    add_to(codes, text, code)
+    code = codes.get_or_make(text, lambda: Code(text, Path(cache) if cache else None))
     return Kernel(code, rows, plan, len(shared(plan)))
 
 
@@ -112,8 +104,8 @@ class Kernels:
 
     def __init__(self) -> None:
         """Begin with none."""
-        self.codes: dict[str, Code] = {}
-        self._made: dict[Hashable, Kernel] = {}
+        # A sweep over models has one after the other.
+        self.codes, self._kernels = BoundedCache[Code](MOST), BoundedCache[Kernel](MOST)
 
     def of(
         self,
@@ -130,16 +122,14 @@ class Kernels:
         """
         # Of wind and noise too: their rows are there only where these are.
         wind = jax.tree.structure(own.loop.motion.wind)
-        signature = own.signature
-        key = (signature, wind, bits, LANES[bits], together, lines, weighted)
-        found = None if signature is None else self._made.get(key)
-        if found is None:
+        key = (own.signature, wind, bits, LANES[bits], together, lines, weighted)
+
+        def make() -> Kernel:
             rows = BlockRows.of(own.loop, own.count)
             plan = plan_of(own, rows, bits, together, lines, weighted, False)
-            found = compiled(rows, plan, self.codes)
-            if signature is not None:
-                add_to(self._made, key, found)
-        return found
+            return compiled(rows, plan, self.codes)
+
+        return self._kernels.get_or_make(None if own.signature is None else key, make)
 
 
 KERNELS = Kernels()

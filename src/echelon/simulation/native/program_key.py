@@ -7,9 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from echelon.core.identity import process_key
+from echelon.core.memoize import BoundedCache
 from echelon.simulation.native.varying import bare, is_number
 from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
+
+_MOST = 256
+"""Kinds of loops of which it is held what they read."""
 
 
 @final
@@ -18,7 +23,7 @@ class ProgramKeys:
 
     def __init__(self) -> None:
         """Begin with no kind known."""
-        self._fixed: dict[Hashable, list[bool]] = {}
+        self._fixed = BoundedCache[list[bool]](_MOST)
 
     def of(self, loop: Loop, settings: Settings) -> Hashable:
         """Return what is the same for all loops that one program can step, each with own numbers.
@@ -29,17 +34,13 @@ class ProgramKeys:
         leaves, tree = jax.tree.flatten(bare(loop))
         wind = loop.motion.wind
         draws = None if wind is None else (jax.tree.structure(wind), int(wind.window))
-        shapes = tuple(np.shape(leaf) for leaf in leaves)
-        words = tuple(_bytes(leaf) for leaf in leaves if not is_number(leaf))
-        kind = (tree, words, shapes, draws, settings)
-        try:
-            hash(kind)
-        except TypeError:
-            return id(loop)
-        if kind not in self._fixed:
-            self._fixed[kind] = _fixed(leaves, tree)
-        pairs = zip(leaves, self._fixed[kind], strict=True)
-        return kind, tuple(_bytes(leaf) for leaf, fixed in pairs if fixed)
+        shapes = [np.shape(leaf) if is_number(leaf) else leaf for leaf in leaves]
+        kind = process_key((tree.unflatten(shapes), draws, settings))
+        pairs = zip(
+            leaves, self._fixed.get_or_make(kind, lambda: _fixed(leaves, tree)), strict=True
+        )
+        numbers = process_key([leaf for leaf, fixed in pairs if fixed])
+        return id(loop) if kind is None or numbers is None else (kind, numbers)
 
 
 def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
@@ -68,7 +69,3 @@ def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
     read = {id(v) for each in traced.eqns for v in each.invars} | {id(v) for v in traced.outvars}
     free = {k for k, v in zip(numbers, traced.invars, strict=True) if id(v) not in read}
     return [k not in free for k in range(len(leaves))]
-
-
-def _bytes(leaf: Any) -> Hashable:
-    return np.asarray(leaf).tobytes() if isinstance(leaf, np.ndarray | jax.Array) else leaf

@@ -5,15 +5,14 @@ Or between one formation now and later, where somebody turns its knobs.
 
 import dataclasses
 import operator
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from echelon.core.disk_cache import is_ours
-from echelon.core.memoize import bits_of
+from echelon.core.identity import digest
 from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop
 
@@ -49,6 +48,8 @@ class VaryingNumbers:
     Attributes:
         loop: the first.
         values: (loops, k) the numbers that differ, in the order of the tree.
+        signature: a digest of what decides the program, the same for other values; None where it
+            cannot be told, as of a user's class, whose methods may be others when traced again.
     """
 
     def __init__(self, loops: Sequence[Loop], unlike: Loop | None = None) -> None:
@@ -61,7 +62,9 @@ class VaryingNumbers:
         flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in [*distinct[1:], *others])]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
         # At once: somebody may write to an array later, and code is made of what stands there now.
-        self._constant = self._fixed(self._flat)
+        constant = self._constant(self._flat)
+        self._digest = digest(constant)
+        self.signature = digest((self._tree.unflatten(constant), self._masks))
         values = np.stack([self._values(leaves) for leaves in flat[: len(distinct)]])
         self.values = values[[places[id(loop)] for loop in loops]]
 
@@ -86,37 +89,23 @@ class VaryingNumbers:
     def covers(self, loop: Loop) -> bool:
         """Tell whether a loop is like the first but for these numbers."""
         leaves, tree = jax.tree.flatten(bare(loop))
-        forms = _forms(leaves, tree)
-        same = forms == _forms(self._flat, self._tree) and _are_numbers(forms)
-        return same and self._fixed(leaves) == self._constant
+        same = _forms(leaves, tree) == _forms(self._flat, self._tree)
+        # The bits of functions are addresses, so that they have no digest.
+        return same and self._digest is not None and digest(self._constant(leaves)) == self._digest
 
     def turn(self, loop: Loop) -> None:
         """Take another loop that is like the first but for these numbers in its place."""
         self._take(loop)
         self.values = self._values(self._flat)[None]
 
-    @property
-    def signature(self) -> Hashable:
-        """What decides the program, the same for other values; None where it cannot be told.
-
-        As of a stranger's class, whose methods may be others when they are traced again.
-        """
-        forms = _forms(self._flat, self._tree)
-        if not (_are_numbers(forms) and is_ours(self.loop)):
-            return None
-        key = forms, *self._constant, *(mask.tobytes() for mask in self._masks)
-        try:
-            hash(key)
-        except TypeError:
-            return None
-        return key
-
-    def _fixed(self, leaves: Sequence[Any]) -> list[bytes]:
-        """Return what says the leaves without the numbers that differ."""
-        return [
-            bits_of(np.where(mask, 0.0, leaf) if mask.any() else np.asarray(leaf))
-            for leaf, mask in zip(leaves, self._masks, strict=True)
-        ]
+    def _constant(self, leaves: Sequence[Any]) -> list[Array]:
+        """Return the leaves with 0 in place of the numbers that differ."""
+        constant = list[Array]()
+        for leaf, mask in zip(leaves, self._masks, strict=True):
+            constant.append(np.array(leaf) if mask.any() else np.asarray(leaf))
+            if mask.any():
+                constant[-1][mask] = 0.0
+        return constant
 
     def leaves(self, entries: Array) -> list[Array]:
         """Return the leaves in which something differs, of these entries where it does."""
@@ -147,11 +136,6 @@ def alike(loop: Loop, other: Loop) -> bool:
 def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
     arrays = [np.asarray(leaf) for leaf in leaves]
     return tree, *((array.dtype, array.shape) for array in arrays)
-
-
-def _are_numbers(forms: tuple[Any, ...]) -> bool:
-    """Tell whether the bits of leaves say what stands there; those of functions are addresses."""
-    return not any(kind.hasobject for kind, _ in forms[1:])
 
 
 def _differing(leaves: Sequence[Any]) -> Array:

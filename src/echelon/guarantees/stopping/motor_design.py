@@ -7,7 +7,7 @@ from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.promise import Promise, promise
-from echelon.guarantees.stopping.motor_load import motors_bear
+from echelon.guarantees.stopping.motor_load import motors_suffice_for
 from echelon.guarantees.stopping.stopping_run import stopping_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.law_drive import Laws
@@ -23,7 +23,7 @@ their range."""
 _FACTORS = (1.0, 0.7, 0.5, 0.35, 0.25)
 
 
-class StoppingDesign(NamedTuple):
+class MotorDesign(NamedTuple):
     """Roots and speeds that are certified with motors, as a scenario has them.
 
     Attributes:
@@ -40,9 +40,13 @@ class StoppingDesign(NamedTuple):
     @property
     def time(self) -> float:
         """From when on followers are promised within 1 cm, s; infinite where that is not known."""
-        tube = self.promise.tube
-        arrival = None if tube is None else tube.arrival
-        return float("inf") if arrival is None else arrival.time
+        arrival = (self.promise.anywhere() or {}).get("within_1_cm_from")
+        return float("inf") if arrival is None else arrival
+
+    @property
+    def name(self) -> str:
+        """The key under which JSON has it."""
+        return "stopping_point"
 
     def sentence(self) -> str:
         """Return what to set, and what is promised then."""
@@ -57,26 +61,20 @@ class StoppingDesign(NamedTuple):
         return {**numbers, "promise": self.promise.as_mapping()}
 
 
-def design_stopping(parts: Parts, settings: Settings) -> StoppingDesign | None:
+def design_with_motors(parts: Parts, settings: Settings) -> MotorDesign | None:
     """Return the laws with which these starts are soonest within 1 cm, the motors certified.
 
-    None where the followers have another law, or none of what is tried bears these starts.
+    None where none of what is tried suffices for these starts.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    drive = parts.drive
-    if not isinstance(drive, Laws) or not isinstance(drive.follower, StoppingPoint):
-        return None
-    told = drive.follower.feedforward is Feedforward.PARENT
-    links = int(parts.graph.depths().max()) if told else 1
+    links = int(parts.graph.depths().max()) if parts.drive.feedforward is Feedforward.PARENT else 1
     found = [each for rate in _RATES for each in _certified(parts, settings, rate, links)]
     return min(found, key=lambda each: each.time, default=None)
 
 
-def _certified(
-    parts: Parts, settings: Settings, rate: float, links: int
-) -> Iterator[StoppingDesign]:
+def _certified(parts: Parts, settings: Settings, rate: float, links: int) -> Iterator[MotorDesign]:
     """Yield the fastest speeds that are certified at a rate, if any are."""
     for factor in _FACTORS:
         speed = tuple(round(factor * s / links, 4) for s in _SPEEDS)
@@ -86,12 +84,12 @@ def _certified(
             prepared = prepare(tried, settings)
             with precision("float64"):
                 run = stopping_of(prepared.parts, settings, prepared.problem.states)
-                borne = run is not None and motors_bear(run)
+                sufficient = motors_suffice_for(run)
         except EchelonError:
             # Roots of another number than the model's, say.
             return
-        if borne and promise(tried, settings).promised:
-            yield StoppingDesign(rate, speed, leader, promise(tried, settings))
+        if sufficient and promise(tried, settings).promised:
+            yield MotorDesign(rate, speed, leader, promise(tried, settings))
             return
 
 

@@ -1,0 +1,188 @@
+"""What is guaranteed by a linearization, or by a metric P: theorems T1, T2 and A5."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import cast, final
+
+import numpy as np
+
+from echelon.agents.models.linearization import at_trim
+from echelon.core.numerics import precision
+from echelon.core.statement import Hypothesis
+from echelon.core.types import Array
+from echelon.core.words import Theorem, Verdict
+from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.certified_set import certified_set, set_line, starts_line
+from echelon.guarantees.promises.claims import claims_line
+from echelon.guarantees.promises.closed_loop import loop_of
+from echelon.guarantees.promises.frozen_laws import ModeMatrices, frozen_at, frozen_of, longest_step
+from echelon.guarantees.promises.hypotheses import hypotheses
+from echelon.guarantees.promises.leaders import leaders_of
+from echelon.guarantees.promises.modes import held
+from echelon.guarantees.promises.promise import Promise, Promises
+from echelon.guarantees.promises.region import region_of, slopes_beside, weaken
+from echelon.guarantees.promises.turning import slowest_in_turns, turns_in_words
+from echelon.simulation.engine.initial import Starts
+from echelon.simulation.engine.prepare import Prepared
+from echelon.simulation.step.settings import Settings
+from echelon.synthesis.certificates.certificate import RegionCertificate
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class MetricPromise(Promise):
+    """What is guaranteed near the trim, and on a domain where a metric contracts there.
+
+    Attributes:
+        case: what it was computed of.
+        turns: what the leader's heading may do, in words; empty where the law does not turn.
+        slowest_turn: the slowest mode in the steady turns of `turns`, 1/s.
+    """
+
+    case: Case
+    turns: str = ""
+    slowest_turn: float = -math.inf
+
+    @classmethod
+    def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "MetricPromise":
+        """Return what is guaranteed of prepared parts."""
+        parts, states = prepared.parts, prepared.problem.states
+        leaders, loop = leaders_of(parts, states), loop_of(parts)
+        region = region_of(parts, leaders)
+        case = Case(
+            parts,
+            settings,
+            loop,
+            leaders,
+            region.certificate,
+            slopes_beside(parts) if at_trim(parts.model).bends.any() else None,
+        )
+        # What does not decay at the trim has nothing to lose elsewhere.
+        if loop.every and case.governed:
+            case = case._replace(frozen=frozen_of(parts, settings, loop, leaders, states))
+        lines = list(hypotheses(case))
+        region = weaken(parts, region, lines)
+        certificate = region.certificate
+        found = certified_set(parts, settings, leaders, certificate)
+        lines += [region.line, set_line(certificate, found)]
+        lines += [starts_line(parts, states, certificate, found)]
+        lines += [claims_line(parts, loop, region.relayed)]
+        return cls(
+            loop=loop,
+            hypotheses=MappingProxyType({cast(Hypothesis, x.statement): x for x in lines}),
+            without=case.disturbed,
+            leader_mode=None if leaders.rest else leaders.slowest,
+            region=certificate,
+            certified=found,
+            domain="" if certificate is None else certificate.domain.in_words(parts.model),
+            case=case,
+            turns=turns_in_words(case),
+            slowest_turn=max(slowest_in_turns(case).values(), default=-math.inf),
+        )
+
+    def at(self, prepared: Prepared, settings: Sequence[Settings], brief: bool) -> Promises:
+        """Yield the same from other starts: only what says something of these changes."""
+        case = self.case
+        if case.loop.every and case.governed and case.frozen is None:
+            # Nobody left the trim, and another seed may be what does.
+            yield from Promise.at(self, prepared, settings, brief)
+            return
+        with precision("float64"):
+            states = Starts(prepared.parts).of([each.seed for each in settings])
+            starts, decays = None, np.ones((len(states), 1), bool)
+            if case.frozen is not None:
+                starts = frozen_at(prepared.parts, case.loop, case.frozen.path, states)
+                decays = starts.decaying(settings[0]).reshape(len(states), -1)
+        for k, each in enumerate(settings):
+            there = case._replace(settings=each)
+            if case.frozen is not None and starts is not None:
+                frozen = case.frozen._replace(starts=_share(starts, k, len(states)))
+                there = there._replace(frozen=frozen)
+            yield self._from(there, states[k], bool(decays[k].all()))
+
+    def _from(self, case: Case, states: Array, decays: bool) -> "MetricPromise":
+        """Return the same from states (N, n), about which held steps decay or may not."""
+        lines = dict(self.hypotheses)
+        # The line tells of where they start only if steps grow there.
+        same = decays and lines[Hypothesis.SAMPLING].verdict is Verdict.HOLDS
+        if case.frozen is not None and case.smooth and not same:
+            lines[Hypothesis.SAMPLING] = held(case)
+        lines[Hypothesis.STARTS] = starts_line(case.parts, states, self.region, self.certified)
+        return dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
+
+    @property
+    def ground(self) -> RegionCertificate | None:
+        """The region of a theorem, where anything is guaranteed."""
+        return self.region if self.promised else None
+
+    @property
+    def rate(self) -> float | None:
+        """At what rate errors shrink, 1/s; None where nothing is guaranteed."""
+        if not self.promised:
+            return None
+        if self.region is not None:
+            return self.region.rate
+        if self.loop.common is not None:
+            return max(0.0, min(self.loop.common, -self.slowest_turn))
+        return -max(self.loop.slowest, self.slowest_turn)
+
+    @property
+    def slowest(self) -> float | None:
+        """The slowest mode near the trim, 1/s; None where the model bends there and has none."""
+        return self.loop.slowest if self.linear else None
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) with which modes decay at the trim and wherever agents go."""
+        return longest_step(self.loop, self.case.frozen, settings)
+
+    @property
+    def condition(self) -> str:
+        """What is asked of the leader, in words; empty for nothing."""
+        return "" if self.case.matched else ", once the leader's input rests at its trim"
+
+    def guarantee(self) -> str:
+        """Return what is guaranteed near the trim, and what the region adds."""
+        if self.linear:
+            text = "by linearization: followers that start near enough to their goals, with the "
+            text += f"leader near enough to the trim{self.turns}, converge to them{self.condition}"
+            text += "; no region is proved" if self.region is None else ""
+        else:
+            text = "on a domain alone, with the slopes of all sides of the trim: the model bends "
+            text += "there, and has no linearization"
+        text = f"Promised, {text}."
+        return text if self.region is None else f"{text} {self._regional(self.region)}"
+
+    def _regional(self, region: RegionCertificate) -> str:
+        """Return what the region adds, as strong as its own argument and no stronger."""
+        found, condition, theorem = self.certified, self.condition, region.theorem
+        by, what = self.kind.value, f"errors shrink at {region.rate:.3g} 1/s or faster"
+        what = "V does not rise" if theorem is Theorem.A5 else what
+        if found is None:
+            text = f"small {what}{condition}, while the leader stays in {self.domain}"
+            return f"{by}: {text} ({theorem})."
+        if not found.radius:
+            text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
+            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}; {found.remedy}."
+        read = "" if found.kind is self.kind else ", the leader going as in a run of its own"
+        start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
+        start = "everywhere" if found.radius == float("inf") else start
+        return f"{by}: from {start}, {what}{condition}{read} ({theorem})."
+
+    def why_covered(self) -> str:
+        """Return why a run is covered that stayed in the domain."""
+        if self.theorem is Theorem.T2:
+            return "the leader stayed in the domain, and small errors about it shrink"
+        starts = self.hypotheses[Hypothesis.STARTS]
+        if starts.fails:
+            text = f"the starts lie outside of the certified set ({starts.number_text}), but all "
+            return f"{text}agents stayed in the domain at every stored frame"
+        text = f"the starts lie in the certified set ({starts.number_text}), and all agents stayed "
+        return f"{text}in the domain"
+
+
+def _share(starts: ModeMatrices, k: int, runs: int) -> ModeMatrices:
+    """Return what is of one of so many runs."""
+    size = len(starts.A) // runs
+    return ModeMatrices(*(part[k * size : (k + 1) * size] for part in starts))

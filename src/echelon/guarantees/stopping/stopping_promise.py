@@ -1,0 +1,122 @@
+"""What theorem T5 guarantees of a run in which agents agree on their stopping points."""
+
+import dataclasses
+from types import MappingProxyType
+from typing import Any, cast, final
+
+from echelon.core.statement import Hypothesis, Statement, Topic, holds, unneeded
+from echelon.core.words import Kind
+from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.closed_loop import loop_of
+from echelon.guarantees.promises.hypotheses import agent_lines
+from echelon.guarantees.promises.leaders import leaders_of
+from echelon.guarantees.promises.promise import AgreementModes, Promise
+from echelon.guarantees.stopping.motor_design import MotorDesign, design_with_motors
+from echelon.guarantees.stopping.stopping_run import (
+    StoppingRun,
+    agreement_modes,
+    condition_lines,
+    drift_reason,
+    stopping_of,
+)
+from echelon.guarantees.stopping.tube import Tube, tube_of
+from echelon.simulation.engine.parts import Parts
+from echelon.simulation.engine.prepare import Prepared
+from echelon.simulation.step.settings import Settings
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class StoppingPromise(Promise):
+    """What T5 guarantees, and what that rests on.
+
+    Attributes:
+        run: what it was computed of.
+        tube: what is guaranteed; None for nothing.
+        coupling: c.
+        hold: the longest step (s) that keeps the largest stopping point from growing.
+    """
+
+    run: StoppingRun
+    tube: Tube | None
+    coupling: float
+    hold: float
+
+    @classmethod
+    def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "StoppingPromise":
+        """Return what is guaranteed of prepared parts; `brief` leaves out arrival and motors."""
+        parts, states = prepared.parts, prepared.problem.states
+        run, leaders = stopping_of(parts, settings, states), leaders_of(parts, states)
+        case = Case(parts, settings, loop_of(parts), leaders)
+        found, drifts = tube_of(run, brief), drift_reason(run)
+        lines = [*agent_lines(case), *condition_lines(run), *found.lines]
+        lines += [drifts] if drifts is not None else []
+        by_name = {cast(Hypothesis, x.statement): x for x in lines}
+        against = any(line.fails and line.reason for line in by_name.values())
+        return cls(
+            loop=case.loop,
+            hypotheses=MappingProxyType(by_name),
+            without=case.disturbed,
+            leader_mode=leaders.slowest,
+            complete=not brief,
+            run=run,
+            # In float64, which a law computes in only here.
+            coupling=run.coupling,
+            hold=run.longest_step,
+            tube=None if against else found.tube,
+        )
+
+    @classmethod
+    def design(cls, parts: Parts, settings: Settings) -> MotorDesign | None:
+        """Return the roots and speeds with which these starts are soonest there, with motors."""
+        return design_with_motors(parts, settings)
+
+    @property
+    def ground(self) -> Tube | None:
+        """What T5 says; None where nothing is guaranteed."""
+        return self.tube
+
+    @property
+    def rate(self) -> float | None:
+        """At what rate errors shrink in the end, 1/s; None where nothing is guaranteed."""
+        return None if self.tube is None else self.tube.rate
+
+    @property
+    def slowest(self) -> float | None:
+        """The slowest mode of the formation, 1/s."""
+        return self.loop.slowest if self.tube is None else -self.tube.rate
+
+    def longest_step(self, settings: Settings) -> float:
+        """Return the longest step (s) that keeps the largest stopping point from growing."""
+        return self.hold
+
+    def guarantee(self) -> str:
+        """Return what T5 guarantees."""
+        assert self.tube is not None
+        return self.tube.sentence()
+
+    def why_covered(self) -> str:
+        """Return why a run is covered in which no limit acted."""
+        return f"no limit acted, and from these starts {self.hypotheses[Hypothesis.STARTS].text}"
+
+    @property
+    def agreement(self) -> AgreementModes:
+        """How stopping points agree, zeta~' = -c lambda zeta~."""
+        return AgreementModes(self.coupling, agreement_modes(self.run.parts.graph, self.run.law))
+
+    @property
+    def paper_lines(self) -> tuple[Statement, ...]:
+        """Assumption 5, Lemma 4 and the conditions on P where stopping points agree."""
+        text = "in flat coordinates, with equality: zeta' = 0 in silence, P = T'T for zeta = T x"
+        offsets = "for offsets of every flat output: they are symmetries of the chains"
+        none = "T5 asks nothing of a P"
+        return (
+            holds(Topic.MONOTONE, Kind.PROOF, text, 0.0, "0"),
+            holds(Topic.DRIFT_ALONG_Z, Kind.PROOF, offsets),
+            unneeded(Topic.LMI_AS_PRINTED, Kind.PROOF, none),
+            unneeded(Topic.FINITE, Kind.PROOF, none),
+        )
+
+    def anywhere(self) -> dict[str, Any] | None:
+        """Return the tube ready for JSON; None where nothing is guaranteed."""
+        return None if self.tube is None else self.tube.as_mapping()

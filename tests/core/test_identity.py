@@ -1,0 +1,177 @@
+"""What identifies a value: each kind of leaf changes the digest, and equal bits do not."""
+
+import dataclasses
+import functools
+from fractions import Fraction
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import echelon as ech
+from echelon.agents.models import Pendulum, VanDerPol
+from echelon.core.identity import digest, process_key
+from echelon.core.memoize import BoundedCache, memoize
+from echelon.core.words import Feedforward, Kind
+
+
+class Scaled(VanDerPol):
+    """A user's model, with a field that JAX does not trace."""
+
+    factors: Any = eqx.field(static=True, default=1.0)
+
+
+def test_an_array_that_is_modified_in_place_is_another_value():
+    # The larger one is hashed where it is.
+    for size in (3, 5000):
+        array = np.arange(float(size))
+        before = digest([array]), process_key([array])
+        assert before == (digest([array.copy()]), process_key([array.copy()]))
+        array[-1] = np.nextafter(array[-1], np.inf)
+        assert digest([array]) != before[0] and process_key([array]) != before[1]
+
+
+@pytest.mark.parametrize("wrap", [float, np.float64, np.asarray, jnp.asarray, lambda x: [1, (x,)]])
+def test_zeros_of_either_sign_differ_and_a_nan_is_itself(wrap):
+    zero, minus, nan = (digest(wrap(x)) for x in (0.0, -0.0, float("nan")))
+    assert None not in (zero, minus, nan) and len({zero, minus, nan}) == 3
+    assert digest(wrap(float("nan"))) == nan
+    assert process_key(wrap(-0.0)) != process_key(wrap(0.0))
+
+
+def test_the_type_and_the_shape_of_numbers_count():
+    array = np.array([1.0, 2.0])
+    others = [array.astype(np.float32), array[None], array.astype(int), array[::-1]]
+    values = [array, *others, jnp.asarray(array), [1.0, 2.0], (1.0, 2.0), 1, 1.0, True, "1", b"1"]
+    assert len({digest(value) for value in values}) == len(values)
+    # A view and its copy have the same numbers, whatever lies between them in memory.
+    wide = np.arange(6.0)
+    assert digest(wide[::2]) == digest(wide[::2].copy())
+
+
+def test_nested_values_are_framed():
+    values = [(1, (1,)), ((1,), 1), (1, 1), ("11",), ("1", "1"), {"a": 1}, {"b": 1}, {}, (), None]
+    assert len({digest(value) for value in values}) == len(values)
+    assert digest({"a": 1, "b": 2}) != digest({"b": 2, "a": 1})
+
+
+def test_each_field_of_a_model_counts():
+    values = [VanDerPol(), Pendulum(), VanDerPol, dataclasses.replace(Pendulum(), damping=0.2)]
+    assert None not in (found := [digest(value) for value in values]) and len(set(found)) == 4
+    assert digest(Pendulum()) == digest(Pendulum())
+
+
+def test_members_of_enumerations_are_told_apart_by_class_and_name():
+    values = [Feedforward.NONE, Feedforward.RELAY, Kind.PROOF, "none"]
+    assert len({digest(value) for value in values}) == len(values)
+
+
+@pytest.mark.filterwarnings("ignore:A JAX array is being set as static")
+def test_a_static_field_counts_and_may_hold_an_array():
+    numbers = np.ones(2)
+    keys = [process_key(Scaled(factors=x)) for x in (1.0, 2.0, numbers, "one")]
+    assert None not in keys and len(set(keys)) == 4
+    numbers[0] = 3.0
+    assert process_key(Scaled(factors=numbers)) not in keys
+
+
+@pytest.mark.parametrize(
+    "value",
+    [Scaled(), Scaled, lambda x: x, Fraction(1, 3), [1, {"a": (Scaled(),)}], frozenset([1])],
+    ids=["model", "class", "function", "fraction", "nested", "set"],
+)
+def test_what_is_not_echelon_s_own_has_no_digest_but_a_key_in_this_process(value):
+    assert digest(value) is None
+    assert process_key(value) is not None and process_key(value) == process_key(value)
+
+
+def test_a_user_s_class_that_is_defined_anew_is_another_one():
+    def define():
+        return type("Own", (VanDerPol,), {})
+
+    one, other = define(), define()
+    assert process_key(one()) == process_key(one()) != process_key(other())
+
+
+def test_numbers_that_are_equal_across_foreign_classes_are_told_apart():
+    assert process_key(Fraction(1)) != process_key(1)
+    assert process_key(Fraction(1)) == process_key(Fraction(2, 2))
+
+
+@pytest.mark.parametrize("value", [{1}, np.array([object()]), (1, [np.array([object()])])])
+def test_what_has_no_hash_is_not_identified(value):
+    assert digest(value) is None and process_key(value) is None
+
+
+def test_keys_of_random_numbers_are_known_by_their_bits():
+    assert digest(jax.random.key(1)) == digest(jax.random.key(1)) != digest(jax.random.key(2))
+
+
+def test_what_is_traced_is_not_identified():
+    keys = []
+
+    def traced(x):
+        keys.append((digest([x]), process_key([x])))
+        return x
+
+    jax.make_jaxpr(traced)(1.0)
+    assert keys == [(None, None)]
+
+
+def test_a_class_that_only_claims_to_be_echelon_s_own_is_foreign(monkeypatch):
+    monkeypatch.setattr(Scaled, "__module__", "echelon.agents.models")
+    assert digest(Scaled()) is None
+    monkeypatch.setattr("echelon.agents.models.Scaled", Scaled, raising=False)
+    assert digest(Scaled()) is not None
+
+
+def test_parts_of_a_run_are_identified_by_every_bit():
+    parts, settings = ech.build(ech.load_scenario("integrators"))
+    first = digest((parts.model, parts.drive, parts.world, settings))
+    again, _ = ech.build(ech.load_scenario("integrators"))
+    assert first is not None
+    assert first == digest((again.model, again.drive, again.world, settings))
+    assert first != digest((parts.model, parts.drive, parts.world, settings._replace(seed=7)))
+
+
+# ---- results that are held ----
+
+
+def test_a_memoized_function_computes_anew_for_other_bits_alone():
+    calls = []
+
+    @memoize
+    def first_entry(array, model=None):
+        calls.append(array[0])
+        return None if array[0] < 0.0 else float(array[0])
+
+    array = np.array([1.0, 2.0])
+    assert first_entry(array) == first_entry(array.copy()) == 1.0 and len(calls) == 1
+    array[0] = -0.0
+    assert first_entry(array) == 0.0 and len(calls) == 2
+    # None is a result too, and a user's class is known as long as the process lasts.
+    array[0] = -1.0
+    for _ in range(2):
+        assert first_entry(array) is None and first_entry(array, model=Scaled()) is None
+    assert len(calls) == 4
+    unhashable = functools.partial(first_entry, array, model={1})
+    assert unhashable() is unhashable() is None and len(calls) == 6
+
+
+def test_a_cache_drops_what_was_not_used_for_longest():
+    cache = BoundedCache(2)
+    assert [cache.get_or_make(key, lambda key=key: key) for key in "abac"] == list("abac")
+    assert len(cache) == 2 and cache.pop("b") is None and cache.pop("a") == "a"
+    assert cache.get_or_make(None, lambda: "new") == "new" and len(cache) == 1
+
+
+def test_a_cache_has_room_for_a_size():
+    cache = BoundedCache(9, len, 10)
+    for text in ("four", "fives", "six"):
+        cache.put(text, text)
+    assert cache.total() == 8 and cache.pop("four") is None
+    cache.put("long", "longer than all")
+    assert len(cache) == 0 == cache.total()
