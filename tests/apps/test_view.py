@@ -376,7 +376,7 @@ def test_agents_that_fly_away_spoil_neither_the_scale_nor_the_rest():
     space = space_of(gone)
     assert space.clipped and (space.high - space.low).max() < 20.0
     header, found = unpacked(replay_data(gone))
-    assert "stand still" in " ".join(header["notes"])
+    assert "drawn at that border" in " ".join(header["notes"])
     places = found["positions"].reshape(-1, 4, 3)
     np.testing.assert_allclose(places[:200], run.states[:200, :, :3], atol=1e-3)
 
