@@ -439,7 +439,7 @@ def test_view_writes_one_file_and_replaces_none_unasked(echelon, stored):
 
 BAD = {
     "nothing": ("none", "`none` does not exist; give the folder of a run, or its `run.nc`."),
-    "no run": (".", "the folder `.` holds no `run.nc`, and so no run."),
+    "no run": (".", "the folder `.` holds no run: it has no `run.nc`."),
     "damaged": ("junk.nc", "`junk.nc` cannot be read as a run: it is damaged, or was not written"),
     "older": ("old.nc", "`old.nc`: the run was written in format 1 by echelon "),
 }
@@ -500,7 +500,7 @@ def test_the_badge_says_which_rate_it_has_and_is_not_green_over_a_run_that_was_l
     slow = promise_badge(told | {"rate": 0.5, "slowest_mode": -0.5})
     assert slow["whole"].endswith("0.5 1/s is that of the slowest mode.")
     turns = promise_badge(told | {"rate": 0.452, "slowest_mode": -1.32})
-    assert "0.452 1/s is kept whichever graph holds" in turns["whole"]
+    assert "0.452 1/s holds for all graphs" in turns["whole"]
     promise = dict(run.promise) | told | {"rate": 0.5, "slowest_mode": -0.5}
     for outcome, state in (("completed", "holds"), ("left_chart", "lost"), ("diverged", "lost")):
         ended = dict(run.attributes) | {"outcome": outcome, "message": "It ended so."}

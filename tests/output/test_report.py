@@ -150,7 +150,7 @@ def test_a_horizon_shorter_than_the_slowest_mode_is_told():
 @pytest.mark.study
 def test_a_leader_that_a_heavier_plant_holds_off_its_path_is_told():
     found = told("plant.scale.mass=1.1", "simulation.horizon=20", scenario="planar-quadrotor")
-    [text] = [each for each in found if "the leader stays" in each]
+    [text] = [each for each in found if "the leader has a steady error" in each]
     assert "no law has integral action" in text and "`leader.gain`" in found[text]
 
 
