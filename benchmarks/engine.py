@@ -233,7 +233,7 @@ def measure_geometric(bits: int, _: Yardstick | None) -> Row:
     told = agents, [side.native.longest], side.reference, bits
 
     def fly(threads: int, clock: Callable[[], float] = time.perf_counter) -> float:
-        side.native.crew = crews[threads]
+        side.native.threads = crews[threads]
         return rate(side.native, *told, clock)
 
     rates = [fly(1, time.process_time) for _ in range(2)]
@@ -286,7 +286,7 @@ def measure_models(_: Yardstick | None) -> Row:
         side = made.steppers(ech.build(ech.load_scenario(name))[0], 64)
         # What JAX does once in a process is done.
         begin = time.process_time()
-        Kernels().of(side.native.own, 64, False, side.native.places.lines)
+        Kernels().of(side.native.varying, 64, False, side.native.places.row_major)
         makes[name] = time.process_time() - begin
         loads[name] = min(_reloaded(program(side.native.plan)) for _ in range(3))
     return {

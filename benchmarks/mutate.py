@@ -1,11 +1,11 @@
-"""Change the code in small ways, one at a time, and see whether a test notices.
+"""Change the code in small ways, one at a time, and report the changes that no test notices.
 
-Run `python3 dev.py mutate verifier` for a room, `verifier/exact.py` for a file, nothing for all
-rooms of the table below. The tree is copied, and each change is tried in a process of its own that
-forks after the heavy libraries are loaded and before echelon is. A first run without a change
-records which functions each test calls; a change is tried on the tests that call its function, the
-quickest first, and if it survives, on all tests of its room. A change that ends in a longer wait
-than `LIMIT` allows is noticed too.
+Run `python3 dev.py mutate verifier` for a package, `verifier/enclosed.py` for a file, nothing for
+all packages of the table below. The tree is copied, and each change is tried in a process of its
+own that forks after the heavy libraries are loaded and before echelon is. A first run without a
+change records which functions each test calls; a change is tried on the tests that call its
+function, the quickest first, and if it survives, on all tests of its package. A change after which
+the tests exceed `LIMIT` counts as noticed.
 
 It prints every change that survived, with file and line, and how many were killed. See
 docs/testing.md for how to read that.
@@ -29,25 +29,29 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-# Which tests concern a room, or a file that has tests of its own.
+# The tests of a package, or of a file that has tests of its own.
 TESTS = {
     "core": ["jaxpr", "linearization", "lyapunov", "bad_input", "limits", "gains", "doctor"],
-    "enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
-    "network": ["graph", "formation", "recommend", "limits"],
-    "certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
-    "certificates/exact.py": ["exact"],
-    "certificates/jacobians.py": ["regional", "exact"],
-    "certificates/sampling.py": ["regional", "exact"],
-    "enclosure/curves.py": ["interval", "hull"],
-    "enclosure/interval.py": ["interval", "hull"],
-    "verifier": ["verify", "false_claims"],
-    "gains": ["gains", "inner_loop", "regional", "paper", "bad_input"],
-    "laws": ["laws", "feedforward", "inner_loop", "bad_input", "paper", "attack"],
-    "engine": ["simulate", "feedforward", "disturbance", "metrics", "plans", "native"],
-    "kernels": ["kernels", "native"],
+    "core/enclosure": ["interval", "hull", "jaxpr", "exact", "regional"],
+    "core/enclosure/curve_polygons.py": ["interval", "hull"],
+    "core/enclosure/interval.py": ["interval", "hull"],
+    "agents/network": ["graph", "formation", "recommend", "limits"],
+    "synthesis/certificates": ["exact", "regional", "lmi", "lyapunov", "margins", "gains"],
+    "synthesis/certificates/exact_proofs.py": ["exact"],
+    "synthesis/certificates/jacobians.py": ["regional", "exact"],
+    "synthesis/certificates/sampling.py": ["regional", "exact"],
+    "synthesis/gains": ["gains", "inner_loop", "regional", "paper", "sentences"],
+    "laws": ["laws", "feedforward", "inner_loop", "sentences", "paper", "attack"],
+    "simulation/step": ["simulate", "feedforward", "disturbance", "metrics"],
+    "simulation/engine": ["simulate", "feedforward", "disturbance", "metrics", "plans", "native"],
+    "simulation/native": ["native", "gradient"],
+    "simulation/codegen": ["codegen", "native"],
+    "guarantees/promises": ["promises", "check", "frozen_laws", "heading"],
+    "guarantees/stopping": ["stopping_point", "borders", "motors"],
+    "guarantees/verifier": ["verify", "false_claims"],
 }
 LIMIT = 4.0, 30.0
-"""A change may make its tests take so many times as long, and so many seconds more."""
+"""How many times as long the tests may take after a change, and how many seconds longer."""
 HEAVY = ["jax.numpy", "equinox", "scipy.linalg", "scipy.optimize", "networkx", "hypothesis.extra"]
 HEAVY += ["hypothesis.extra.numpy", "xarray", "cvxpy", "yaml", "beartype", "jaxtyping", "pytest"]
 
@@ -248,19 +252,22 @@ def write(file: Path, source: bytes) -> None:
         compiled.unlink()
 
 
-def study(tree: Path, room: str, only: str, count: int, seed: int) -> tuple[int, list[Change]]:
-    """Try changes of a room and return how many were killed, and those that survived."""
-    files = sorted((tree / "src" / "echelon" / room).glob(only or "*.py"))
+def study(tree: Path, package: str, only: str, count: int, seed: int) -> tuple[int, list[Change]]:
+    """Try changes of a package; return how many were killed, and those that survived."""
+    files = sorted((tree / "src" / "echelon" / package).glob(only or "*.py"))
     every = [change for file in files for change in changes(file)]
     drawn = random.Random(seed).sample(every, min(count, len(every)))
-    listed = TESTS.get(f"{room}/{only}", TESTS[room])
-    tests = [f"tests/test_{name}.py" for name in listed]
+    listed = TESTS.get(f"{package}/{only}", TESTS[package])
+    paths = {path.stem: str(path.relative_to(tree)) for path in (tree / "tests").rglob("test_*.py")}
+    tests = [paths[f"test_{name}"] for name in listed]
     watch, recorded, begun = Watch(str(tree / "src" / "echelon")), tree / "calls", time.monotonic()
     if forked(tests, 3600.0, watch, recorded):
-        raise SystemExit(f"the tests of `{room}` fail without any change: {' '.join(tests)}")
+        raise SystemExit(f"the tests of `{package}` fail without any change: {' '.join(tests)}")
     watch.calls, watch.of_module, watch.seconds = pickle.loads(recorded.read_bytes())
     whole = time.monotonic() - begun
-    print(f"{room}: {len(drawn)} of {len(every)} changes; all tests take {whole:.0f} s", flush=True)
+    print(
+        f"{package}: {len(drawn)} of {len(every)} changes; all tests take {whole:.0f} s", flush=True
+    )
     survived = []
     for k, change in enumerate(sorted(drawn, key=lambda each: (each.file, each.line)), 1):
         some = watch.calling(change.file, change.function)
@@ -279,15 +286,22 @@ def study(tree: Path, room: str, only: str, count: int, seed: int) -> tuple[int,
     return len(drawn) - len(survived), survived
 
 
+def parted(name: str) -> tuple[str, str]:
+    """Return the package and the file of a name; the last part of a package's name is enough."""
+    package, _, file = name.rpartition("/") if name.endswith(".py") else (name, "", "")
+    return next((full for full in TESTS if full.split("/")[-1] == package), package), file
+
+
 def main() -> None:
     """Copy the tree, load what is heavy, and try."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("room", nargs="*", help=f"of {', '.join(TESTS)}; or ROOM/FILE.py")
-    parser.add_argument("--count", type=int, default=50, help="changes of each room (50)")
+    parser.add_argument("package", nargs="*", help=f"of {', '.join(TESTS)}; or PACKAGE/FILE.py")
+    parser.add_argument("--count", type=int, default=50, help="changes of each package (50)")
     parser.add_argument("--seed", type=int, default=0, help="which ones are drawn (0)")
-    asked = parser.parse_args()
-    rooms = [each.partition("/") for each in asked.room or TESTS if asked.room or "/" not in each]
-    unknown = [room for room, _, _ in rooms if room not in TESTS]
+    arguments = parser.parse_args()
+    everything = [name for name in TESTS if not name.endswith(".py")]
+    packages = [parted(name) for name in arguments.package or everything]
+    unknown = [package for package, _ in packages if package not in TESTS]
     if unknown:
         parser.error(f"`{unknown[0]}` has no tests listed; there are {', '.join(TESTS)}")
     with tempfile.TemporaryDirectory() as folder:
@@ -305,10 +319,10 @@ def main() -> None:
         for name in HEAVY:
             __import__(name)
         killed, survived = 0, []
-        for room, _, only in rooms:
-            some, left = study(tree, room, only, asked.count, asked.seed)
+        for package, only in packages:
+            some, left = study(tree, package, only, arguments.count, arguments.seed)
             killed, survived = killed + some, survived + left
-        print(f"\n{killed} killed, {len(survived)} survived (seed {asked.seed})")
+        print(f"\n{killed} killed, {len(survived)} survived (seed {arguments.seed})")
         for change in survived:
             print(f"{change.file.relative_to(tree)}:{change.line}: {change.old}  ->  {change.new}")
 

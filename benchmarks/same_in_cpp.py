@@ -1,4 +1,4 @@
-"""A follower's whole step as C++ with vector types, operation by operation, to compare code with.
+"""A follower's step as C++ with vector types, operation by operation, to compare code with.
 
 What LLVM makes native code of is written out a second time and compiled by `g++ -O3`: the same
 nodes in the same order, without the branches that native code takes around what seldom happens.
@@ -14,20 +14,13 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from echelon.simulation.codegen import (
-    SLOTS,
-    Body,
-    Code,
-    Plan,
-    aligned,
-    program,
-    shared,
-)
-from echelon.simulation.codegen.fast_path import whole
+from echelon.simulation.codegen import Body, Code, Plan, aligned, program, shared
+from echelon.simulation.codegen.fast_path import general_case
 from echelon.simulation.native.agent_step import body_of
 from echelon.simulation.native.kernel_cache import LANES
 from echelon.simulation.native.schedule import step_by_step
 from echelon.simulation.native.stepper import NativeStepper
+from echelon.simulation.native.threads import call
 from echelon.simulation.scalars import Node
 from echelon.simulation.scalars.scalar_graph import needed, rewritten
 
@@ -47,7 +40,7 @@ extern "C" void run({T} *rows, long blocks, long steps) {{
 for (long step = 0; step < steps; step++) for (long b = 0; b < blocks; b++) {{
 {T} *at = rows + b * {size};
 """
-_INFIX = {"add": "+", "sub": "-", "apart": "-", "mul": "*", "div": "/", "over": "/"}
+_INFIX = {"add": "+", "sub": "-", "unfused_sub": "-", "mul": "*", "div": "/", "exact_div": "/"}
 _INFIX |= {"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "and": "&", "or": "|", "xor": "^"}
 _CALLS = {
     "fma": "{0} * {1} + {2}",
@@ -89,8 +82,8 @@ class Follower:
 
     def __init__(self, stepper: NativeStepper, bits: int) -> None:
         """Put all that is read into rows, and all that is written."""
-        self.bits, self.lanes, own = bits, LANES[bits], stepper.own
-        body = body_of(own, bits, stepper.rows, False, bool(stepper.plan.table))
+        self.bits, self.lanes, varying = bits, LANES[bits], stepper.varying
+        body = body_of(varying, bits, stepper.rows, False, bool(stepper.plan.table))
         places: dict[Any, int] = {}
 
         def read(node: Node, _: Any) -> Node | None:
@@ -99,13 +92,13 @@ class Follower:
             place = places.setdefault(node.value, stepper.rows.total + len(places))
             return node.graph.leaf("row", place)
 
-        made = body.become(rewritten(body.results(), read))
-        graph = next(iter(made.stores.values())).graph
-        pairs = ((made.sums, "add"), (made.greatest, "max"), (made.least, "min"))
-        self.stores = made.stores | {
+        after = body.map_nodes(rewritten(body.results(), read))
+        graph = next(iter(after.stores.values())).graph
+        pairs = ((after.sums, "add"), (after.maxima, "max"), (after.minima, "min"))
+        self.stores = dict(after.stores) | {
             row: graph.make(op, graph.leaf("row", row), node)
-            for kept, op in pairs
-            for row, node in kept.items()
+            for results, op in pairs
+            for row, node in results.items()
         }
         self.rows, self.state = stepper.rows.total + len(places), stepper.rows.state
         self.first = np.asarray(stepper.states[1:2]).T
@@ -133,18 +126,17 @@ class Follower:
 
     def native(self) -> Run:
         """Return it as native code."""
-        nothing = Body({}, {}, {}, {}, {}, [], [], [])
-        bodies = nothing._replace(stores=self.stores), nothing
+        bodies = Body(stores=self.stores), Body()
         read = (0, 0, False, False, False, (), 0, 0.0)
         plan = Plan(self.bits, self.lanes, False, False, self.rows, 0, *bodies, *read)
         code = Code(program(plan))
 
         def run(rows: np.ndarray, steps: int) -> None:
-            turns = step_by_step(np.array([0, len(rows)]), 0, steps, 0, 1)
-            common = aligned((steps, 1 + len(shared(plan))), rows.dtype)
-            told = {"rows": rows.ctypes.data, "turns": turns.ctypes.data, "steps": steps}
-            told |= {"common": common.ctypes.data, "count": len(turns), "groups": 1, "threads": 1}
-            code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
+            schedule = step_by_step(np.array([0, len(rows)]), 0, steps, 0, 1)
+            uniform_values = aligned((steps, 1 + len(shared(plan))), rows.dtype)
+            arrays = {"rows": rows, "schedule": schedule, "uniform_values": uniform_values}
+            numbers = {"steps": steps, "count": len(schedule), "groups": 1, "threads": 1}
+            call(code, numbers, arrays)
 
         return run
 
@@ -165,7 +157,7 @@ class Follower:
 
     def _text(self) -> str:
         """Return the step as C++."""
-        kind, complete = _KINDS[self.bits], whole(list(self.stores.values()))
+        kind, complete = _KINDS[self.bits], general_case(list(self.stores.values()))
         results = {row: complete[node] for row, node in self.stores.items()}
         lines = [_HEAD.format(size=self.rows * self.lanes, **kind)]
         for node in needed(results.values()):

@@ -1,4 +1,4 @@
-"""Runs a function of one agent's numbers as native code, an agent a lane."""
+"""Runs a function of one agent's numbers as native code, with one agent per lane."""
 
 import numpy as np
 
@@ -8,13 +8,11 @@ from echelon.simulation.codegen import (
     Code,
     Plan,
     aligned,
+    factored,
     program,
     shared,
-    shortened,
 )
 from echelon.simulation.scalars import ScalarGraph, lower, nodes
-
-NOTHING = Body({}, {}, {}, {}, {}, [], [], [])
 
 
 def lowered(function, count, bits=64):
@@ -22,27 +20,27 @@ def lowered(function, count, bits=64):
     graph = ScalarGraph(bits)
     x = np.empty(count, object)
     x[:] = [graph.leaf("row", k) for k in range(count)]
-    found = [node for part in lower(function, graph, [x]) for node in nodes(graph, part)]
-    short = shortened(found)
-    found = [short[node] for node in found]
-    return [graph.make("select", n, 1.0, 0.0) if n.truth else n for n in found]
+    results = [node for part in lower(function, graph, [x]) for node in nodes(graph, part)]
+    after = factored(results)
+    results = [after[node] for node in results]
+    return [graph.make("select", n, 1.0, 0.0) if n.truth else n for n in results]
 
 
 def text_of(function, count, bits=64, lanes=None):
     """Return the code of a function, how many results it has, and its plan."""
     results = lowered(function, count, bits)
-    body = NOTHING._replace(stores=dict(enumerate(results, count)))
+    body = Body(stores=dict(enumerate(results, count)))
     plan = Plan(
         bits=bits,
         lanes=lanes or 512 // bits,
-        together=False,
-        lines=False,
+        batched=False,
+        row_major=False,
         rows=count + len(results),
         width=0,
         first=body,
-        others=NOTHING,
-        tell=0,
-        told=0,
+        others=Body(),
+        message_start=0,
+        message_size=0,
         one_source=False,
         one_leader=False,
         weighted=False,
@@ -61,13 +59,13 @@ def run(function, columns, bits=64, lanes=None, cache=None):
     rows = aligned((blocks, count + results, lanes), dtype)
     padded = np.resize(columns.T, (blocks * lanes, count))
     rows[:, :count] = padded.reshape(blocks, lanes, count).transpose(0, 2, 1)
-    turn, slots = np.array([0, 0, 0, blocks, 0, 0, 0, 0]), np.zeros(len(SLOTS), np.int64)
-    values = {"rows": rows.ctypes.data, "turns": turn.ctypes.data}
-    common = aligned((1 + len(shared(plan)),), dtype)
-    values |= {"common": common.ctypes.data}
+    task, slots = np.array([0, 0, 0, blocks, 0, 0, 0, 0]), np.zeros(len(SLOTS), np.int64)
+    values = {"rows": rows.ctypes.data, "schedule": task.ctypes.data}
+    uniform_values = aligned((1 + len(shared(plan)),), dtype)
+    values |= {"uniform_values": uniform_values.ctypes.data}
     values |= dict.fromkeys(("steps", "count", "groups", "threads"), 1)
     for name, value in values.items():
         slots[SLOTS.index(name)] = value
     Code(text, cache).call(slots)
-    found = rows[:, count:].transpose(0, 2, 1)
-    return found.reshape(blocks * lanes, results)[:agents].T.copy()
+    after = rows[:, count:].transpose(0, 2, 1)
+    return after.reshape(blocks * lanes, results)[:agents].T.copy()

@@ -9,7 +9,7 @@ from echelon.experiments.results.recording import InputBounds, LoopPoles, Record
 
 PROMISE = {
     "promised": True,
-    "sentence": "Promised, by linearization: all is well.",
+    "sentence": "Local guarantee (linearization): all is well.",
     "reasons": [],
     "theorem": None,
     "kind": "linearization",

@@ -18,7 +18,7 @@ from echelon.core.statement import Hypothesis, Topic
 from echelon.core.words import Kind, Verdict
 from echelon.experiments.studies.check import check
 from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.guarantees.verifier.verify import verify
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.agent import Agent
@@ -139,7 +139,10 @@ def test_networkx_means_the_same_by_arrows():
         (lambda: ech.Graph([(0, 1), (0, 1)], directed=True), r"edge \[0, 1\] is given twice"),
         (lambda: ech.Graph([(0, 1, -1.0)], directed=True), "must be positive and finite"),
         (lambda: ech.Graph([(0, 1)], weights=[1.0, 2.0]), "1 edges and 2 weights"),
-        (lambda: ech.Graph([(0, 1, 1.0)], weights=[1.0]), "weights stand in a list of their own"),
+        (
+            lambda: ech.Graph([(0, 1, 1.0)], weights=[1.0]),
+            "must be .i, j. where `weights` are listed separately",
+        ),
         (
             lambda: ech.Graph.switching([(0.0, [(0, 1), (1, 2)]), (3.0, [(0, 1)])]),
             "agent 2 has no path to a leader .leader 0. from 3 s on, after the last switch",
@@ -456,7 +459,7 @@ def worst(draw, count, states):
 def tube_left(parts, settings, x):
     from echelon.guarantees.stopping.tube import tube_of
 
-    tube = tube_of(stopping_of(parts, settings, x)).tube
+    tube = tube_of(stopping_run_of(parts, settings, x))[0]
     assert tube is not None
     return tube.left
 

@@ -362,7 +362,7 @@ def test_every_number_of_every_bundled_model_can_be_scaled(name):
         assert type(plant) is type(model) and plant.state_names == model.state_names
         assert differences(model, plant).startswith(f"`{field.name}` ") == bool(np.any(value))
         back = vary_parameters(plant, {field.name: value}, {})
-        assert differences(model, back).endswith("which is no different")
+        assert differences(model, back).endswith("which equals the model")
 
 
 # ---- what is told ----
@@ -529,7 +529,7 @@ def test_faults_of_plant_and_disturbance_are_told_with_their_place(section, plac
         ),
         (
             lambda: vary_parameters(Linear(np.eye(2), np.eye(2)), {}, {"names": 2.0}),
-            "`names` of `Linear` is ('x1', 'x2'), which no factor can scale.",
+            "`names` of `Linear` is ('x1', 'x2'), and only numbers can be scaled by a factor.",
         ),
     ],
 )

@@ -14,7 +14,7 @@ from echelon.agents.models.model import FlatBound, FlatChains
 from echelon.core.errors import EchelonError
 from echelon.core.words import Kind, Theorem
 from echelon.guarantees.promises.promise import promise
-from echelon.guarantees.stopping.chain_clearance import length_room_of
+from echelon.guarantees.stopping.chain_clearance import length_clearance_of
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
 from echelon.guarantees.verifier.verify import verify
@@ -52,7 +52,9 @@ def test_a_vector_grows_no_longer_than_its_room(roots, order):
     draw, p = np.random.default_rng(0), len(roots)
     starts, speed = draw.uniform(-1.0, 1.0, (2, p)), 0.8
     exact = [list(map(Fraction, row)) for row in starts.tolist()]
-    fall = float(length_room_of(Chain.of(roots), order, exact, Fraction("0.8"), Fraction(9)).fall)
+    fall = float(
+        length_clearance_of(Chain.of(roots), order, exact, Fraction("0.8"), Fraction(9)).fall
+    )
     A = np.eye(p, k=1)
     A[-1] = -np.poly(-np.array(roots))[:0:-1]
     b, dt = np.eye(p)[-1] * A[-1, 0], 0.002
@@ -72,10 +74,10 @@ def test_a_vector_grows_no_longer_than_its_room(roots, order):
 def test_of_one_root_the_longest_vector_is_the_longer_of_start_and_speed():
     for start, speed in ((1.0, 0.4), (0.3, 0.9)):
         exact = [[Fraction(start)], [Fraction(0)]]
-        room = length_room_of(Chain.of((4.0,)), 0, exact, Fraction(speed), Fraction(2))
+        room = length_clearance_of(Chain.of((4.0,)), 0, exact, Fraction(speed), Fraction(2))
         assert max(start, speed) <= float(room.fall) <= 1.02 * max(start, speed)
         # Behind a leader at rest a start alone may be as long as what is allowed.
-        alone = length_room_of(Chain.of((4.0,)), 0, (), Fraction(speed), Fraction(2))
+        alone = length_clearance_of(Chain.of((4.0,)), 0, (), Fraction(speed), Fraction(2))
         assert 1.98 <= float(alone.steepest) <= 2.0
 
 
@@ -160,7 +162,7 @@ def test_unicycles_come_together_from_afar_and_never_stop():
     off = np.linalg.norm(result.errors[:, 1:, :2], axis=2)
     assert off[-1].max() <= 1e-9
     outside = result.times[np.flatnonzero((off >= 0.01).any(axis=1))[-1]]
-    assert outside <= found.tube.arrival.time <= 2.0 * outside
+    assert outside <= found.tube.arrival <= 2.0 * outside
 
 
 # ---- models that do not say ----------------------------------------------------------------------
@@ -235,7 +237,7 @@ def test_what_is_proved_of_a_model_of_ones_own_is_promised_and_flown():
 def test_a_model_that_ends_somewhere_unknown_is_promised_nothing():
     found = promised(swings(Tilted()))
     assert not found.promised
-    assert "does not say where its flat coordinates end" in found.sentence()
+    assert "does not state where its flat coordinates end" in found.sentence()
 
 
 # ---- bounds that models state --------------------------------------------------------------------

@@ -178,9 +178,9 @@ def test_a_brief_promise_is_the_same_but_for_motors_and_arrival(hovering):
     parts, settings, whole = hovering
     # Of other parts, since a promise is kept for those of which it was asked.
     [brief] = promises(parts.replace(), [settings], brief=True)
-    assert whole.tube.strain is not None and whole.tube.arrival is not None
-    assert brief.tube == whole.tube._replace(strain=None, arrival=None)
-    assert "motors" not in brief.sentence() and "within 1 cm" not in brief.sentence()
+    assert whole.tube.motor_load is not None and whole.tube.arrival is not None
+    assert brief.tube == whole.tube._replace(motor_load=None, arrival=None)
+    assert "motor" not in brief.sentence() and "within 1 cm" not in brief.sentence()
     for name in ("promised", "reasons", "kind", "theorem", "rate", "hold", "certified"):
         assert getattr(brief, name) == getattr(whole, name), name
     rest = {name: line for name, line in whole.hypotheses.items() if name is not Hypothesis.LIMITS}
@@ -189,10 +189,10 @@ def test_a_brief_promise_is_the_same_but_for_motors_and_arrival(hovering):
 
 def test_motors_that_suffice_are_promised_and_verified(hovering, tmp_path):
     _, _, found = hovering
-    strain, line = found.tube.strain, found.hypotheses[Hypothesis.LIMITS]
+    load, line = found.tube.motor_load, found.hypotheses[Hypothesis.LIMITS]
     assert line.verdict is Verdict.HOLDS and line.kind is Kind.PROOF
-    assert 0.0 < strain.least < QUADROTOR.mass * QUADROTOR.gravity / 4.0 < strain.largest < 0.15975
-    assert "motors give between" in found.sentence() and strain.alone.rest
+    assert 0.0 < load.least < QUADROTOR.mass * QUADROTOR.gravity / 4.0 < load.largest < 0.15975
+    assert "thrust stays between" in found.sentence() and load.alone.rest
     told = found.as_mapping()
     file = tmp_path / "summary.json"
 
@@ -221,7 +221,7 @@ def test_motors_that_may_not_suffice_leave_the_promise_of_the_tube(hovering):
         drive=parts.drive.with_follower(eqx.tree_at(lambda law: law.speed, law, speeds))
     )
     found = promise(fast, settings)
-    assert found.promised and found.tube.strain is None
+    assert found.promised and found.tube.motor_load is None
     line = found.hypotheses[Hypothesis.LIMITS]
     assert line.fails and "gentler `roots`" in line.remedy
     free = promise(parts, settings._replace(limits=False))
@@ -231,7 +231,7 @@ def test_motors_that_may_not_suffice_leave_the_promise_of_the_tube(hovering):
 @pytest.mark.slow
 def test_starts_at_the_edge_of_the_certificate_are_flown_within_it():
     parts, settings = gentle("simulation.horizon=6")
-    strain = promise(parts, settings).tube.strain
+    load = promise(parts, settings).tube.motor_load
     draw, found = np.random.default_rng(0), []
     start = prepare(parts, settings).problem.states
     for kind in ("tilt", "sideways", "upward", "rate", "rest"):
@@ -243,18 +243,18 @@ def test_starts_at_the_edge_of_the_certificate_are_flown_within_it():
             along = np.array([np.cos(way), np.sin(way)])
             if kind == "tilt":
                 # Yaw 0: pitch leans forward, roll to the right.
-                lean = np.tan(strain.alone.tilt) * along
+                lean = np.tan(load.alone.tilt) * along
                 agent[6:] = 0.0
                 agent[7] = np.arctan(lean[0])
                 agent[6] = np.arctan(-lean[1] * np.cos(agent[7]))
             elif kind == "sideways":
-                agent[3:5] += strain.alone.sideways * along
+                agent[3:5] += load.alone.sideways * along
             elif kind == "upward":
-                agent[5] += strain.alone.upward * draw.choice([-1.0, 1.0])
+                agent[5] += load.alone.upward * draw.choice([-1.0, 1.0])
             else:
                 agent[6:] = 0.0
                 agent[8] = way
-                agent[9:11] = strain.alone.rate * along * (kind == "rate")
+                agent[9:11] = load.alone.rate * along * (kind == "rate")
                 agent[3:6] *= kind == "rate"
         # Off limits, so that what motors would have to give is seen.
         run = ech.simulate(parts.replace(initial=x), settings._replace(dt=0.001, limits=False))

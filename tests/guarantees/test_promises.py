@@ -195,7 +195,7 @@ def test_a_run_says_what_check_says_of_a_step_too_long():
     changes += ["simulation.horizon=0.01", "report.steady_window=0.005"]
     built = ech.build(ech.load_scenario("planar-quadrotor", changes))
     found = ech.promise(*built)
-    assert found.reasons == ("with the input held over the step `dt` it grows",)
+    assert found.reasons == ("with the input held over the step `dt` the disagreement grows",)
     report = " ".join(ech.report(ech.simulate(*built)).split())
     assert found.sentence() in report and "stable" not in report
 
@@ -222,7 +222,7 @@ def test_the_printed_step_keeps_no_offset():
     assert ech.promise(parts, settings(integrator="printed", dt=1.0)).promised
     away = parts.replace(formation=ech.Formation([[0.0], [1.0]]))
     step = ech.promise(away, settings(integrator="printed", dt=1.0)).hypotheses[Hypothesis.SAMPLING]
-    assert step.fails and "forgets the goals" in step.text
+    assert step.fails and "ignores the goals" in step.text
 
 
 @pytest.mark.parametrize(
@@ -446,7 +446,7 @@ def test_a_limit_and_a_wind_leave_a_run_uncovered(swinging):
 def test_a_run_that_will_grow_says_what_would_not(echelon):
     quick = ["--set", "simulation.horizon=0.5", "--set", "simulation.dt=0.05", "--no-figures"]
     code, out, err = echelon("run", "planar-quadrotor", *quick, "--out", "o")
-    assert code == 0 and err.startswith("echelon: Nothing is promised: with the input held over")
+    assert code == 0 and err.startswith("echelon: Nothing is guaranteed: with the input held over")
     assert "It will grow; what would not: `--set simulation.dt=" in err
     shorter = err.partition("`--set simulation.dt=")[2].partition("`")[0]
     change = f"simulation.dt={shorter}"
@@ -487,8 +487,8 @@ def test_plans_are_promised_nothing():
     goals = ech.Formation(np.zeros((4, 4)))
     parts = ech.Parts(model, PATH, goals, ech.optimal.Plans(ech.references.Circle()))
     assert ech.promise(parts, settings()).sentence() == (
-        "Nothing is promised: no theorem is known of `Plans`. What would help: use laws, which "
-        "theorems speak of."
+        "Nothing is guaranteed: no theorem covers `Plans`. What would help: use laws that a "
+        "theorem covers."
     )
 
 
@@ -633,7 +633,7 @@ def test_no_mode_and_no_edge_is_told_of_a_model_that_bends_at_its_trim(method):
     parts = parts_of(model, PATH, gain, initial={"x": 0.1})
     promise, run = ech.promise(parts, settings()), settings(horizon=0.1)
     assert promise.promised and promise.theorem is Theorem.T1
-    assert promise.sentence().startswith("Promised, on a domain alone")
+    assert promise.sentence().startswith("Guaranteed on a domain only")
     told = promise.as_mapping()
     assert (told["slowest_mode"], told["edge"]) == (None, None)
     for text in (promise.sentence(), ech.report(ech.simulate(parts, run))):

@@ -15,7 +15,7 @@ from scipy.linalg import solve_continuous_are
 import echelon as ech
 from echelon.agents.models import DoubleIntegrator, Pendulum, Quadrotor, Unicycle
 from echelon.agents.references import Circle, FigureEight, Hover, StatePath
-from echelon.agents.references.demand import asked, reference_warnings
+from echelon.agents.references.demand import reference_demand, reference_warnings
 from echelon.core.errors import LawError, ReferenceError
 from echelon.core.numerics import precision
 from echelon.core.words import Verdict
@@ -150,16 +150,16 @@ def test_an_angle_may_be_given_within_one_turn():
 
 def test_how_far_a_path_is_from_a_motion_is_said_with_its_number():
     times, states, inputs = swing(61)
-    assert asked(PENDULUM, StatePath(times, states, inputs), 6.0).defect < 0.02
+    assert reference_demand(PENDULUM, StatePath(times, states, inputs), 6.0).defect < 0.02
     # Without its torque the rate is off by the torque, where it is largest.
     still = StatePath(times, states, 0.0 * inputs)
-    found = asked(PENDULUM, still, 6.0)
+    found = reference_demand(PENDULUM, still, 6.0)
     assert found.off[0] == 1 and found.off[1] > 5.0 and not found.feasible
     (told,) = reference_warnings(PENDULUM, still, 6.0)
     assert "the reference `StatePath` is no motion of `Pendulum`: at t = " in told
     assert f"the rate of `rate` is {found.off[1]:.3g} off f + g u" in told
     # A path that ends on the way is held where nothing would hold it.
-    assert not asked(PENDULUM, StatePath(times, states, inputs), 8.0).feasible
+    assert not reference_demand(PENDULUM, StatePath(times, states, inputs), 8.0).feasible
 
 
 def test_a_check_says_what_the_reference_asks(tmp_path, echelon):
@@ -202,7 +202,7 @@ def test_a_scenario_names_a_path_of_states_by_its_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("reference.file=none.csv", "is no line of names with lines of numbers below it"),
+        ("reference.file=none.csv", "none.csv` cannot be read"),
         ("reference={name: circle, file: swing.csv}", "`circle` does not read files"),
         ("model={name: van-der-pol}", "has the columns `rate`, `t`, `angle`, `torque`, and `Van"),
         ("reference={name: states, times: [0, 0], states: [[0]], inputs: [[0]]}", "increasing"),

@@ -109,7 +109,7 @@ def test_a_bound_is_drawn_where_a_theorem_gives_one_and_it_bounds_what_shrinks_s
         {"promise": CERTIFIED | {"theorem": "T2"}},
         {"promise": CERTIFIED | {"hypotheses": []}},
         {"promise": CERTIFIED | {"promised": False}},
-        {"promise": CERTIFIED | {"sentence": "This is said without what the scenario adds: wind."}},
+        {"promise": CERTIFIED | {"sentence": "The guarantee ignores that wind acts."}},
     ],
 )
 def test_no_bound_is_drawn_that_is_not_promised_of_the_run(run, spoiled):

@@ -14,7 +14,7 @@ from scipy.special import erf
 
 from echelon.agents.models import Quadrotor
 from echelon.core.numerics import precision, rk4
-from echelon.simulation.codegen import machine_code, shortened
+from echelon.simulation.codegen import factored, machine_code
 from echelon.simulation.scalars import ScalarGraph, Unsupported, needed
 from echelon.simulation.scalars.scalar_graph import OPERATIONS
 
@@ -449,7 +449,7 @@ def test_sums_of_whole_numbers_stay_the_same_with_no_more_products():
             plain = graph.constant(drawn.choice([0.5, 2.0, -2.0, 3.0]))
             args = [drawn.choice([plain, *pool[-6:]]) for _ in range(1 if op == "neg" else 2)]
             pool.append(graph.make(op, *args))
-        short, row = shortened(pool[-2:]), [3.0, -5.0, 2.0, 7.0]
+        short, row = factored(pool[-2:]), [3.0, -5.0, 2.0, 7.0]
         exact = numbers_of(pool[-2:], row)
         if max(map(abs, exact)) < 2.0**40:
             assert numbers_of([short[node] for node in pool[-2:]], row) == exact

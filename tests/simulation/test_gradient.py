@@ -260,7 +260,7 @@ def test_what_is_kept_has_a_bound_in_bytes_and_holds_no_moments(monkeypatch):
     ready = gradients._ready.pop(differentiate(0.7))
     assert not any(way.moments for way in ready._native._ways.values())
     way = next(iter(ready._native._ways.values()))
-    assert ready.size > way.tape.nbytes + way.felt.nbytes
+    assert ready.size > way.tape.nbytes + way.cotangents.nbytes
     monkeypatch.setattr(gradients, "_ready", ready_runs(2 * ready.size))
     for start in (0.8, 0.9, 0.6):
         differentiate(start)

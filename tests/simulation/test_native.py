@@ -226,7 +226,7 @@ def test_bits_do_not_depend_on_threads(monkeypatch):
     chunks = []
     with jax.enable_x64(True):
         for count in (1, 3):
-            stepper.crew = threads.ThreadPool(stepper.places, None, count)
+            stepper.threads = threads.ThreadPool(stepper.places, None, count)
             chunks.append(stepper.advance(stepper.start(), np.array([5, 40]), None))
     alone, shared = chunks
     assert shared.now.states.tobytes() == alone.now.states.tobytes()
@@ -241,14 +241,14 @@ def test_bits_do_not_depend_on_which_blocks_take_their_steps_first(graph, monkey
     formation = ech.Formation(np.arange(200.0)[:, None] * [[1.0, 0.0]])
     parts = ech.Parts(model, graph, formation, drive, initial={"position": 1.0})
     whole, stepper = stepped(parts, run_settings(), (5, 0, 40), "native")
-    near = stepper.places.near
-    assert near.reach < 4
-    monkeypatch.setattr(schedule, "_CACHES", (8 * near.reach * near.bytes,))
+    reach = stepper.places.reach
+    assert reach.reach < 4
+    monkeypatch.setattr(schedule, "_CACHES", (8 * reach.reach * reach.bytes,))
     for count in (1, 3):
-        stepper.crew = threads.ThreadPool(stepper.places, None, count)
+        stepper.threads = threads.ThreadPool(stepper.places, None, count)
         with jax.enable_x64(True):
             tiles = stepper.advance(stepper.start(), np.array([5, 0, 40]), None)
-        assert len(stepper.crew._turns(40, 0)) > 3 * 40
+        assert len(stepper.threads._schedule(40, 0)) > 3 * 40
         assert tiles.states.tobytes() == whole.states.tobytes()
         assert tiles.inputs.tobytes() == whole.inputs.tobytes()
         assert all(a.tobytes() == b.tobytes() for a, b in zip(tiles.sums, whole.sums, strict=True))
@@ -270,14 +270,14 @@ def test_numbers_are_where_they_were_put_whoever_stands_where(bits, agents, rows
     blocks = kernels.aligned((len(stand) // lanes, rows + 3, lanes), kind)
     wanted = draws.normal(size=(agents, rows)).astype(kind)
     part = blocks[:, 1 : 1 + rows]
-    kernels.move(part, stand, wanted, True, 0, len(blocks))
+    kernels.copy_rows(part, stand, wanted, True, 0, len(blocks))
     np.testing.assert_array_equal(part.transpose(0, 2, 1).reshape(len(stand), rows), wanted[stand])
     assert not blocks[:, 0].any() and not blocks[:, 1 + rows :].any()
     for other in (kind, np.dtype(float)):
         found = np.full((agents, rows), np.nan, other)
         # In pieces, as threads do.
         for first in range(len(blocks)):
-            kernels.move(part, stand, found, False, first, first + 1)
+            kernels.copy_rows(part, stand, found, False, first, first + 1)
         np.testing.assert_array_equal(found, wanted)
 
 
@@ -296,9 +296,9 @@ def test_native_code_is_given_arrays_of_its_own_layout_alone():
     }.items():
         told = {"rows": blocks, "agents": stand, "values": wanted, "first": 0, "last": 2} | changed
         with pytest.raises(ValueError, match=f"`{name}` does not fit"):
-            kernels.move(**told, inward=True)
+            kernels.copy_rows(**told, inward=True)
     with pytest.raises(ValueError, match="`values` does not fit"):
-        kernels.move(blocks, stand, wanted.astype(int), True, 0, 2)
+        kernels.copy_rows(blocks, stand, wanted.astype(int), True, 0, 2)
     assert not blocks.any()
 
 
@@ -314,16 +314,16 @@ def test_the_code_that_moves_numbers_is_made_once_for_all_threads(monkeypatch):
             pass
 
     monkeypatch.setattr(block_copy, "Code", Slow)
-    block_copy._mover.cache_clear()
+    block_copy._copier.cache_clear()
     blocks, stand = kernels.aligned((1, 1, 8), np.float64), np.arange(8)
 
     def move(_):
         begin.wait()
-        kernels.move(blocks, stand, np.ones((8, 1)), True, 0, 1)
+        kernels.copy_rows(blocks, stand, np.ones((8, 1)), True, 0, 1)
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(move, range(4)))
-    block_copy._mover.cache_clear()
+    block_copy._copier.cache_clear()
     assert len(made) == 1
 
 
@@ -432,8 +432,8 @@ def test_states_beyond_the_range_of_the_sines_are_stepped_by_jax():
     assert ours.states.tobytes() == theirs.states.tobytes()
     [warning] = stepper.warnings
     assert warning == (
-        "JAX stepped the agents from t = 0 s on where a state was beyond 100000, since the sines "
-        "of native code lose digits there."
+        "From t = 0 s on, JAX stepped the agents whenever a state was beyond 100000, where the "
+        "sines of native code lose digits."
     )
 
 
@@ -478,7 +478,7 @@ def test_where_agents_stand_changes_no_bit(monkeypatch):
         assert a.tobytes() == b.tobytes(), name
 
     def apart(stepper):
-        i, j = stepper.places.of[graph.edges].T
+        i, j = stepper.places.position[graph.edges].T
         return np.abs(i - j).mean()
 
     # On a line each stands beside the next, but for the leader's block.

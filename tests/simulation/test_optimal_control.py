@@ -13,7 +13,12 @@ from scipy.integrate import solve_bvp
 
 import echelon as ech
 from echelon.agents.models import Limits
-from echelon.agents.references.demand import asked, demand, flat_inputs, reference_warnings
+from echelon.agents.references.demand import (
+    demand,
+    flat_inputs,
+    reference_demand,
+    reference_warnings,
+)
 from echelon.core.errors import MissingExtraError, ModelError, PlanError
 from echelon.core.numerics import precision
 
@@ -457,8 +462,8 @@ def test_a_reference_beyond_the_limits_is_warned_of_with_the_ratio():
     assert re.fullmatch(
         r"the reference `FigureEight` is too fast for `Quadrotor`: at t = [\d.]+ s it needs "
         + re.escape(f"{worst:.3g}")
-        + r" times what the actuators leave beyond the trim \(thrust [\d.]+ N, torque_x .*\); make "
-        "it slower or smaller.",
+        + r" times the range of the actuators beyond the trim \(thrust [\d.]+ N, torque_x .*\); "
+        "make it slower or smaller.",
         told,
     )
     assert reference_warnings(model, ech.references.FigureEight(rate=0.3), 10.0) == ()
@@ -468,13 +473,13 @@ def test_a_reference_beyond_the_limits_is_warned_of_with_the_ratio():
 def test_a_circle_asks_for_its_speed_and_its_centripetal_acceleration():
     circle = ech.references.Circle(radius=2.0, rate=1.5)
     for model in (ech.models.Quadrotor.crazyflie(), ech.models.Unicycle()):
-        found = asked(model, circle, 5.0)
+        found = reference_demand(model, circle, 5.0)
         assert found.speed == pytest.approx(3.0, rel=1e-5)
         assert found.acceleration == pytest.approx(4.5, rel=1e-5)
         assert found.defect < 1e-5 and found.feasible
     # Nothing of a motion without a position is metres.
     path = ech.references.StatePath([0.0, 1.0], [[0.0, 0.0]] * 2, [[0.0]] * 2)
-    assert asked(ech.models.Pendulum(), path, 1.0)[:3] == (None, None, 0.0)
+    assert reference_demand(ech.models.Pendulum(), path, 1.0)[:3] == (None, None, 0.0)
 
 
 def test_a_leader_beyond_its_limits_is_warned_of_before_it_flies():

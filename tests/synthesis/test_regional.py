@@ -395,7 +395,7 @@ def test_a_weak_input_weakens_the_trim_thrust_too():
 
 def test_check_exits_by_what_is_promised(echelon):
     code, out, err = echelon("check", "paper")
-    assert (code, err) == (0, "") and "Promised, by linearization" in out
+    assert (code, err) == (0, "") and "Local guarantee (linearization)" in out
     code, out, _ = echelon("check", "paper-literal", "--json")
     assert code == 1 and json.loads(out)["promise"]["promised"] is False
 

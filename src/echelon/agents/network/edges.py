@@ -1,4 +1,4 @@
-"""Reading and checking the edges and leaders that a graph is made from."""
+"""Reading and checking the edges and leaders of a graph."""
 
 import operator
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ from echelon.core.types import Array
 
 def split_weights(edges: Iterable[Sequence[float]]) -> tuple[Array, Array]:
     """Return pairs (E, 2) of whole numbers and weights (E,)."""
-    # Arrays come from generators of large graphs, and need no look at each edge.
+    # Arrays come from the generators of large graphs, whose edges need no check one by one.
     if isinstance(edges, np.ndarray) and edges.ndim == 2 and edges.shape[1] == 2:
         return _whole(edges, "an edge is"), np.ones(len(edges))
     edges = [tuple(edge) for edge in edges]
@@ -31,9 +31,9 @@ def _whole(values: Sequence[Any] | Array, what: str) -> Array:
     if not _are_whole(values):
         for value in values:
             if not _are_whole(value):
-                shown = list(value) if isinstance(value, tuple) else value
-                raise GraphError(f"{what} {shown}, and agents are whole numbers from 0 on.")
-    # By way of floats, so that the 1.0 of a file is agent 1.
+                text = list(value) if isinstance(value, tuple) else value
+                raise GraphError(f"{what} {text}, and agents are whole numbers from 0 on.")
+    # Through floats, so that the 1.0 of a file is agent 1.
     return np.array(values, dtype=np.float64).astype(np.int64)
 
 
@@ -46,7 +46,7 @@ def _are_whole(values: object) -> bool:
 
 
 def count_agents(pairs: Array, agents: int | None) -> int:
-    """Return the number of agents, that of the largest named when left out."""
+    """Return the number of agents, by default the largest number in an edge plus one."""
     named = int(pairs.max(initial=0)) + 1
     if agents is None:
         agents = named
@@ -63,7 +63,7 @@ def check_edges(
 ) -> tuple[Array, Array]:
     """Return the edges, undirected ones with the smaller agent first, and their weights."""
     edges = pairs if directed else _ascending(pairs)
-    # The first fault alone is reported, here and below.
+    # Only the first fault is reported, here and below.
     for i, j in pairs[edges.min(axis=1, initial=0) < 0][:1]:
         raise GraphError(
             f"an edge is [{i}, {j}], and agents are whole numbers from 0 to {agents - 1}."
@@ -74,7 +74,7 @@ def check_edges(
         )
     for i, j in edges[_repeated(edges, agents)][:1]:
         raise GraphError(f"edge [{i}, {j}] is given twice, and may be given once.")
-    # Negated, so that NaN, which no comparison holds for, is wrong too.
+    # Negated, so that NaN, for which every comparison is false, is wrong too.
     wrong = ~((weights > 0.0) & (weights < np.inf))
     for (i, j), weight in zip(edges[wrong][:1], weights[wrong][:1], strict=True):
         raise GraphError(
@@ -90,31 +90,33 @@ def links(i: Array | int, j: Array) -> Array:
 
 def _ascending(pairs: Array) -> Array:
     """Return pairs with the smaller number first."""
-    # Three times as fast as a sort of each.
+    # Three times as fast as sorting each pair.
     i, j = pairs.T
     return np.stack([np.minimum(i, j), np.maximum(i, j)], axis=1)
 
 
 def give_weights(edges: Iterable[Sequence[float]], weights: Sequence[float]) -> list[list[float]]:
-    """Return edges (i, j) with weights that stand in a list of their own.
+    """Return edges (i, j, weight) from edges (i, j) and a list of weights.
 
     Raises:
-        GraphError: there are not as many, or an edge has one already.
+        GraphError: their numbers differ, or an edge has a weight already.
     """
     edges, weights = [list(edge) for edge in edges], list(weights)
     if len(edges) != len(weights):
-        raise GraphError(f"there are {len(edges)} edges and {len(weights)} weights of them.")
+        raise GraphError(
+            f"there are {len(edges)} edges and {len(weights)} weights; give one weight per edge."
+        )
     for edge in edges:
         if len(edge) != 2:
             raise GraphError(
-                f"an edge is {edge}, and must be [i, j] where weights stand in a list of their own."
+                f"an edge is {edge}, and must be [i, j] where `weights` are listed separately."
             )
     return [[*edge, float(weight)] for edge, weight in zip(edges, weights, strict=True)]
 
 
 def _repeated(edges: Array, agents: int) -> Array:
-    """Return the places of edges that are there more than once."""
-    # One number an edge sorts ten times faster than rows, of which a swarm has millions.
+    """Return the indices of edges that occur more than once."""
+    # One number per edge sorts ten times faster than rows, and large graphs have millions.
     number = edges[:, 0] * agents + edges[:, 1]
     ordered = np.sort(number)
     again = ordered[1:][ordered[1:] == ordered[:-1]]
@@ -145,13 +147,13 @@ def count_grid(rows: int, columns: int) -> int:
 
 
 def check_size(agents: int, least: int, kind: str, edges: int = 0, share: float = 0) -> None:
-    """Check that a kind of graph has enough agents, and no more than fit; nor its edges.
+    """Check that a kind of graph has enough agents, and that agents and edges fit into memory.
 
-    These are counted, or are about a share of all pairs.
+    The number of edges is `edges`, plus about a `share` of all pairs.
     """
     _check_whole(agents)
     if agents < least:
-        raise GraphError(f"a {kind} needs at least {least} agents, and was given {agents}.")
+        raise GraphError(f"a {kind} needs at least {least} agents, and has {agents}.")
     excess = excess_agents(agents) or excess_edges(edges + share * (agents * (agents - 1) // 2))
     if excess is not None:
         raise GraphError(f"the graph is too large: {excess}.")
@@ -168,5 +170,5 @@ def _check_whole(agents: int) -> None:
 
 def name_agents(agents: np.ndarray) -> str:
     """Return a subject with its verb such as `agents 2, 3 have`, shortened when there are many."""
-    shown = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
-    return f"agent {shown} has" if len(agents) == 1 else f"agents {shown} have"
+    numbers = ", ".join(str(agent) for agent in agents[:8]) + (", ..." if len(agents) > 8 else "")
+    return f"agent {numbers} has" if len(agents) == 1 else f"agents {numbers} have"

@@ -1,7 +1,4 @@
-"""The formation: each agent's goal offset xi_i from the leader.
-
-With it stands what the graph and the model make of the offsets: rigidity and symmetry.
-"""
+"""The formation: each agent's goal offset xi_i from the leader, its rigidity and symmetry."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import final
@@ -18,23 +15,23 @@ from echelon.core.types import Array, States
 
 # For an analytic model one random state would do, almost surely; kinks need more.
 _SAMPLES = 32
-_TESTED = 64
+_MAX_TESTED = 64
 _SYMMETRY_TOLERANCE = 1e-9
 
 
 @final
 class Formation:
-    """Goal offsets xi (N, n), one row an agent; xi_i is agent i's goal state minus the leader's.
+    """Goal offsets xi (N, n), one row per agent; xi_i is agent i's goal minus the leader's state.
 
     Attributes:
         offsets: (N, n) float64.
 
     Raises:
-        FormationError: the offsets are no finite matrix.
+        FormationError: the offsets are not a finite matrix.
     """
 
     def __init__(self, offsets: Sequence[Sequence[float]] | Array) -> None:
-        """Keep the offsets, read-only."""
+        """Store the offsets, read-only."""
         self.offsets = np.array(offsets, dtype=np.float64)
         if self.offsets.ndim != 2 or not np.isfinite(self.offsets).all():
             raise FormationError(
@@ -56,11 +53,11 @@ class Formation:
     def from_offsets(
         cls, model: ControlAffine, graph: Graph, offsets: Mapping[int, Sequence[float]]
     ) -> "Formation":
-        """Return the formation with the given offsets; an agent not named has none.
+        """Return the formation of some offsets; the others are zero.
 
         Args:
-            model: gives the states.
-            graph: gives the agents.
+            model: defines the states.
+            graph: defines the agents.
             offsets: agent number -> offset, over the position coordinates (metres) or over all n
                 states.
 
@@ -87,7 +84,7 @@ class Formation:
     def triangle(cls, model: ControlAffine, graph: Graph, spacing: float = 1.0) -> "Formation":
         """Return a filled triangle with agent 0 at the tip.
 
-        Rows of 2, 3, ... agents stand behind it, towards minus the first axis.
+        Rows of 2, 3, ... agents follow behind it, towards minus the first axis.
         """
         # Row r begins with agent r (r + 1) / 2, solved for r.
         rows = np.floor((np.sqrt(8.0 * np.arange(graph.agents) + 1.0) - 1.0) / 2.0)
@@ -117,7 +114,7 @@ class Formation:
         """Return agents 1, 2, ... on a circle around agent 0, `spacing` apart along its chords."""
         ring = max(graph.agents - 1, 1)
         angle = 2.0 * np.pi * np.arange(ring) / ring
-        # A chord is 2 r sin(pi / ring); of one or two agents it says nothing of use.
+        # A chord is 2 r sin(pi / ring); for one or two agents it does not set the radius.
         radius = 1.0 if ring < 3 else 0.5 / np.sin(np.pi / ring)
         points = radius * np.column_stack([np.cos(angle), np.sin(angle)])
         plan = np.vstack([np.zeros((1, 2)), points])[: graph.agents]
@@ -127,11 +124,11 @@ class Formation:
     def grid(
         cls, model: ControlAffine, graph: Graph, spacing: float = 1.0, columns: int | None = None
     ) -> "Formation":
-        """Return rows of `columns` agents (near a square unless given), agent 0 at a corner."""
+        """Return rows of `columns` agents (by default near a square), agent 0 at a corner."""
         columns = int(np.ceil(np.sqrt(graph.agents))) if columns is None else columns
         if columns < 1:
             raise FormationError(f"`columns` of a grid is {columns}, and must be at least 1.")
-        # More columns than agents are one row, and may be more than an array's numbers can count.
+        # More columns than agents are one row, and could exceed the range of integers in arrays.
         number, columns = np.arange(graph.agents), min(columns, graph.agents)
         plan = np.column_stack([-(number // columns), number % columns])
         return cls._place_plan(model, graph, plan, spacing)
@@ -149,9 +146,9 @@ class Formation:
         if not axes:
             raise FormationError(
                 f"`{type(model).__name__}` has no position, "
-                "so a drawn formation has no meaning; give `offsets`."
+                "so a geometric formation has no meaning; give `offsets`."
             )
-        # On a line the plan is projected; goals that then coincide are warned of before a run.
+        # On a line the plan is projected; goals that coincide then cause a warning before a run.
         used = min(2, len(axes))
         full = np.zeros((graph.agents, len(model.state_names)))
         full[:, axes[:used]] = spacing * plan[:, :used]
@@ -183,10 +180,10 @@ class Formation:
         return matrix.reshape(len(graph.edges), -1)
 
     def is_rigid(self, model: ControlAffine, graph: Graph) -> bool:
-        """Tell whether the edges' lengths fix the shape to first order (infinitesimal rigidity)."""
+        """Tell whether edge lengths fix the shape to first order (infinitesimal rigidity)."""
         agents, dim = graph.agents, len(model.position)
-        # dim translations and dim (dim - 1) / 2 turns; agents fewer than axes can fix as many
-        # lengths as they have pairs.
+        # dim translations and dim (dim - 1) / 2 rotations; fewer agents than axes can fix as many
+        # lengths as there are pairs.
         motions = (
             dim * (dim + 1) // 2 if agents >= dim else agents * dim - agents * (agents - 1) // 2
         )
@@ -202,28 +199,28 @@ class Formation:
     def broken_symmetries(
         self, model: ControlAffine, lower: Array | float = -0.5, upper: Array | float = 0.5
     ) -> dict[int, str]:
-        """Return which agents' offsets change the dynamics, each with one reason; empty if none.
+        """Return the agents whose offsets change the dynamics, each with one reason.
 
-        An offset d keeps the formation law exact only if f(x + d) = f(x) and g(x + d) = g(x). Both
-        are compared at random states, values and Jacobians, in float64. It is a sampled test, of at
+        The formation law is exact for an offset d only if f(x + d) = f(x) and g(x + d) = g(x). Both
+        are compared at random states, values and Jacobians, in float64. The test is sampled, at
         most 64 distinct offsets spread over all of them.
 
         Args:
-            model: whose f and g.
-            lower: from where on states are drawn, (n,) or for all, as deviations from the trim.
-            upper: up to where.
+            model: the agent.
+            lower: lower bounds of the states, (n,) or one for all, as deviations from the trim.
+            upper: upper bounds.
         """
-        offsets = self.offsets - self.offsets[0] + 0.0  # which makes -0.0 the same as 0.0
+        offsets = self.offsets - self.offsets[0] + 0.0  # turns -0.0 into 0.0
         first, group = _distinct(offsets)
-        tested = range(0, len(first), max(1, -(-len(first) // _TESTED)))
+        tested = range(0, len(first), max(1, -(-len(first) // _MAX_TESTED)))
         # In float32 rounding alone would exceed the tolerance.
         with precision("float64"):
-            found = {
+            changes = {
                 k: _describe_change(model, offsets[first[k]], lower, upper)
                 for k in tested
                 if offsets[first[k]].any()
             }
-        reasons = {k: reason for k, reason in found.items() if reason}
+        reasons = {k: reason for k, reason in changes.items() if reason}
         agents = np.flatnonzero(np.isin(group, [*reasons])) if reasons else np.zeros(0, int)
         return {agent: reasons[int(group[agent])] for agent in agents.tolist()}
 
@@ -270,14 +267,14 @@ def _describe_change(
 ) -> str | None:
     """Return how f or g changes under x -> x + offset, or None where it does not."""
     base = np.asarray(model.trim[0], float)
-    # Near the trim where nothing else is asked, so that no angle leaves its chart.
+    # Near the trim by default, so that no angle leaves its chart.
     states = base + np.random.default_rng(0).uniform(lower, upper, (_SAMPLES, len(base)))
     both = np.concatenate([states, states + offset])
     for name, (values, slopes) in _local(model, both).items():
         here, there = np.split(np.asarray(values), 2)
         # A change that happens to vanish at a state rarely vanishes with its slope.
-        turned = np.abs(np.diff(np.split(np.asarray(slopes), 2), axis=0))[0].max(axis=-1)
-        change = np.maximum(np.abs(there - here), turned)
+        slope_change = np.abs(np.diff(np.split(np.asarray(slopes), 2), axis=0))[0].max(axis=-1)
+        change = np.maximum(np.abs(there - here), slope_change)
         # Each entry against its own size: an inertia makes some entries of g tens of thousands.
         entries = change / np.maximum(1.0, np.abs(here).max(axis=0))
         per_state = change.reshape(_SAMPLES, len(base), -1).max(axis=(0, 2))

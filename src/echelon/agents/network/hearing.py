@@ -1,4 +1,4 @@
-"""Who hears whom: along which edges, and in words through whom each hears which leaders."""
+"""Who receives from whom: along which edges, and in words from which leaders and through whom."""
 
 from collections.abc import Iterator, Sequence
 
@@ -10,64 +10,64 @@ from echelon.agents.network.graph import Graph
 from echelon.core.types import Array
 
 _NAMED = 12
-"""Up to so many followers, or leaders of a flock, have words of their own."""
+"""Up to so many followers, or leaders, are named one by one."""
 
 
-def edges_of(graph: Graph, heard: Exchange) -> tuple[Array, Array]:
-    """Return along which edge each of the ways goes (K,), and which end of it, 0 or 1, hears."""
-    hears, said = np.asarray(heard.receivers), np.asarray(heard.senders)
-    # A directed edge (i, j) is heard by j, and an undirected one has the lower number first.
-    end = np.ones(len(hears), int) if graph.directed else (hears > said).astype(int)
+def edges_of(graph: Graph, exchange: Exchange) -> tuple[Array, Array]:
+    """Return the edge of each directed link (K,), and which end of it, 0 or 1, receives."""
+    receivers, senders = np.asarray(exchange.receivers), np.asarray(exchange.senders)
+    # Along a directed edge (i, j) j receives, and an undirected one has the lower number first.
+    end = np.ones(len(receivers), int) if graph.directed else (receivers > senders).astype(int)
     keys = graph.edges @ (graph.agents, 1)
     order = np.argsort(keys)
-    wanted = np.where(end, said, hears) * graph.agents + np.where(end, hears, said)
-    return order[np.searchsorted(keys, wanted, sorter=order)], end
+    link_keys = np.where(end, senders, receivers) * graph.agents + np.where(end, receivers, senders)
+    return order[np.searchsorted(keys, link_keys, sorter=order)], end
 
 
 def heard_along(graph: Graph, leaderward: bool, leaders_hear: bool) -> Array:
-    """Return whether each end of each edge hears the other, (E, 2).
+    """Return whether each end of each edge uses the messages of the other, (E, 2).
 
     Args:
-        graph: of all.
-        leaderward: whether those alone are heard who are nearer to a leader.
-        leaders_hear: whether leaders act on what they hear.
+        graph: the communication graph.
+        leaderward: whether agents use only neighbours that are nearer to a leader.
+        leaders_hear: whether leaders act on messages.
     """
-    found = np.zeros((len(graph.edges), 2), bool)
-    found[edges_of(graph, graph.exchange(leaderward))] = True
-    return found & (leaders_hear | ~np.isin(graph.edges, graph.leaders))
+    used = np.zeros((len(graph.edges), 2), bool)
+    used[edges_of(graph, graph.exchange(leaderward))] = True
+    return used & (leaders_hear | ~np.isin(graph.edges, graph.leaders))
 
 
 def who_hears_whom(graph: Graph) -> str:
-    """Return which leaders the followers hear, directly or through whom; of a flock, in numbers.
+    """Return from which leaders followers receive, directly or through whom; for many, in numbers.
 
-    Everybody hears everybody in the end; what is told is the way from the leader that goals are
-    relative to, the nearest one.
+    Information spreads to all agents; the text gives the path from the nearest leader, relative to
+    which the goals are defined.
     """
-    near, before, hops = _ways(graph)
+    near, before, hops = _nearest(graph)
     if len(graph.followers) <= _NAMED:
-        told = _each(graph, near, before)
+        parts = _by_follower(graph, near, before)
     elif len(graph.leaders) <= _NAMED:
-        told = _by_leader(graph, near, hops)
+        parts = _by_leader(graph, near, hops)
     else:
-        told = _in_all(graph, near, hops)
-    heard = graph.outgoing()
-    alone = [k for k in graph.leaders if {*heard[[k]].indices.tolist()} <= {*graph.leaders}]
+        parts = _in_total(graph, near, hops)
+    outgoing = graph.outgoing()
+    alone = [k for k in graph.leaders if {*outgoing[[k]].indices.tolist()} <= {*graph.leaders}]
     unheard = [f"nobody hears {_numbered('leader', alone)}"] if alone else []
-    return "; ".join([*told, *unheard])
+    return "; ".join([*parts, *unheard])
 
 
-def _ways(graph: Graph) -> tuple[Array, Array, Array]:
-    """Return for each agent its nearest leader, its neighbour on the way there, and the links."""
-    asked = {"indices": graph.leaders, "unweighted": True, "return_predecessors": True}
-    links, before = map(np.atleast_2d, csgraph.dijkstra(graph.outgoing(), **asked))
-    # The first of equals, as everywhere that the nearest leader counts.
+def _nearest(graph: Graph) -> tuple[Array, Array, Array]:
+    """Return for each agent its nearest leader, its neighbour towards it, and the distance."""
+    options = {"indices": graph.leaders, "unweighted": True, "return_predecessors": True}
+    links, before = map(np.atleast_2d, csgraph.dijkstra(graph.outgoing(), **options))
+    # The first of equally near ones, as in `Graph.nearest_leader`.
     row = np.argmin(links, axis=0)
     agents = np.arange(graph.agents)
     return np.array(graph.leaders)[row], before[row, agents], links[row, agents].astype(int)
 
 
-def _each(graph: Graph, near: Array, before: Array) -> Iterator[str]:
-    """Yield who hears which leaders, all that hear the same in one part."""
+def _by_follower(graph: Graph, near: Array, before: Array) -> Iterator[str]:
+    """Yield which followers receive from which leaders, those with equal paths together."""
     groups: dict[str, list[int]] = {}
     for agent in graph.followers:
         direct = [other for other in graph.neighbours(agent) if other in graph.leaders]
@@ -81,15 +81,15 @@ def _each(graph: Graph, near: Array, before: Array) -> Iterator[str]:
 def _by_leader(graph: Graph, near: Array, hops: Array) -> Iterator[str]:
     followers = np.array(graph.followers)
     for leader in graph.leaders:
-        own = followers[near[followers] == leader]
-        direct = int((hops[own] == 1).sum())
-        far = f", the farthest through {hops[own].max() - 1}" if direct < len(own) else ""
+        nearest = followers[near[followers] == leader]
+        direct = int((hops[nearest] == 1).sum())
+        far = f", the farthest through {hops[nearest].max() - 1}" if direct < len(nearest) else ""
         verb = "hears" if direct == 1 else "hear"
-        if len(own):
-            yield f"of {len(own)} followers nearest to leader {leader} {direct} {verb} it{far}"
+        if len(nearest):
+            yield f"of {len(nearest)} followers nearest to leader {leader} {direct} {verb} it{far}"
 
 
-def _in_all(graph: Graph, near: Array, hops: Array) -> Iterator[str]:
+def _in_total(graph: Graph, near: Array, hops: Array) -> Iterator[str]:
     followers = np.array(graph.followers)
     direct, most = int((hops[followers] == 1).sum()), int(hops[followers].max()) - 1
     counts = np.bincount(near[followers], minlength=graph.agents)[list(graph.leaders)]

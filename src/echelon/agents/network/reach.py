@@ -1,4 +1,4 @@
-"""Whom the leaders reach, along the edges of a graph at a time or of a whole window of it."""
+"""The agents that leaders reach, along the edges of one stretch of time or of all stretches."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,10 +11,10 @@ from echelon.core.types import Array
 
 
 def check_reached(graph: GraphMatrices) -> None:
-    """Check that a leader reaches everybody: along all edges, or those that count in the end.
+    """Check that leaders reach every agent along all edges, and along the last ones for ever.
 
     Raises:
-        GraphError: it does not.
+        GraphError: they do not.
     """
     lost = lost_along(graph, graph.weights)
     if len(lost):
@@ -26,19 +26,19 @@ def check_reached(graph: GraphMatrices) -> None:
             raise GraphError(
                 f"the graph leaves agents behind: {name_agents(lost)} no path to a leader "
                 f"({_name_leaders(graph)}) from {schedule.starts[-1]:g} s on, after the last "
-                "switch; add edges there, or give a `period` after which the schedule begins again."
+                "switch; add edges there, or give a `period` after which the schedule repeats."
             )
     if len(graph.leaders) == 1:
         return
     count, label = csgraph.connected_components(graph.adjacency(), directed=False)
     if count > 1:
-        # Each piece has a leader of its own, and would be a formation of its own.
+        # Each component has its own leader and would be a separate formation.
         apart = np.flatnonzero(label != label[0])
         raise GraphError(f"the graph is disconnected: {name_agents(apart)} no path to agent 0.")
 
 
 def _cut_off(graph: GraphMatrices, lost: Array) -> str:
-    """Return the sentence on agents that no leader ever reaches."""
+    """Return the error message about agents that no leader ever reaches."""
     who = f"{name_agents(lost)} no path to a leader ({_name_leaders(graph)})"
     if graph.schedule is not None and graph.schedule.period is not None:
         return (
@@ -48,7 +48,7 @@ def _cut_off(graph: GraphMatrices, lost: Array) -> str:
     if graph.directed:
         return (
             f"the graph leaves agents behind: {who} along its arrows; an edge "
-            "[i, j] lets j hear i, so add one, or turn one round."
+            "[i, j] lets j receive from i, so add one, or reverse one."
         )
     return f"the graph is disconnected: {who}."
 
@@ -56,9 +56,9 @@ def _cut_off(graph: GraphMatrices, lost: Array) -> str:
 def lost_along(graph: GraphMatrices, weights: Array) -> Array:
     """Return the agents that no leader reaches along the edges that have a weight (E,)."""
     if not graph.directed:
-        # One way of each edge is enough, and half of what takes long where they are millions.
-        kept = weights > 0.0
-        edges = graph.edges if kept.all() else graph.edges[kept]
+        # One direction of each edge is enough, which halves the time for millions of edges.
+        present = weights > 0.0
+        edges = graph.edges if present.all() else graph.edges[present]
         links = sp.coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
         count, label = csgraph.connected_components(links.tocsr(), directed=False)
         led = np.zeros(count, bool)
@@ -69,7 +69,7 @@ def lost_along(graph: GraphMatrices, weights: Array) -> Array:
 
 
 def nearest_leaders(graph: GraphMatrices) -> tuple[int, ...]:
-    """Return what `Graph.nearest_leader` says."""
+    """Return `Graph.nearest_leader`."""
     if len(graph.leaders) == 1:
         return graph.leaders * graph.agents
     hops = csgraph.dijkstra(graph.outgoing(), indices=graph.leaders, unweighted=True)
@@ -78,7 +78,7 @@ def nearest_leaders(graph: GraphMatrices) -> tuple[int, ...]:
 
 
 def lost_at_times(graph: GraphMatrices) -> str:
-    """Return whom leaders do not reach at some time, and when; empty where they always do."""
+    """Return which agents leaders do not reach at some time, and when; empty if there are none."""
     if graph.schedule is None:
         return ""
     for span, weights in zip(graph.schedule.spans(), graph.schedule.weights, strict=True):

@@ -1,4 +1,4 @@
-"""When a graph changes: stretches of time, each with weights of its own for all edges."""
+"""Switching graphs: stretches of time, each with its weights of all edges."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeAlias
@@ -10,18 +10,18 @@ from echelon.core.errors import GraphError
 from echelon.core.types import Array
 
 Stretch: TypeAlias = tuple[float, Iterable[Sequence[float]]]
-"""From when on (s), and the edges from then on."""
+"""Start (s) and edges of a stretch of time."""
 _ROUNDED = 1e-9
-"""Of a step: a switch so little before it is one at it."""
+"""Share of a step by which rounding may put a switch before the step that it belongs to."""
 
 
 class Schedule(NamedTuple):
     """When which weights hold.
 
     Attributes:
-        starts: (S,) s, ascending from 0: from when on each row of weights holds.
-        weights: (S, E), not negative: 0 where an edge is not there.
-        period: s, after which all begins again; None where the last row holds for ever.
+        starts: (S,) s, ascending from 0: the start of each row of weights.
+        weights: (S, E), not negative: 0 where an edge is absent.
+        period: s, after which the rows repeat; None where the last row holds for ever.
     """
 
     starts: Array
@@ -30,38 +30,38 @@ class Schedule(NamedTuple):
 
     @property
     def last(self) -> Array:
-        """The rows that hold for ever, or again and again."""
+        """The rows that repeat, or the one that holds for ever."""
         return self.weights if self.period is not None else self.weights[-1:]
 
     def row(self, t: float) -> int:
         """Return which row holds at a time (s)."""
-        # Rounded before the period is taken off, or what is just short of its end would be last.
+        # Rounded before the modulus: a time just below the period belongs to the first row.
         t = t + _ROUNDED if self.period is None else (t + _ROUNDED) % self.period
         return int(np.searchsorted(self.starts, t, side="right")) - 1
 
     def switches(self, dt: float, horizon: float, first: int = 0) -> tuple[Array, Array]:
-        """Return from which steps on (K,) which rows (K,) hold, in steps of dt (s).
+        """Return the first steps (K,) of rows and the rows (K,), in steps of dt (s).
 
-        They are those of a horizon (s) from the first of its periods on.
+        They cover a horizon (s), starting with the period of number `first`.
         """
         rounds = 1 if self.period is None else int(np.floor(horizon / self.period)) + 1
         begins = (first + np.arange(rounds)) * (self.period or 0.0)
         times = (begins[:, None] + self.starts).reshape(-1)
         steps = np.ceil(times / dt - _ROUNDED).astype(np.int64)
         rows = np.tile(np.arange(len(self.starts)), rounds)
-        # Of two that fall on one step, the later one holds.
-        kept = np.append(np.diff(steps) > 0, True)
-        return steps[kept], rows[kept]
+        # Of two switches at one step the later one counts.
+        last = np.append(np.diff(steps) > 0, True)
+        return steps[last], rows[last]
 
     def spans(self) -> Iterator[str]:
-        """Yield from when to when each row holds, in words."""
+        """Yield the time span of each row, in words."""
         ends = [*self.starts[1:].tolist(), self.period]
         for start, end in zip(self.starts.tolist(), ends, strict=True):
             yield f"from {start:g} s on" if end is None else f"from {start:g} to {end:g} s"
 
 
 class United(NamedTuple):
-    """All edges of some stretches: pairs (E, 2), the largest weight of each (E,), and when."""
+    """All edges of the stretches: pairs (E, 2), the largest weight of each (E,), the schedule."""
 
     pairs: Array
     weights: Array
@@ -72,17 +72,17 @@ class United(NamedTuple):
 def unite(
     stretches: Sequence[Stretch], agents: int | None, period: float | None, directed: bool
 ) -> United:
-    """Return the edges of all stretches, each once, and when they are there.
+    """Return the edges of all stretches, each once, and their schedule.
 
     Raises:
-        GraphError: a stretch has a false edge, or the times do not ascend from 0.
+        GraphError: a stretch has an invalid edge, or the times do not ascend from 0.
     """
     starts = np.array([at for at, _ in stretches], float)
     _check_times(starts, period)
     read = [split_weights(edges) for _, edges in stretches]
     agents = count_agents(np.concatenate([pairs for pairs, _ in read]), agents)
     places: dict[tuple[int, int], int] = {}
-    checked = [check_edges(*each, agents, directed) for each in read]
+    checked = [check_edges(*edges, agents, directed) for edges in read]
     for pairs, _ in checked:
         for pair in pairs.tolist():
             places.setdefault((pair[0], pair[1]), len(places))
@@ -96,11 +96,11 @@ def unite(
 
 
 def _check_times(starts: Array, period: float | None) -> None:
-    fine = len(starts) and starts[0] == 0.0 and np.isfinite(starts).all()
-    if not fine or (np.diff(starts) <= 0.0).any():
-        shown = ", ".join(f"{at:g}" for at in starts[:8])
+    ascending = len(starts) and starts[0] == 0.0 and np.isfinite(starts).all()
+    if not ascending or (np.diff(starts) <= 0.0).any():
+        listed = ", ".join(f"{at:g}" for at in starts[:8])
         raise GraphError(
-            f"the graph switches at {shown or 'no time'} s, and times must ascend from 0, the "
+            f"the graph switches at {listed or 'no time'} s, and times must ascend from 0, the "
             "first."
         )
     if period is not None and not starts[-1] < period < np.inf:

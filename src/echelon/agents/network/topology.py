@@ -1,4 +1,4 @@
-"""What shortens a slow formation: agents to make leaders, and edges to add.
+"""Recommended leaders and edges: the changes of a graph that speed up a formation most.
 
 The slowest disagreement follows the smallest eigenvalue lambda_min of the grounded Laplacian. One
 more leader grounds one more agent, one more edge adds w (v_i - v_j)^2 to its Rayleigh quotient;
@@ -20,15 +20,14 @@ from echelon.core.types import Array
 _DENSE = 400
 _ROUNDS = 30
 _MOST_TRIED, _FEWEST_TRIED, _WORK = 300, 24, 100_000
-"""Agents or pairs that are tried: as many as the work on a large graph allows, at most and least.
-"""
+"""Largest and smallest number of agents or pairs that are tried, and the work that sets it."""
 
 
 def recommend_leaders(graph: Graph, count: int = 1) -> tuple[int, ...]:
-    """Return followers to make leaders too, one after the other, each raising lambda_min the most.
+    """Return followers to make leaders, one after the other, each raising lambda_min the most.
 
-    Taken one at a time they need not be the best of all sets of `count`. On more than 400 followers
-    an even choice is tried, ordered by how much the slowest mode moves them.
+    Chosen one at a time they need not be the best set of `count`. With more than 400 followers an
+    even selection is tried, ordered by their amplitude in the slowest mode.
 
     Raises:
         GraphError: `count` is negative, or leaves no follower; the graph is directed or switches.
@@ -48,7 +47,7 @@ def recommend_leaders(graph: Graph, count: int = 1) -> tuple[int, ...]:
 def recommend_edges(graph: Graph, count: int = 1) -> tuple[tuple[int, int], ...]:
     """Return pairs to link with weight 1, one after the other, each raising lambda_min the most.
 
-    Of many pairs those are tried that promise most in first order, (v_i - v_j)^2, 300 at most.
+    Of many pairs at most 300 are tried, those with the largest first-order effect (v_i - v_j)^2.
 
     Raises:
         GraphError: `count` is negative, or there are not so many pairs; the graph is directed or
@@ -67,7 +66,7 @@ def recommend_edges(graph: Graph, count: int = 1) -> tuple[tuple[int, int], ...]
 
 
 def _check_mutual(graph: Graph) -> None:
-    # What is ranked by is of a symmetric matrix: a mode's energy, and its change of rank one.
+    # The ranking uses properties of a symmetric matrix: a mode's energy and its rank-one change.
     if graph.directed or graph.schedule is not None:
         raise GraphError(
             "leaders and edges are recommended for undirected graphs that do not switch."
@@ -121,7 +120,7 @@ class _Large:
         """
         a = np.zeros(len(self.mode))
         a[list(rows)] = entries
-        # A change of rank one moves the mode little, so a few rounds from it are enough.
+        # A change of rank one changes the mode little, so a few rounds from it are enough.
         far, x, value = self.solve(a), self.mode, 0.0
         for _ in range(_ROUNDS):
             # (L + a a'/s)^-1 = L^-1 - L^-1 a a'L^-1 / (s + a'L^-1 a).
@@ -133,7 +132,7 @@ class _Large:
 
 def _rank_pairs(graph: Graph, mode: Array, count: int) -> list[tuple[int, int]]:
     """Return the pairs without an edge that raise lambda_min most in first order."""
-    # The far ends of the mode make the best pairs, so few agents are enough on a large graph.
+    # The extremes of the mode form the best pairs, so few agents are enough on a large graph.
     order = np.argsort(mode, kind="stable")
     if len(order) > 2 * _MOST_TRIED:
         order = np.concatenate([order[:_MOST_TRIED], order[-_MOST_TRIED:]])
@@ -150,7 +149,7 @@ def _slowest_mode(graph: Graph) -> Array:
     """Return the mode (N,) of lambda_min, not negative, zero at the leaders."""
     mode = np.zeros(graph.agents)
     vectors = np.linalg.eigh(graph.grounded_laplacian().toarray())[1]
-    # The mode of lambda_min has one sign (Perron and Frobenius), which one `eigh` leaves open.
+    # The mode of lambda_min has one sign (Perron and Frobenius); `eigh` may return either.
     mode[list(graph.followers)] = np.abs(vectors[:, 0])
     return mode
 

@@ -1,4 +1,4 @@
-"""A graph as seen from its leaders: who comes before whom, and who is whose parent."""
+"""The order of agents by distance from the leaders, and their parents in a tree."""
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -11,18 +11,18 @@ from echelon.core.types import Array
 
 
 def ordered_outward(graph: GraphMatrices) -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """Return what `Graph.outward` says.
+    """Return `Graph.outward`.
 
     Raises:
         GraphError: the graph switches.
     """
     if graph.schedule is not None:
         raise GraphError("the graph switches, and plans are made in one order for all times.")
-    # Stable, which leaves the equally far in the order of their numbers.
+    # Stable, so that agents at equal distance stay in the order of their numbers.
     order = np.argsort(graph.depths(), kind="stable").tolist()
-    known = {agent: order[:place] for place, agent in enumerate(order)}
+    earlier = {agent: order[:place] for place, agent in enumerate(order)}
     return tuple(
-        (i, () if i in graph.leaders else tuple(j for j in graph.neighbours(i) if j in known[i]))
+        (i, () if i in graph.leaders else tuple(j for j in graph.neighbours(i) if j in earlier[i]))
         for i in order
     )
 
@@ -30,26 +30,26 @@ def ordered_outward(graph: GraphMatrices) -> tuple[tuple[int, tuple[int, ...]], 
 def outward_edges(graph: GraphMatrices) -> tuple[Array, Array]:
     """Return the edges (E, 2) as arrows from nearer to a leader to farther, and their weights (E,).
 
-    Edges between agents equally far are none of them.
+    Edges between agents at equal distance are left out.
 
     Raises:
-        GraphError: the graph switches, or what each leader leads falls apart from the rest.
+        GraphError: the graph switches, or the parts of different leaders are not connected.
     """
     if graph.schedule is not None:
         raise GraphError("the graph switches, and no agent is nearer to a leader at all times.")
-    heard = graph.exchange(leaderward=True)
-    edges = np.stack([heard.senders, heard.receivers], axis=1)
+    exchange = graph.exchange(leaderward=True)
+    edges = np.stack([exchange.senders, exchange.receivers], axis=1)
     links = coo_array((np.ones(len(edges)), edges.T), (graph.agents, graph.agents))
     if connected_components(links, directed=False)[0] > 1:
         raise GraphError(
-            "of the graph heard one way, what the leaders lead falls apart: no agent hears more "
+            "the directed graph splits into one part for each leader: no agent receives from more "
             "than one of them; leave `directed` out, or give the edges."
         )
-    return edges, np.asarray(heard.weights)
+    return edges, np.asarray(exchange.weights)
 
 
 def parents_of(graph: GraphMatrices) -> tuple[int, ...]:
-    """Return what `Graph.parents` says.
+    """Return `Graph.parents`.
 
     Raises:
         GraphError: as there.
@@ -62,13 +62,13 @@ def parents_of(graph: GraphMatrices) -> tuple[int, ...]:
     depth, parents = graph.depths(), np.arange(graph.agents)
     i, j = graph.edges[depth[graph.edges].max(axis=1) > 0].T
     if graph.directed:
-        # Whoever hears another one beside its parent is no link of a chain of its own.
-        heard = depth[j] > 0
-        child, parent = j[heard], i[heard]
+        # In a tree an agent receives from its parent only.
+        follower = depth[j] > 0
+        child, parent = j[follower], i[follower]
         counted, way = child, "more than one agent to hear"
     else:
         child, parent = np.where(depth[i] > depth[j], (i, j), (j, i))
-        # An edge between two that are equally far gives both of them one more way.
+        # An edge between agents at equal distance gives each of them a second path to a leader.
         counted = np.concatenate([child, parent[depth[i] == depth[j]]])
         way = "more than one way to a leader"
     several = np.flatnonzero(np.bincount(counted, minlength=graph.agents) > 1)
@@ -82,6 +82,6 @@ def parents_of(graph: GraphMatrices) -> tuple[int, ...]:
 
 
 def shares(graph: GraphMatrices, agent: int, earlier: tuple[int, ...]) -> Array:
-    """Return what part each neighbour has in an agent's targets, by the edges' weights."""
+    """Return the share of each neighbour in an agent's targets, by the weights of edges."""
     weights = np.asarray(graph.adjacency()[[agent]].toarray()).ravel()[list(earlier)]
     return weights / weights.sum()

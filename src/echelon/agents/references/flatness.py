@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Float
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.references.guide import Guide
@@ -16,23 +17,26 @@ from echelon.core.numerics import precision
 from echelon.core.types import Array, State
 
 _FEW, _MANY = 512, 4096
-"""Up to so many times are followed by one program, some at once: compiling is what costs."""
+"""Up to `_MANY` times are computed in blocks of `_FEW` by one program, since compiling is slow."""
 
 
-def follow_at(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> tuple[Any, Any]:
+def follow_at(
+    model: ControlAffine, reference: Guide, times: Float[Array, " T"] | Float[jax.Array, " T"]
+) -> tuple[Any, Any]:
     """Return the states (T, n) and inputs (T, m) that follow a reference exactly at times (T,)."""
     if isinstance(times, Tracer) or len(times) > _MANY:
         return _follow_all(model, reference, times)
     count = len(times)
     padded = np.pad(np.asarray(times), (0, -count % _FEW), mode="edge")
-    found = [_follow_all(model, reference, few) for few in np.split(padded, len(padded) // _FEW)]
-    x, u = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+    blocks = np.split(padded, len(padded) // _FEW)
+    paths = [_follow_all(model, reference, block) for block in blocks]
+    x, u = (np.concatenate(parts)[:count] for parts in zip(*paths, strict=True))
     return x, u
 
 
 def followed_states(model: ControlAffine, reference: Guide, times: Array | jax.Array) -> jax.Array:
     """Return the states (T, n) that follow a reference exactly at times (T,)."""
-    # As laws return them, and without a program of its own as `asarray` has.
+    # `asarray` would compile a program of its own.
     return jax.device_put(follow_at(model, reference, times)[0])
 
 
@@ -49,10 +53,10 @@ def _follow_all(
 
 
 class Targets(NamedTuple):
-    """What a plan follows at T times.
+    """The targets of a plan at T times.
 
-    States (T, n) are a guess of the motion, outputs (T, q) are what counts, inputs (T, m) are
-    normalized.
+    States (T, n) are an initial guess of the motion, outputs (T, q) enter the objective, inputs
+    (T, m) are normalized.
     """
 
     states: Array
@@ -61,12 +65,12 @@ class Targets(NamedTuple):
 
 
 def reference_targets(model: ControlAffine, reference: Guide | None, times: Array) -> Targets:
-    """Return what a leader follows: its reference by the model's flatness map, or its trim.
+    """Return the targets of a leader: its reference by the model's flatness map, or its trim.
 
     Raises:
         PlanError: the model has no such map, or the reference is not finite.
     """
-    # Without a reference a leader stays at rest, which its trim is.
+    # Without a reference a leader stays at rest, at its trim.
     if reference is None:
         x = np.tile(np.asarray(model.trim[0], float), (len(times), 1))
         return _targets(model, x, np.zeros((len(times), len(model.input_names))))
@@ -93,7 +97,7 @@ def shifted_targets(model: ControlAffine, targets: Targets, offset: Array) -> Ta
 def mean_targets(model: ControlAffine, states: Array, inputs: Array, share: Array) -> Targets:
     """Return the mean of targets with states (J, T, n) and inputs (J, T, m), by shares (J,).
 
-    A sum of squared errors to several targets is that to their mean and a constant.
+    A sum of squared errors to several targets equals that to their mean plus a constant.
     """
     return _targets(model, np.tensordot(share, states, 1), np.tensordot(share, inputs, 1))
 

@@ -1,4 +1,4 @@
-"""What a leader follows: a state and an input of a model at each time."""
+"""The motion that a leader follows: a state and an input of a model at each time."""
 
 import abc
 
@@ -10,7 +10,7 @@ from echelon.core.types import Input, Scalar, State
 
 
 class Guide(eqx.Module):
-    """What a leader follows, whether it is a path in space or one of states and inputs."""
+    """The motion that a leader follows: a path in space, or one of states and inputs."""
 
     @abc.abstractmethod
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
@@ -21,12 +21,12 @@ class Guide(eqx.Module):
         return self.follow(model, t)[0][heading_index(model)]
 
     def turns(self, model: ControlAffine) -> bool:
-        """Tell whether that heading may be another than the trim's at some time."""
+        """Tell whether the heading may differ from the trim's at some time."""
         return True
 
     @abc.abstractmethod
     def check(self) -> None:
-        """Check what it returns.
+        """Check the values that the reference returns.
 
         Raises:
             ReferenceError: it is malformed.
@@ -37,5 +37,5 @@ class Guide(eqx.Module):
         """Check that a model can be led along it.
 
         Raises:
-            LawError: it cannot, and why.
+            LawError: it cannot; the message says why.
         """

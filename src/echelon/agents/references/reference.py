@@ -19,8 +19,8 @@ from echelon.core.trace import check_array, check_function, checked_trace
 from echelon.core.types import Array, Input, Scalar, State
 
 COORDINATES = ("x", "y", "z", "yaw")
-_LONGEST = 10**9
-"""s; thirty years, for which no run goes on."""
+_MAX_TIME = 10**9
+"""s; thirty years, longer than any run."""
 
 
 class Reference(Guide):
@@ -35,23 +35,23 @@ class Reference(Guide):
 
         Their shape is (order + 1, len(coordinates)).
         """
-        # Before differentiating, so that what the model ignores costs no derivatives.
-        picked = np.array([COORDINATES.index(name) for name in coordinates])
-        return derivatives(lambda s: self(s)[picked], t, order)
+        # Selected before differentiating, so that unused coordinates cost no derivatives.
+        chosen = np.array([COORDINATES.index(name) for name in coordinates])
+        return derivatives(lambda s: self(s)[chosen], t, order)
 
     def follow(self, model: ControlAffine, t: Scalar) -> tuple[State, Input]:
-        """Return the state (n,) and the input (m,) by the model's flatness map."""
+        """Return the state and the input by the model's flatness map."""
         return model.flat(self.derivatives(t, model.flat_order, model.flat_outputs))
 
     def heading(self, model: ControlAffine, t: Scalar) -> Scalar:
         """Return the heading (rad) at time t of a model that states one."""
-        place = _heading_place(model)
-        return super().heading(model, t) if place is None else self(t)[place]
+        index = _heading_coordinate(model)
+        return super().heading(model, t) if index is None else self(t)[index]
 
     def turns(self, model: ControlAffine) -> bool:
-        """Tell it of a path whose heading is enclosed in rationals; of another it may."""
-        place = _heading_place(model)
-        return place is None or _turns(self, place, rest_heading(model))
+        """Tell whether the heading may change, from an enclosure; True where there is none."""
+        index = _heading_coordinate(model)
+        return index is None or _turns(self, index, rest_heading(model))
 
     def check(self) -> None:
         """Check that (x, y, z, yaw) is returned."""
@@ -66,7 +66,7 @@ class Reference(Guide):
             )
 
     def fit(self, model: ControlAffine) -> None:
-        """Check that the model has a flatness map, of outputs that a reference gives."""
+        """Check that the model has a flatness map for coordinates of a reference."""
         name, unknown = type(model).__name__, set(model.flat_outputs) - set(COORDINATES)
         if not model.flat_outputs:
             raise LawError(
@@ -77,27 +77,27 @@ class Reference(Guide):
         if unknown:
             raise LawError(
                 f"`flat_outputs` of `{name}` names {listing(sorted(unknown))}, and a reference "
-                f"gives {listing(COORDINATES)}."
+                f"has {listing(COORDINATES)}."
             )
         _check_map(model)
 
 
-def _heading_place(model: ControlAffine) -> int | None:
-    """Return which coordinate is the model's heading, so that no derivative is needed for it."""
+def _heading_coordinate(model: ControlAffine) -> int | None:
+    """Return the index of the coordinate that is the model's heading, if one is."""
     name = heading_of(model).state
     return COORDINATES.index(name) if name in COORDINATES and name in model.flat_outputs else None
 
 
 @memoize
-def _turns(reference: Reference, place: int, rest: float) -> bool:
-    """Tell whether a coordinate may be another than `rest` at some time."""
+def _turns(reference: Reference, index: int, rest: float) -> bool:
+    """Tell whether a coordinate may differ from `rest` at some time."""
 
-    def there(t: jax.Array, nothing: jax.Array) -> jax.Array:
-        return reference(t[0])[place].reshape(1, 1)
+    def coordinate(t: jax.Array, no_input: jax.Array) -> jax.Array:
+        return reference(t[0])[index].reshape(1, 1)
 
     try:
         with precision("float64"):
-            hull = value_hull(there, Box([0], [_LONGEST]), Box([0], [0]))
+            hull = value_hull(coordinate, Box([0], [_MAX_TIME]), Box([0], [0]))
     except GainError:
         return True
     return bool((hull.vertices != rest).any() or hull.error.any())
@@ -108,17 +108,17 @@ def _check_map(model: ControlAffine) -> None:
     """Trace the flatness map, and check the state and the input that it returns."""
     name, shapes = type(model).__name__, (len(model.state_names), len(model.input_names))
     with precision("float64"):
-        found = checked_trace(
+        returned = checked_trace(
             LawError,
             f"`flat` of `{name}`",
             model.flat,
             np.zeros((model.flat_order + 1, len(model.flat_outputs))),
             advice="it must be written with `jax.numpy` and take the outputs' derivatives",
         ).result
-    if not isinstance(found, tuple | list) or len(found) != 2:
-        raise LawError(f"`flat` of `{name}` must return two things, a state and an input.")
-    for what, value, size in zip(("state", "input"), found, shapes, strict=True):
-        check_array(LawError, f"the {what} that `flat` of `{name}` makes", value, (size,))
+    if not isinstance(returned, tuple | list) or len(returned) != 2:
+        raise LawError(f"`flat` of `{name}` must return a pair, a state and an input.")
+    for what, value, size in zip(("state", "input"), returned, shapes, strict=True):
+        check_array(LawError, f"the {what} that `flat` of `{name}` returns", value, (size,))
 
 
 def check_finite(owner: Reference, **values: object) -> None:
@@ -131,8 +131,7 @@ def check_finite(owner: Reference, **values: object) -> None:
     """
     for name, (value, length) in values.items():  # type: ignore[misc]
         array = numbers_of(value)
-        wanted = () if length is None else (length,)
-        if array.shape != wanted or not np.isfinite(array).all():
+        if array.shape != (() if length is None else (length,)) or not np.isfinite(array).all():
             shape = "a finite number" if length is None else f"{length} finite numbers"
             raise ReferenceError(
                 f"`{name}` of `{type(owner).__name__}` is {value}, and must be {shape}."
@@ -140,32 +139,31 @@ def check_finite(owner: Reference, **values: object) -> None:
 
 
 def numbers_of(value: object) -> Array:
-    """Return a number or nested lists of numbers as float64; NaN alone for anything else."""
+    """Return a number or nested lists of numbers as float64; a single NaN for anything else."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths
         return np.array([np.nan])
-    # Text that reads as a number is none, nor is a truth value, and what no int64 holds is an
-    # object.
+    # Neither text nor a truth value is a number, and an integer beyond int64 is an object.
     return array.astype(np.float64) if array.dtype.kind in "iuf" else np.array([np.nan])
 
 
 def check_kind_of(reference: object) -> None:
-    """Check that a reference is one.
+    """Check that a value is a reference.
 
     Raises:
-        ReferenceError: it is none.
+        ReferenceError: it is not.
     """
-    # A path of states is one too, though no `Reference`, which is the name that users know.
+    # A path of states is one too, but users know the name `Reference`.
     kind = Guide if isinstance(reference, Guide) else Reference
     check_kind("reference", reference, kind, ReferenceError)
 
 
 def check_reference(reference: Guide) -> None:
-    """Check that a reference is one, and what it returns.
+    """Check that a value is a reference, and the values that it returns.
 
     Raises:
-        ReferenceError: it is none, or returns something else than the interface says.
+        ReferenceError: it is none, or returns anything but (x, y, z, yaw).
     """
     check_kind_of(reference)
     reference.check()

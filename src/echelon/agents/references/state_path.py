@@ -20,12 +20,12 @@ _Rows = Sequence[Sequence[float]]
 
 @final
 class StatePath(Guide):
-    """A path through states (K, n) with inputs (K, m) at times (K,), for a model that has no map.
+    """A path through states (K, n) with inputs (K, m) at times (K,), for any model.
 
-    Between knots the input is linear and each state a cubic, with the slopes f + g u at the knots
-    (Hermite's, as in direct collocation). So the path is as feasible as its knots are: how far
-    xdot is from f + g u between them is said by `echelon check`. Before the first time and after
-    the last the ends are held.
+    Between knots the input is linear and each state a cubic with slopes f + g u at the knots
+    (Hermite, as in direct collocation). The path is therefore as feasible as its knots are;
+    `echelon check` reports the distance of xdot from f + g u between them. Before the first and
+    after the last time the path is constant.
 
     Args:
         times: K >= 2 increasing times, s.
@@ -56,7 +56,7 @@ class StatePath(Guide):
     def read(cls, file: str | Path, model: ControlAffine) -> "StatePath":
         """Return the path in a CSV file, whose first line names `t`, the states and the inputs.
 
-        The columns may stand in any order.
+        The columns may be in any order.
 
         Raises:
             ReferenceError: the file cannot be read, or lacks a column or has one too many.
@@ -68,7 +68,8 @@ class StatePath(Guide):
             table = np.array([[float(cell) for cell in row] for row in rows if row])
         except (OSError, ValueError) as error:
             raise ReferenceError(
-                f"the path `{file}` is no line of names with lines of numbers below it: {error}."
+                f"the path `{file}` cannot be read: {error}; it must have a line of names and "
+                "lines of numbers below it."
             ) from None
         head = [name.strip() for name in head]
         if sorted(head) != sorted(names):
@@ -87,25 +88,25 @@ class StatePath(Guide):
         knots, x, u = (
             jnp.asarray(part, t.dtype) for part in (self.times, self.states, self.inputs)
         )
-        held = jnp.clip(t, knots[0], knots[-1])
-        # At the last knot there is no piece to the right, so the one to its left holds.
-        k = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
+        inside = jnp.clip(t, knots[0], knots[-1])
+        # At the last knot there is no piece to the right, so the one to its left is used.
+        k = jnp.clip(jnp.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
         span = knots[k + 1] - knots[k]
-        s = (held - knots[k]) / span
-        # The model's own difference, so that an angle may be given within one turn.
+        s = (inside - knots[k]) / span
+        # The model's difference, so that an angle may jump by a whole turn.
         step = model.difference(x[k + 1], x[k])
         first, last = (span * model.velocity(x[j], u[j]) for j in (k, k + 1))
         state = x[k] + s * (1.0 - s) ** 2 * first + s**2 * (3.0 - 2.0 * s) * step
         return state + s**2 * (s - 1.0) * last, (1.0 - s) * u[k] + s * u[k + 1]
 
     def check(self) -> None:
-        """Do nothing: the knots were checked when it was made."""
+        """Do nothing: the constructor checked the knots."""
 
     def fit(self, model: ControlAffine) -> None:
         """Check that it has the model's states and inputs."""
         sizes = (("states", self.states), ("inputs", self.inputs))
-        wanted = (model.state_names, model.input_names)
-        for (what, rows), names in zip(sizes, wanted, strict=True):
+        expected = (model.state_names, model.input_names)
+        for (what, rows), names in zip(sizes, expected, strict=True):
             if rows.shape[1] != len(names):
                 raise LawError(
                     f"`StatePath` has {rows.shape[1]} {what}, and `{type(model).__name__}` has "

@@ -1,4 +1,4 @@
-"""References without a bend: a fixed point and a line at constant velocity."""
+"""Straight references: a fixed point and a line at constant velocity."""
 
 import jax
 import jax.numpy as jnp

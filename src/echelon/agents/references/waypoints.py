@@ -18,7 +18,7 @@ from echelon.core.types import Array, Scalar
 class Waypoints(Reference):
     """The spline of degree 7 through `points` at `times`, at rest at both ends.
 
-    Before the first time and after the last the ends are held. Its derivatives are continuous up
+    Before the first and after the last time the path is constant. Its derivatives are continuous up
     to the sixth, so that a quadrotor can fly it (flatness needs four). The path starts and stops
     with zero velocity, acceleration and jerk.
 
@@ -47,19 +47,18 @@ class Waypoints(Reference):
     def __call__(self, t: Scalar) -> jax.Array:
         """Return the point at time t."""
         knots = jnp.asarray(self.knots, t.dtype)
-        held = jnp.clip(t, knots[0], knots[-1])
-        # At the last knot there is no piece to the right, so the one to its left holds.
-        piece = jnp.clip(jnp.searchsorted(knots, held, side="right") - 1, 0, len(knots) - 2)
-        s = held - knots[piece]
+        inside = jnp.clip(t, knots[0], knots[-1])
+        # At the last knot there is no piece to the right, so the one to its left is used.
+        piece = jnp.clip(jnp.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
+        s = inside - knots[piece]
         value = jnp.zeros(3, t.dtype)
-        # Horner, in the time since the piece's own knot: powers of t would lose digits late in a
-        # flight.
+        # Horner's scheme in the time since the knot: powers of t would lose digits late in a run.
         for coefficient in jnp.asarray(self.coefficients, t.dtype)[:, piece]:
             value = value * s + coefficient
         return in_space(value, self.yaw)
 
     def turns(self, model: ControlAffine) -> bool:
-        """Tell whether the constant yaw is another than the trim's; a spline is not enclosed."""
+        """Tell whether the constant yaw differs from the trim's; a spline has no enclosure."""
         return heading_of(model).state != "yaw" or self.yaw != rest_heading(model)
 
 
@@ -67,12 +66,12 @@ def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Ar
     """Return times (K,) and points (K, 3), after checking both."""
     t, p = numbers_of(times), numbers_of(points)
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-        shown = times.tolist() if isinstance(times, np.ndarray) else times
+        listed = times.tolist() if isinstance(times, np.ndarray) else times
         raise ReferenceError(
-            f"`times` of `Waypoints` is {shown}, and must be at least 2 increasing times."
+            f"`times` of `Waypoints` is {listed}, and must be at least 2 increasing times."
         )
     if p.shape != (len(t), 3) or not np.isfinite(p).all():
-        # Rows of different lengths, or words, have no shape to tell of.
+        # Rows of different lengths, or text, have no shape.
         got = f"is {points}" if p.shape == (1,) else f"has shape {p.shape}"
         raise ReferenceError(
             f"`points` of `Waypoints` {got}, and must be {len(t)} finite points (x, y, z)."
@@ -82,7 +81,7 @@ def _read(times: Sequence[float], points: Sequence[Sequence[float]]) -> tuple[Ar
 
 def _fit(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the knots (K,) and the coefficients (8, K - 1, 3), highest power first."""
-    # Imported here: splines load slowly, and few references need them.
+    # Imported here: splines load slowly, and only this reference needs them.
     from scipy.interpolate import make_interp_spline
 
     # A spline of degree 7 through K points has K + 6 coefficients: three conditions more at each

@@ -1,7 +1,7 @@
-"""Wind and noise: what acts on the agents although no law requested it.
+"""Disturbances: wind on the agents and noise on their inputs.
 
-Draws are keyed by seed, time and agent, so a law, the number of agents, the frames that are stored
-and the precision change nothing of them.
+Each random draw depends only on the seed, the time and the agent's number; not on the law, the
+number of agents, the stored frames or the precision.
 """
 
 import dataclasses
@@ -29,17 +29,17 @@ class Disturbance:
     """xdot = f(x) + g(x) (u + S noise) + wind, with both held over a step as the input is.
 
     Args:
-        constant: the lasting part of the wind, by state or group: what is added to the rate of each
+        constant: the constant part of the wind, by state or group: it is added to the rate of each
             state, in its unit per second, so m/s^2 for a velocity.
         rms: root mean square of the random part of the wind, by state or group, for each state.
-        input_rms: root mean square of the noise, by input, in normalized inputs. It acts behind
-            the actuators, so no limit touches it.
-        hold: how long a draw lasts, s; rounded to whole steps, and at least one.
-        common: whether all agents feel one random wind; otherwise each has its own.
-        seed: of the draws; the run's own when left out.
+        input_rms: root mean square of the noise, by input, in normalized inputs. It acts after the
+            actuators, so limits do not apply to it.
+        hold: duration of a draw, s; rounded to whole steps, and at least one.
+        common: whether one random wind acts on all agents; otherwise each has its own.
+        seed: of the draws; by default that of the run.
 
-    Draws are normal, and independent from one hold to the next and from state to state. The
-    same seed gives the same draws at all rms, so a wind of twice the rms is twice the wind.
+    Draws are normal, and independent from one hold to the next and from state to state. The same
+    seed gives the same draws at any rms, so twice the rms is exactly twice the wind.
 
     Raises:
         SimulationError: a number is not finite, an rms is negative, or `hold` is not positive.
@@ -53,7 +53,7 @@ class Disturbance:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuse numbers that no wind can have."""
+        """Reject numbers that are not finite, and negative ones where only positive are allowed."""
         for what in ("constant", "rms", "input_rms"):
             least = -math.inf if what == "constant" else 0.0
             for name, value in getattr(self, what).items():
@@ -97,17 +97,17 @@ class Disturbance:
         """
         seed = seed if self.seed is None else self.seed
         rms = plant.per_state(self.rms)
-        # Column j is what noise of its rms on the normalized input j adds to the physical ones.
+        # Column j is the effect of noise on the normalized input j on the physical inputs.
         noise = plant.physical(np.diag(_by_input(plant, self.input_rms)), trim=False).T
         return Wind(
             constant=plant.per_state(self.constant),
             # None and not zeros, so that a step without draws is compiled without them.
             rms=rms if rms.any() else None,
             noise=noise if noise.any() else None,
-            # The two halves of the seed, since a precision could cut it to its lower one.
+            # The two halves of the seed: 32-bit integers would cut it to its lower one.
             key=np.array([seed >> 32 & 0xFFFFFFFF, seed & 0xFFFFFFFF], np.uint32),
             # Whole steps: a wind that changed within one would cost the integrator its order.
-            # A draw that outlasts any run need not be counted further.
+            # A draw longer than any run need not be counted further.
             window=np.asarray(max(1, round(min(self.hold / dt, 2**31 - 1))), np.int32),
             common=self.common,
         )
@@ -115,9 +115,15 @@ class Disturbance:
 
 @final
 class Wind(eqx.Module):
-    """A disturbance ready to be drawn; a part without a random share is None.
+    """A disturbance as arrays; a part without randomness is None.
 
-    constant (n,), rms (n,), noise (m, m): S times the rms, key (2,), window: steps a draw lasts.
+    Attributes:
+        constant: (n,).
+        rms: (n,).
+        noise: (m, m), S times the rms of the inputs.
+        key: (2,), the halves of the seed.
+        window: duration of a draw in steps.
+        common: whether all agents share one random wind.
     """
 
     constant: Array
@@ -128,39 +134,39 @@ class Wind(eqx.Module):
     common: bool = eqx.field(static=True)
 
     def on_state(self, step: jax.Array, agent: jax.Array) -> State:
-        """Return what is added to xdot of an agent during a step, (n,)."""
+        """Return the wind on xdot of an agent during a step."""
         constant = jnp.asarray(self.constant)
         if self.rms is None:
             return constant
-        # Agent 0's draw for all; the product keeps it traced.
+        # The draw of agent 0 for all; the product keeps the number traced.
         draw = self._draw(_WIND, step, 0 * agent if self.common else agent, len(self.rms))
         return constant + jnp.asarray(self.rms) * draw
 
     def on_input(self, step: jax.Array, agent: jax.Array) -> Input | None:
-        """Return what is added to the physical input of an agent during a step, (m,)."""
+        """Return the noise on the physical input of an agent during a step."""
         if self.noise is None:
             return None
         return jnp.asarray(self.noise) @ self._draw(_NOISE, step, agent, len(self.noise))
 
     def _draw(self, part: int, step: jax.Array, agent: jax.Array, size: int) -> jax.Array:
-        # By name, as JAX's default generator is a setting of the user.
+        # By name, since the default generator of JAX is a setting of the user.
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl="threefry2x32")
-        # Keyed by where and when, and not carried on: no draw depends on the ones before.
+        # Keyed by time and agent instead of carried on: no draw depends on earlier ones.
         for number in (part, step // jnp.asarray(self.window), agent):
             key = jax.random.fold_in(key, number)
-        # Drawn in float32 whatever the precision, which would otherwise change the draws.
+        # Drawn in float32, so that draws do not depend on the precision.
         return jax.random.normal(key, (size,), jnp.float32).astype(float)
 
 
 def draw(wind: Wind | None, step: jax.Array, agent: jax.Array) -> tuple[State | None, Input | None]:
-    """Return what acts on an agent's rate and on its input during a step; None for nothing."""
+    """Return the wind on an agent's rate and the noise on its input during a step, or None."""
     return (
         (None, None) if wind is None else (wind.on_state(step, agent), wind.on_input(step, agent))
     )
 
 
 def disturbed(plant: ControlAffine, push: State | None, noise: Input | None) -> Field:
-    """Return (x, u) -> xdot of an agent under wind and noise, which are held over a step."""
+    """Return (x, u) -> xdot of an agent under wind and noise, constant over a step."""
     if push is None and noise is None:
         return plant.velocity
 

@@ -1,4 +1,4 @@
-"""The plant: the agents as they are, where laws and gains are made for others."""
+"""The plant: agents that differ from the model for which laws and gains are made."""
 
 import dataclasses
 import numbers
@@ -19,36 +19,37 @@ def vary_parameters(
     A factor on several numbers multiplies each.
 
     Raises:
-        ModelError: the model has no such parameter, it is no number, or no such agent can be.
+        ModelError: the model has no such parameter, a factor has no number to scale, or the model
+            rejects the values.
     """
-    known = [field.name for field in dataclasses.fields(model) if field.init]
+    names = [field.name for field in dataclasses.fields(model) if field.init]
     name = type(model).__name__
     for parameter in (*parameters, *scale):
-        if parameter not in known:
-            has = f"it has {listing(known)}" if known else "it has none"
+        if parameter not in names:
+            has = f"it has {listing(names)}" if names else "it has none"
             raise ModelError(
-                f"`{parameter}` is no parameter of `{name}`; {has}{did_you_mean(parameter, known)}."
+                f"`{parameter}` is no parameter of `{name}`; {has}{did_you_mean(parameter, names)}."
             )
     changes = dict(parameters)
     for parameter, factor in scale.items():
         scaled = _scale_value(getattr(model, parameter), factor)
         if scaled is None:
             raise ModelError(
-                f"`{parameter}` of `{name}` is {getattr(model, parameter)!r}, which no factor can "
-                "scale."
+                f"`{parameter}` of `{name}` is {getattr(model, parameter)!r}, and only numbers can "
+                "be scaled by a factor."
             )
         changes[parameter] = scaled
     try:
-        # It runs the model's own checks, so that no plant is made that cannot be.
+        # `replace` runs the checks of the model, so that an invalid plant is rejected.
         return dataclasses.replace(model, **changes)
     except (TypeError, ValueError) as error:
         message = (str(error).splitlines() or ["no message"])[0].rstrip(".")
-        raise ModelError(f"`{name}` cannot be made with these parameters: {message}.") from error
+        raise ModelError(f"`{name}` rejects these parameters: {message}.") from error
 
 
 def _scale_value(value: Any, factor: float) -> Any:
     """Return a number, an array, or nested tuples of numbers times a factor; None where neither."""
-    # True is a number to Python, and a switch has no size.
+    # True is a number to Python, but a switch cannot be scaled.
     if isinstance(value, bool | str):
         return None
     if isinstance(value, numbers.Real):
@@ -65,14 +66,14 @@ def check_plant(model: ControlAffine, plant: ControlAffine) -> None:
     """Check that a plant has the states and inputs of the model.
 
     Raises:
-        ModelError: it has not.
+        ModelError: it does not.
     """
     for what in ("state_names", "input_names"):
-        wanted, got = getattr(model, what), getattr(plant, what)
-        if wanted != got:
+        expected, got = getattr(model, what), getattr(plant, what)
+        if expected != got:
             raise ModelError(
                 f"`{what}` of the plant `{type(plant).__name__}` are {listing(got)}, and must be "
-                f"those of the model `{type(model).__name__}`, {listing(wanted)}."
+                f"those of the model `{type(model).__name__}`, {listing(expected)}."
             )
 
 
@@ -87,18 +88,18 @@ def differences(model: ControlAffine, plant: ControlAffine) -> str:
         for field in dataclasses.fields(plant)
         if _as_lists(getattr(plant, field.name)) != _as_lists(getattr(model, field.name))
     ]
-    return ", ".join(changed) or f"{name}, which is no different"
+    return ", ".join(changed) or f"{name}, which equals the model"
 
 
 def _as_lists(value: Any) -> Any:
     """Return lists for tuples and arrays."""
-    # Arrays compare entry by entry, and lists as a whole.
+    # Arrays compare entry by entry, lists as a whole.
     value = value.tolist() if isinstance(value, np.ndarray) else value
     return list(map(_as_lists, value)) if isinstance(value, tuple | list) else value
 
 
 def _format_value(value: Any) -> str:
-    """Return a parameter as text with the digits that a person reads."""
+    """Return a parameter as text with six digits."""
     value = _as_lists(value)
     if isinstance(value, list):
         return f"({', '.join(map(_format_value, value))})"

@@ -1,4 +1,4 @@
-"""What the laws do not know, as one value: laws, gains and feed-forward go on knowing the model."""
+"""The world of a run: plant, disturbance and channel, of which the laws know nothing."""
 
 import dataclasses
 from typing import final
@@ -14,11 +14,10 @@ from echelon.core.errors import SimulationError
 @final
 @dataclasses.dataclass(frozen=True)
 class World:
-    """What differs from the model, and what acts on the agents besides their inputs.
+    """How the simulated agents and network differ from the model that laws and gains use.
 
     Args:
-        plant: the agents as they are, where they differ from the model: these move, and have these
-            actuators.
+        plant: the agents that move, with their actuators, where they differ from the model.
         disturbance: wind and noise on all agents.
         channel: what the network does to messages; left out, the network is ideal.
     """
@@ -33,15 +32,15 @@ class World:
         return self.plant is None and self.disturbance is None and self.channel is None
 
     def plant_for(self, model: ControlAffine) -> ControlAffine:
-        """Return what moves: the plant, or the model where no other is given."""
+        """Return the plant, or the model if there is none."""
         return model if self.plant is None else self.plant
 
     def check(self, model: ControlAffine) -> tuple[str, ...]:
-        """Check what is not the model, and return the warnings about it.
+        """Check plant and disturbance, and return warnings.
 
         Raises:
             ModelError: the plant is malformed, or has other states or inputs than the model.
-            SimulationError: the disturbance is none.
+            SimulationError: the disturbance is not a `Disturbance`.
         """
         if self.disturbance is not None and not isinstance(self.disturbance, Disturbance):
             raise SimulationError(
@@ -50,13 +49,13 @@ class World:
             )
         if self.plant is None:
             return ()
-        # First: the names of a malformed plant may be no names to compare.
+        # First: a malformed plant may have no names to compare.
         warnings = check_model(self.plant)
         check_plant(model, self.plant)
         return warnings
 
     def describe(self, model: ControlAffine) -> dict[str, str | None]:
-        """Return in words how the plant differs from the model, and what disturbs it; else None."""
+        """Return plant and disturbance in words; None for each that is absent."""
         return {
             "plant": None if self.plant is None else differences(model, self.plant),
             "disturbance": None if self.disturbance is None else str(self.disturbance),

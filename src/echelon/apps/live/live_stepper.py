@@ -45,7 +45,7 @@ def choose_stepper(loop: Loop, unlike: Loop, states: Array, settings: Settings) 
     try:
         # In float64: even so it takes a tenth of a picture's time.
         with precision("float64"):
-            return LiveEngine(NativeStepper([loop], states, 64, None, unlike=unlike), "float64")
+            return LiveEngine(NativeStepper([loop], states, 64, None, variant=unlike), "float64")
     except (Unsupported, MissingExtraError, TypeError):
         # A law that needs its numbers as numbers is traced by JAX as it stands.
         return by_jax

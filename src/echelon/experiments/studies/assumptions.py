@@ -10,7 +10,12 @@ import numpy as np
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.graph import Graph
 from echelon.agents.network.hearing import who_hears_whom
-from echelon.agents.references.demand import ReferenceDemand, asked, infeasible, too_fast
+from echelon.agents.references.demand import (
+    ReferenceDemand,
+    infeasible,
+    reference_demand,
+    too_fast,
+)
 from echelon.core.linear import eigenvalue_text
 from echelon.core.statement import (
     Hypothesis,
@@ -85,7 +90,7 @@ def drift_lines(parts: Parts, settings: Settings, promise: Promise) -> Iterator[
     yield _leader_line(promise)
     reference = reference_of(getattr(parts.drive, "leader", parts.drive))
     if reference is not None:
-        found = asked(parts.model, reference, settings.horizon)
+        found = reference_demand(parts.model, reference, settings.horizon)
         yield _reference_line(parts.model, found, settings)
     if promise.paper_lines:
         yield from promise.paper_lines

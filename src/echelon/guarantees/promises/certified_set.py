@@ -50,13 +50,13 @@ def certified_set(
         return None
     kind, free = region.kind, region.theorem is Theorem.A5
     if free and not leaders.rest and not _constant(parts, region):
-        text = "g varies, and a leader that moves then adds to V"
+        text = "g varies, and a moving leader then adds to V"
         return CertifiedSet(0.0, kind, text, "use a model whose g is constant")
     trim = np.asarray(parts.model.trim[0], float)
     if leaders.rest and (leaders.starts == trim).all():
         return _less(parts, region, kind, np.zeros(len(trim)))
     if leaders.answer:
-        text = "the leader reacts, so its excursion is not its own"
+        text = "the leader reacts to followers, so its excursion depends on them"
         return CertifiedSet(0.0, kind, text, "set `leader.reacts: false`")
     paths = own_paths(parts, settings, leaders.starts)
     if paths is None:
@@ -127,9 +127,9 @@ def starts_line(
     size = size_of(parts, states)
     number = size, f"{size:.3g} of {found.radius:.3g}"
     if size <= found.radius:
-        text = "from there no follower leaves the domain"
+        text = "no follower leaves the domain from these starts"
         return holds(Hypothesis.STARTS, found.kind, text, *number)
-    text, remedy = "what the set promises does not reach them", "start nearer to the goals"
+    text, remedy = "the starts are outside the certified set", "start nearer to the goals"
     return fails(Hypothesis.STARTS, found.kind, text, *number, remedy=remedy)
 
 

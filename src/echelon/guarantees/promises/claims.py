@@ -28,8 +28,8 @@ def claims_line(parts: Parts, loop: LinearLoop, found: RegionCertificate | None)
         return unneeded(name, kind, "there is no gain")
     text = _difference(parts, gain, loop, found)
     if text:
-        return fails(name, kind, text, remedy="what is promised here is computed anew")
-    return holds(name, kind, "they are of this model, graph and coupling")
+        return fails(name, kind, text, remedy="the guarantee here is computed from what runs")
+    return holds(name, kind, "they agree with this model, graph and coupling")
 
 
 def _difference(parts: Parts, gain: Gain, loop: LinearLoop, found: RegionCertificate | None) -> str:

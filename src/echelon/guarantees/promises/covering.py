@@ -25,7 +25,7 @@ def coverage(result: Result, promise: Promise) -> Iterator[str]:
     """Say of a theorem's promise whether a run kept to what it rests on."""
     if promise.theorem is None or not len(result.times):
         return
-    what = "proof" if promise.kind is Kind.PROOF else "promise on the domain"
+    what = "proof" if promise.kind is Kind.PROOF else "guarantee on the domain"
     left = None if promise.region is None else first_exit(result, promise)
     limited = float(result.saturated.max())
     against, remedy = promise.without, "leave it out to see what it costs"

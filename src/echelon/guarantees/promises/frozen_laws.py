@@ -19,7 +19,7 @@ from echelon.core.linear import discretize, matrix_exponential, sampled_radius
 from echelon.core.types import Array, Input, State, States
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.closed_loop import LinearLoop, telling
-from echelon.guarantees.promises.leader_path import MOMENTS, LeaderPath, PathSamples, route_of
+from echelon.guarantees.promises.leader_path import MOMENTS, LeaderPath, PathSamples, leader_path_of
 from echelon.guarantees.promises.leaders import Leaders
 from echelon.laws.law import Law, LocalView, gain_of, without_certificates
 from echelon.simulation.engine.law_drive import Laws
@@ -140,14 +140,14 @@ class FrozenLaws(NamedTuple):
         along: the followers' law along the leader's path.
         leader: the leader's own law there; None where it is not known.
         starts: the followers' law where agents start.
-        blamed: what takes the law out of where it stabilizes, in words; empty where nothing does.
+        culprit: what takes the law out of where it stabilizes, in words; empty where nothing does.
     """
 
     path: LeaderPath
     along: ModeMatrices
     leader: ModeMatrices | None
     starts: ModeMatrices
-    blamed: str = ""
+    culprit: str = ""
 
     @property
     def times(self) -> Array:
@@ -163,27 +163,27 @@ class FrozenLaws(NamedTuple):
         return self.path.extreme_rates()
 
     @property
-    def travelled(self) -> tuple[ModeMatrices, ...]:
+    def on_path(self) -> tuple[ModeMatrices, ...]:
         """The laws along the path; none where there is no path."""
         both = (self.along, self.leader)
         return tuple(each for each in both if each is not None) if len(self.times) else ()
 
     def radii(self, settings: Settings) -> tuple[float, float]:
         """Return the largest spectral radius of a step along the path, and where agents start."""
-        along = (each.stable().radius(settings) for each in self.travelled)
+        along = (each.stable().radius(settings) for each in self.on_path)
         return max(along, default=0.0), self.starts.stable().radius(settings)
 
     def growth(self) -> Growth:
         """Return what errors do along the path, of those who do worse."""
         found = (
             each.along(self.times, who)
-            for each, who in zip(self.travelled, ("followers'", "leader's"))
+            for each, who in zip(self.on_path, ("followers'", "leader's"))
         )
         return max(found, key=lambda one: (one.lost, one.rate))
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which the laws decay wherever they are frozen."""
-        all_ = (*self.travelled, self.starts)
+        all_ = (*self.on_path, self.starts)
         return min(each.stable().longest_step(settings) for each in all_)
 
 
@@ -206,10 +206,10 @@ def frozen_of(
     trim, starts = np.asarray(parts.model.trim[0], float), states - parts.formation.offsets
     if not isinstance(parts.drive, Laws):
         return None
-    path = route_of(parts, settings, leaders)
+    path = leader_path_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
-    begun = frozen_at(parts, loop, path, states[None])
+    begun = frozen_starts(parts, loop, path, states[None])
     if not len(path.times):
         none = ModeMatrices(*(part[:0] for part in begun))
         return FrozenLaws(path, none, None, begun)
@@ -218,10 +218,10 @@ def frozen_of(
     found = FrozenLaws(path, along, own, begun)
     if not found.growth().lost:
         return found
-    return found._replace(blamed=_blamed(parts, loop, path, found))
+    return found._replace(culprit=_culprit(parts, loop, path, found))
 
 
-def frozen_at(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
+def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
     """Return the laws of prepared parts frozen where agents start, in many runs (S, N, n).
 
     It is the same number of each run after the other.
@@ -303,7 +303,7 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
     return along._replace(gains=fed_back[:, None])
 
 
-def _blamed(parts: Parts, loop: LinearLoop, path: LeaderPath, found: FrozenLaws) -> str:
+def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, found: FrozenLaws) -> str:
     """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)

@@ -40,7 +40,7 @@ def hypotheses(case: Case) -> Iterator[Statement]:
 def agent_lines(case: Case) -> Iterator[Statement]:
     """Yield what any promise asks of the agents and their leaders."""
     yield _trim_applied(case)
-    yield _trim_held(case)
+    yield _trim_within_limits(case)
     yield _exact(case)
     yield _agreement(case)
 
@@ -55,7 +55,7 @@ def _trim_applied(case: Case) -> Statement:
     size = float(np.abs(goal_drifts(parts.model, there, parts.drive)).max())
     number = size, f"|f + g u*| {size:.2g}"
     if parts.drive.trimmed or not np.any(np.asarray(parts.model.trim[1], float)):
-        text = "about the trim, whose input the law applies"
+        text = "holds about the trim, since the law applies the trim input"
         return holds(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number)
     text, remedy = "the law leaves out the trim input", "set `follower.trim: true`"
     return fails(Hypothesis.TRIM_APPLIED, Kind.PROOF, text, *number, remedy=remedy, reason=text)
@@ -75,12 +75,12 @@ def _drifts(model: ControlAffine, law: Law | Drive | None, states: States) -> ja
     return jax.vmap(lambda x: law.drift(model, x))(states)
 
 
-def _trim_held(case: Case) -> Statement:
+def _trim_within_limits(case: Case) -> Statement:
     """Within limits an agent holds its trim only if its actuators deliver that input."""
     model, plant, name = case.parts.model, case.parts.world.plant, Hypothesis.TRIM_WITHIN_LIMITS
     moved = case.parts.world.plant_for(model)
     if not (case.settings.limits and is_limited(moved)):
-        return unneeded(name, Kind.PROOF, "no limit acts on the inputs")
+        return unneeded(name, Kind.PROOF, "the inputs have no limits")
     short = trim_shortfall(moved, np.asarray(model.trim[1], float))
     if plant is not None:
         # A heavier plant needs more than the model's trim to stay where it is.
@@ -88,11 +88,11 @@ def _trim_held(case: Case) -> Statement:
     if not short:
         stuck = at_limits(moved, np.asarray(model.trim[1], float))
         if stuck:
-            text = "the trim stands at a limit of the actuators, which deliver no change of "
-            text, remedy = text + listing(stuck), "give the actuators room about the trim"
+            text = "the trim is at a limit of the actuators, which leaves no margin for "
+            text, remedy = text + listing(stuck), "give the actuators a margin about the trim"
             # No small error gets the input that it asks for.
             return fails(name, Kind.PROOF, text, 0.0, "0 %", remedy=remedy, reason=text)
-        text = "the actuators deliver the input that it takes, and more either way"
+        text = "the actuators deliver the trim input with a margin on both sides"
         return holds(name, Kind.PROOF, text)
     units = dict(zip(model.input_names, model.input_units, strict=True))
     cut = [f"{got:.4g} of {asked:.4g} {units[i]}".rstrip() for i, (got, asked) in short.items()]
@@ -108,7 +108,7 @@ def _exact(case: Case) -> Statement:
     if not case.disturbed:
         text = "states are known exactly, and nothing disturbs the agents"
         return holds(Hypothesis.EXACT_STATES, Kind.PROOF, text)
-    text = f"{case.disturbed}; what holds without is said, and how far it may push is below"
+    text = f"{case.disturbed}; the guarantee ignores this, and bounds on its effect are below"
     return fails(
         Hypothesis.EXACT_STATES, Kind.PROOF, text, remedy="leave it out to see what it costs"
     )
@@ -126,7 +126,7 @@ def _agreement(case: Case) -> Statement:
         text = "they start apart, and their own law brings them together"
         return holds(name, _LINEAR, text, slow, f"{slow:.3g} 1/s")
     if leaders.answer:
-        text = "leaders that answer to their neighbours are pushed apart by them"
+        text = "leaders that react to their neighbours are driven apart by them"
         return fails(name, _LINEAR, text, remedy="set `leader.reacts: false`", reason=text)
     return _drifting(case)
 
@@ -171,9 +171,12 @@ def _symmetric(case: Case) -> Statement:
             bounds = (np.where(np.isfinite(b), b, s) for b, s in zip(domain.box, (-0.5, 0.5)))
             broken = formation.broken_symmetries(model, *bounds)
     if not broken:
-        return holds(name, kind, f"f and g do not notice them{where}", 0, "0 broken")
+        return holds(name, kind, f"f and g are invariant under them{where}", 0, "0 broken")
     agent, why = next(iter(broken.items()))
-    text, remedy = f"agent {agent}: {why}{where}", "offset only states that f and g ignore"
+    text, remedy = (
+        f"agent {agent}: {why}{where}",
+        "offset only states that f and g do not use",
+    )
     count, reason = len(broken), "an offset is no symmetry of the dynamics"
     return fails(name, kind, text, count, f"{count} broken", remedy=remedy, reason=reason)
 
@@ -183,24 +186,26 @@ def _smooth(case: Case) -> Statement:
     name, parts = Hypothesis.SMOOTH, case.parts
     bends = at_trim(parts.model).bends
     if not bends.any():
-        text = "values of f and g on either side of it show the slopes that A is made of"
+        text = "the slopes of f and g on both sides of the trim agree with A"
         return holds(name, Kind.SAMPLES, text)
     entry, variable = (parts.model.state_names[k] for k in np.argwhere(bends)[0])
     text = f"the rate of `{entry}` bends or jumps with `{variable}` at the trim"
     if case.region is not None and case.region.kind is not Kind.SAMPLES:
-        return fails(name, Kind.SAMPLES, text, remedy="what holds of all its sides is said")
-    remedy = "use `robust-lqr` or `contraction`, whose hull holds the slopes of both sides"
-    reason = f"{text}, where nothing linear holds"
+        return fails(
+            name, Kind.SAMPLES, text, remedy="the guarantee uses the slopes on all of its sides"
+        )
+    remedy = "use `robust-lqr` or `contraction`, whose hull contains the slopes of both sides"
+    reason = f"{text}, so there is no linearization"
     return fails(name, Kind.SAMPLES, text, remedy=remedy, reason=reason)
 
 
 def _matched(case: Case) -> Statement:
     name, leaders = Hypothesis.MATCHED_MOTION, case.leaders
     remedy = (
-        "`feedforward: relay` removes the lag, and asks for the leader's input at every follower"
+        "`feedforward: relay` removes the lag, but requires the leader's input at every follower"
     )
     if not case.matched and leaders.answer and case.governed:
-        text = "the leader answers to followers that do not know its input, and nothing is known "
+        text = "the leader reacts to followers that do not know its input, and nothing is known "
         text += "of that loop"
         return fails(name, Kind.PROOF, text, remedy=remedy, reason=text)
     if not case.matched:
@@ -212,5 +217,7 @@ def _matched(case: Case) -> Statement:
     elif case.fed_by_parents:
         text = "each follower is sent its parent's input"
     else:
-        text = "the leader's input reaches every follower, which the paper's network does not give"
+        text = (
+            "every follower receives the leader's input, which the paper's network does not provide"
+        )
     return holds(name, Kind.PROOF, text)

@@ -75,11 +75,11 @@ class LeaderPath(NamedTuple):
             return PathSamples(still, np.tile(self.trim, (count, 1)), sent, states, still)
         first = PathSamples(*(np.repeat(part[:1], count, axis=0) for part in self.rows))
         away = np.repeat(self.headings[:1], count)
-        seen = _turned_back(model, states, away) if away.any() else states
+        seen = _in_axes(model, states, away) if away.any() else states
         return first._replace(times=np.zeros(count), states=np.asarray(seen))
 
 
-def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderPath:
+def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderPath:
     """Return where the leader goes: its reference, or by itself where its input rests."""
     model, times = parts.model, np.linspace(0.0, settings.horizon, MOMENTS)
     trim, m = np.asarray(model.trim[0], float), len(model.input_names)
@@ -89,17 +89,17 @@ def route_of(parts: Parts, settings: Settings, leaders: Leaders) -> LeaderPath:
         states, soon = np.split(np.asarray(wanted), 2)
         v = _inputs(model, states, soon)
         known = np.isfinite(states).all(axis=1) & np.isfinite(v).all(axis=1)
-        return _seen(parts, times[known], states[known], v[known])
+        return _as_sensed(parts, times[known], states[known], v[known])
     own = None
     if leaders.rest and not (leaders.starts == trim).all():
         own = own_paths(parts, settings, leaders.starts[:1])
     if own is None:
-        return _seen(parts, np.zeros(0), np.zeros((0, len(trim))), np.zeros((0, m)))
+        return _as_sensed(parts, np.zeros(0), np.zeros((0, len(trim))), np.zeros((0, m)))
     frames = np.linspace(0, len(own) - 1, MOMENTS).round().astype(int)
-    return _seen(parts, times, own[frames, 0], np.zeros((MOMENTS, m)))
+    return _as_sensed(parts, times, own[frames, 0], np.zeros((MOMENTS, m)))
 
 
-def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
+def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
     """Return a path as a law that turns with the heading sees it, or as it is."""
     assert isinstance(parts.drive, Laws)
     model, still = parts.model, np.zeros(len(times))
@@ -113,7 +113,7 @@ def _seen(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPat
 
 
 @cached_jit
-def _turned_back(model: ControlAffine, states: States, angles: jax.Array) -> States:
+def _in_axes(model: ControlAffine, states: States, angles: jax.Array) -> States:
     """Return states (K, n) in axes that are turned by angles (K,)."""
     return jax.vmap(lambda x, angle: rotate_state(model, x, -angle))(states, angles)
 
@@ -128,7 +128,7 @@ def _in_heading(
         return model.velocity(x, model.physical(v))[heading_index(model)]
 
     sent = jax.vmap(input_turn(model))(inputs, -angles)
-    return _turned_back(model, states, angles), sent, jax.vmap(rate)(states, inputs)
+    return _in_axes(model, states, angles), sent, jax.vmap(rate)(states, inputs)
 
 
 def _inputs(model: ControlAffine, now: Array, soon: Array) -> Array:

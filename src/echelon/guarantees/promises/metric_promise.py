@@ -17,12 +17,17 @@ from echelon.guarantees.promises.case import Case
 from echelon.guarantees.promises.certified_set import certified_set, set_line, starts_line
 from echelon.guarantees.promises.claims import claims_line
 from echelon.guarantees.promises.closed_loop import loop_of
-from echelon.guarantees.promises.frozen_laws import ModeMatrices, frozen_at, frozen_of, longest_step
+from echelon.guarantees.promises.frozen_laws import (
+    ModeMatrices,
+    frozen_of,
+    frozen_starts,
+    longest_step,
+)
 from echelon.guarantees.promises.hypotheses import hypotheses
 from echelon.guarantees.promises.leaders import leaders_of
-from echelon.guarantees.promises.modes import held
+from echelon.guarantees.promises.modes import sampling_line
 from echelon.guarantees.promises.promise import Promise, Promises
-from echelon.guarantees.promises.region import region_of, slopes_beside, weaken
+from echelon.guarantees.promises.region import adjacent_slopes, region_of, weaken
 from echelon.guarantees.promises.turning import slowest_in_turns, turns_in_words
 from echelon.simulation.engine.initial import Starts
 from echelon.simulation.engine.prepare import Prepared
@@ -57,7 +62,7 @@ class MetricPromise(Promise):
             loop,
             leaders,
             region.certificate,
-            slopes_beside(parts) if at_trim(parts.model).bends.any() else None,
+            adjacent_slopes(parts) if at_trim(parts.model).bends.any() else None,
         )
         # What does not decay at the trim has nothing to lose elsewhere.
         if loop.every and case.governed:
@@ -93,7 +98,7 @@ class MetricPromise(Promise):
             states = Starts(prepared.parts).of([each.seed for each in settings])
             starts, decays = None, np.ones((len(states), 1), bool)
             if case.frozen is not None:
-                starts = frozen_at(prepared.parts, case.loop, case.frozen.path, states)
+                starts = frozen_starts(prepared.parts, case.loop, case.frozen.path, states)
                 decays = starts.decaying(settings[0]).reshape(len(states), -1)
         for k, each in enumerate(settings):
             there = case._replace(settings=each)
@@ -108,7 +113,7 @@ class MetricPromise(Promise):
         # The line tells of where they start only if steps grow there.
         same = decays and lines[Hypothesis.SAMPLING].verdict is Verdict.HOLDS
         if case.frozen is not None and case.smooth and not same:
-            lines[Hypothesis.SAMPLING] = held(case)
+            lines[Hypothesis.SAMPLING] = sampling_line(case)
         lines[Hypothesis.STARTS] = starts_line(case.parts, states, self.region, self.certified)
         return dataclasses.replace(self, hypotheses=MappingProxyType(lines), case=case)
 
@@ -145,27 +150,28 @@ class MetricPromise(Promise):
     def guarantee(self) -> str:
         """Return what is guaranteed near the trim, and what the region adds."""
         if self.linear:
-            text = "by linearization: followers that start near enough to their goals, with the "
-            text += f"leader near enough to the trim{self.turns}, converge to them{self.condition}"
-            text += "; no region is proved" if self.region is None else ""
+            text = "Local guarantee (linearization): followers converge to their goals from "
+            text += "sufficiently close starts, with the leader sufficiently close to the trim"
+            text += f"{self.turns}{self.condition}"
         else:
-            text = "on a domain alone, with the slopes of all sides of the trim: the model bends "
-            text += "there, and has no linearization"
-        text = f"Promised, {text}."
-        return text if self.region is None else f"{text} {self._regional(self.region)}"
+            text = "Guaranteed on a domain only: the model is not differentiable at the trim, so "
+            text += "the slopes on all of its sides are used"
+        if self.region is None:
+            return f"{text}; how close is not known."
+        return f"{text}. {self._regional(self.region)}"
 
     def _regional(self, region: RegionCertificate) -> str:
         """Return what the region adds, as strong as its own argument and no stronger."""
         found, condition, theorem = self.certified, self.condition, region.theorem
         by, what = self.kind.value, f"errors shrink at {region.rate:.3g} 1/s or faster"
-        what = "V does not rise" if theorem is Theorem.A5 else what
+        what = "V does not increase" if theorem is Theorem.A5 else what
         if found is None:
             text = f"small {what}{condition}, while the leader stays in {self.domain}"
             return f"{by}: {text} ({theorem})."
         if not found.radius:
             text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
             return f"{by}: {what}{condition}, {text}certified to stay: {found.why}; {found.remedy}."
-        read = "" if found.kind is self.kind else ", the leader going as in a run of its own"
+        read = "" if found.kind is self.kind else ", if the leader moves as in a run of its own"
         start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
         start = "everywhere" if found.radius == float("inf") else start
         return f"{by}: from {start}, {what}{condition}{read} ({theorem})."

@@ -14,7 +14,9 @@ from echelon.simulation.engine.law_drive import Laws
 from echelon.synthesis.certificates.margins import detectability
 
 _LINEAR = Kind.LINEARIZATION
-_BENT = "the model bends at the trim, and has no modes there"
+_GROWS = "with the input held over the step `dt` the disagreement grows"
+_NOT_STABLE = "the disagreement does not decay at the trim"
+_BENT = "the model is not differentiable at the trim and has no modes there"
 
 
 def modes(case: Case) -> Iterator[Statement]:
@@ -28,7 +30,7 @@ def _linear(case: Case) -> Iterator[Statement]:
     yield _decaying(case)
     yield _along(case)
     yield from turning(case)
-    yield held(case)
+    yield sampling_line(case)
     if case.parts.graph.schedule is not None:
         yield _taking_turns(case)
 
@@ -44,7 +46,7 @@ def _bent(case: Case) -> Iterator[Statement]:
     if region is None or region.theorem is Theorem.A5:
         yield vacuous(Hypothesis.DISAGREEMENT_DECAY, _LINEAR, _BENT)
     else:
-        text = "by the slopes of all sides of the trim, where the model bends"
+        text = "by the slopes on all sides of the trim, where the model is not differentiable"
         rate = -region.rate
         yield holds(Hypothesis.DISAGREEMENT_DECAY, region.kind, text, rate, f"{rate:.3g} 1/s")
     yield _sampled_bend(case)
@@ -53,18 +55,17 @@ def _bent(case: Case) -> Iterator[Statement]:
 def _sampled_bend(case: Case) -> Statement:
     """Whether each side of a bend decays in steps of the integrator, as if it were all around."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
-    shown = f"dt {settings.dt:g} s"
+    dt_text = f"dt {settings.dt:g} s"
     if case.region is None or case.slopes is None:
-        return vacuous(name, Kind.SAMPLES, _BENT, None, shown)
+        return vacuous(name, Kind.SAMPLES, _BENT, None, dt_text)
     A, dt = case.slopes[:, None], settings.dt
     radius = sampled_radius(A, loop.linear.B, loop.gains, dt, settings.integrator)
     text = f"spectral radius {radius:.4g} a step, over the slopes of all sides of the trim"
     if radius < 1.0:
-        return holds(name, Kind.SAMPLES, text, radius, shown)
+        return holds(name, Kind.SAMPLES, text, radius, dt_text)
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
     remedy = "shorten `simulation.dt`, or lower the gain"
-    reason = "with the input held over the step `dt` it grows"
-    return fails(name, Kind.SAMPLES, text, radius, shown, remedy=remedy, reason=reason)
+    return fails(name, Kind.SAMPLES, text, radius, dt_text, remedy=remedy, reason=_GROWS)
 
 
 # ---- where it has a linearization ---------------------------------------------------------------
@@ -73,7 +74,7 @@ def _sampled_bend(case: Case) -> Statement:
 def _detectable(case: Case) -> Statement:
     model, loop, name = case.parts.model, case.loop, Hypothesis.DETECTABLE
     if not case.governed:
-        return unneeded(name, _LINEAR, "there is no P")
+        return unneeded(name, _LINEAR, "the law has no P")
     rank, n = loop.certificate.observable, len(model.state_names)
     hidden = detectability(loop.linear.A, loop.linear.B.T @ loop.closed.P)
     number = rank, f"rank {rank} of {n}"
@@ -90,10 +91,10 @@ def _detectable(case: Case) -> Statement:
 def _coupled(case: Case) -> Statement:
     edge, c = case.loop.certificate.edge, case.loop.closed.coupling
     if edge is None:
-        return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge known", c, f"c {c:.4g}")
+        return holds(Hypothesis.COUPLING, Kind.PROOF, "no edge is known", c, f"c {c:.4g}")
     number = c, f"c {c:.4g}, edge {edge:.4g}"
     if c >= edge:
-        text = "from the edge on every mode decays: near the trim, of linear agents anywhere"
+        text = "from the edge on every mode decays: near the trim, and of linear agents anywhere"
         return holds(Hypothesis.COUPLING, Kind.PROOF, text, *number)
     text = f"coupling {c:.4g} is below the edge {edge:.4g} of what this gain guarantees"
     remedy = f"raise `coupling` to {edge:.4g} or more"
@@ -106,8 +107,8 @@ def _decaying(case: Case) -> Statement:
     if not case.governed:
         law = isinstance(case.parts.drive, Laws)
         text = "the followers' law does not act on the disagreement"
-        text = text if law else f"no theorem is known of `{type(case.parts.drive).__name__}`"
-        remedy = "use `consensus`" if law else "use laws, which theorems speak of"
+        text = text if law else f"no theorem covers `{type(case.parts.drive).__name__}`"
+        remedy = "use `consensus`" if law else "use laws that a theorem covers"
         return fails(name, _LINEAR, text, remedy=remedy, reason=text)
     text = f"over {loop.certificate.modes} eigenvalues of the graph"
     if case.fed_by_parents:
@@ -131,13 +132,16 @@ def _taking_turns(case: Case) -> Statement:
     name, loop = Hypothesis.SWITCHING, case.loop
     edge, c, common = loop.certificate.edge, loop.closed.coupling, loop.common
     if not case.governed:
-        text = "no theorem is known of this law on graphs that take turns"
+        text = "no theorem covers this law on switching graphs"
         return fails(name, _LINEAR, text, remedy="use `consensus`", reason=text)
     # At the edge the sum may only stay; what feels nothing then decays by detectability.
     if common is not None and edge is not None and c >= edge and common > -np.inf:
-        text, rate = "whenever they do: sum_i delta_i'P delta_i rises on none", max(0.0, common)
+        text, rate = (
+            "sum_i delta_i'P delta_i increases on no graph, whenever they switch",
+            max(0.0, common),
+        )
         return holds(name, _LINEAR, text, rate, f"{rate:.3g} 1/s")
-    text = "no one P is known to serve all the graphs that take turns"
+    text = "no one P is known that serves all graphs of the schedule"
     remedy = "use the law `stopping-point`"
     if edge is not None and not c >= edge:
         remedy = f"raise `coupling` to {edge:.4g} or more, or {remedy}"
@@ -148,43 +152,49 @@ def _along(case: Case) -> Statement:
     """Whether the laws are stable where the reference takes them, frozen there: no proof."""
     name, frozen = Hypothesis.ALONG_PATH, case.frozen
     if not (case.loop.every and case.governed):
-        return unneeded(name, Kind.SAMPLES, "there is nothing to lose")
-    if frozen is None or not frozen.travelled:
+        return unneeded(name, Kind.SAMPLES, _NOT_STABLE)
+    if frozen is None or not frozen.on_path:
         text = "the leader rests at the trim, or follows no path of its own"
         return unneeded(name, Kind.SAMPLES, text)
     found, states = frozen.growth(), len(frozen.times)
     number = found.rate, f"{found.rate:.3g} 1/s"
     if not found.lost:
-        text = f"small errors shrink over {states} states of it, each frozen until the next"
+        text = f"small errors decay over {states} states of it, each frozen until the next"
         return holds(name, Kind.SAMPLES, text, *number)
     grown = f"{np.exp(min(found.most, 99.0)):.2g}-fold on a part of it"
     grown = f"at {found.rate:.3g} 1/s" if found.rate >= 0.0 else grown
     text = f"along the leader's path the {found.whose} errors grow {grown}, fastest at "
-    text += f"{found.when:.3g} s, where {frozen.blamed} takes the law farthest from its trim"
-    remedy = f"keep {frozen.blamed.partition(' ')[0]} nearer to the trim there"
+    text += f"{found.when:.3g} s, where {frozen.culprit} takes the law farthest from its trim"
+    remedy = f"keep {frozen.culprit.partition(' ')[0]} nearer to the trim there"
     return fails(name, Kind.SAMPLES, text, *number, remedy=remedy, reason=text)
 
 
-def held(case: Case) -> Statement:
+def sampling_line(case: Case) -> Statement:
     """Whether it still decays in steps of the integrator that runs, with the input held."""
     name, loop, settings = Hypothesis.SAMPLING, case.loop, case.settings
     if not (loop.every and case.governed):
-        return unneeded(name, _LINEAR, "there is nothing to lose", None, f"dt {settings.dt:g} s")
+        return unneeded(
+            name,
+            _LINEAR,
+            _NOT_STABLE,
+            None,
+            f"dt {settings.dt:g} s",
+        )
     radius, printed = loop.radius(settings), settings.integrator == "printed"
     goals = np.asarray(case.parts.model.trim[0], float) + case.parts.formation.offsets
     if printed and goals.any():
-        text = "`printed` takes f + g u for the state, and so forgets the goals"
-        return _step(case, np.inf, text, "use `simulation.integrator: rk4`")
+        text = "`printed` takes f + g u as the next state, which ignores the goals"
+        return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
     found = {f"a step, {loop.where}": radius}
     if case.frozen and not printed:
         places = ("a step along the leader's path", "a step where agents start")
         found |= zip(places, case.frozen.radii(settings))
     where = next((x for x, one in found.items() if not one < 1.0), f"a step, {loop.where}")
     remedy = "use `simulation.integrator: rk4`" if printed else ""
-    return _step(case, found[where], f"spectral radius {found[where]:.4g} {where}", remedy)
+    return _step_line(case, found[where], f"spectral radius {found[where]:.4g} {where}", remedy)
 
 
-def _step(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
+def _step_line(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
     """Return the line of a step from a spectral radius and where it is met."""
     dt = case.settings.dt
     number = radius, f"dt {dt:g} s"
@@ -194,6 +204,6 @@ def _step(case: Case, radius: float, text: str, remedy: str = "") -> Statement:
         longest = longest_step(case.loop, case.frozen, case.settings)
         remedy = f"shorten `simulation.dt` below {longest:.3g} s, or lower the gain"
     # Where agents start it lasts a moment, and a promise is of starts near the goals.
-    reason = "" if "agents start" in text else "with the input held over the step `dt` it grows"
+    reason = "" if "agents start" in text else _GROWS
     text = f"the step `dt` = {dt:g} s is too long for this gain: {text}"
     return fails(Hypothesis.SAMPLING, _LINEAR, text, *number, remedy=remedy, reason=reason)

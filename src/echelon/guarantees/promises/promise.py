@@ -212,7 +212,7 @@ class Promise(abc.ABC):
         """Return what is guaranteed, in sentences, and no more than that."""
         text = self.guarantee() if self.promised else self._against()
         if self.promised and self.without:
-            text += f" This is said without what the scenario adds: {self.without}."
+            text += f" The guarantee ignores that {self.without}."
         claims = self.hypotheses[Hypothesis.CLAIMS]
         return f"{text} Note: {claims.explanation}." if claims.fails else text
 
@@ -220,7 +220,7 @@ class Promise(abc.ABC):
         """Return all that stands against a guarantee, and what would help."""
         against = (each for each in self.hypotheses.values() if each.fails and each.reason)
         remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
-        return f"Nothing is promised: {'; '.join(self.reasons)}. What would help: {remedies}."
+        return f"Nothing is guaranteed: {'; '.join(self.reasons)}. What would help: {remedies}."
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""

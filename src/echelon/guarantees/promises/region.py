@@ -55,20 +55,20 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
     """Return what is promised on the domain that the gain of prepared parts was made for."""
     gain = parts.drive.gain
     if gain is not None and gain.certificate.region is None and at_trim(parts.model).bends.any():
-        return _beside_bends(parts, leaders, gain)
+        return _region_at_bend(parts, leaders, gain)
     if gain is None or gain.certificate.region is None:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
         return Region(None, None, unneeded(_NAME, Kind.PROOF, text, number_text="none"))
     try:
         found = _computed(parts, gain, gain.certificate.region)
     except GainError as error:
-        return Region(None, None, _lost(str(error).rstrip("."), "make the gain again"))
+        return Region(None, None, _lost(str(error).rstrip("."), "compute the gain again"))
     if found is None and not _strength(parts, gain) > 0.0:
-        text = "on this graph no sum of squares is known that falls whatever the slopes are"
-        return Region(None, None, _lost(text, "let agents hear each other both ways"))
+        text = "on this graph no sum of squares is known that decreases for all slopes"
+        return Region(None, None, _lost(text, "make the links bidirectional"))
     if found is None:
         strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
-        text = f"P contracts at no rate on the domain {strength}"
+        text = f"P does not contract on the domain {strength}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
     text, remedy = _withheld(parts, leaders, gain, found)
     if text:
@@ -76,12 +76,12 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
     return Region(found, found, _line(parts, found))
 
 
-def _beside_bends(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
+def _region_at_bend(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     """Return what a metric promises about a trim at which the model bends.
 
     It has no linearization there, but a hull holds the slopes of all its sides nearby.
     """
-    text = "the slopes beside the trim, where the model bends, do not all contract in P"
+    text = "the model is not differentiable at the trim, and its slopes there do not all contract"
     none = unneeded(_NAME, Kind.VERTICES, text, number_text="none")
     try:
         pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
@@ -97,7 +97,7 @@ def _near(model: ControlAffine) -> Domain:
     return Domain.about(model, dict.fromkeys(model.state_names, _NEAR))
 
 
-def slopes_beside(parts: Parts) -> Array | None:
+def adjacent_slopes(parts: Parts) -> Array | None:
     """Return the drift's slopes on all sides of the trim, (K, n, n); None where none are found."""
     gain = parts.drive.gain
     try:
@@ -146,7 +146,7 @@ def _withheld(
 ) -> tuple[str, str]:
     """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
     if gain.inner is not None:
-        return "the hull is of the drift without the gain's inner loop", "leave the loop out"
+        return "the hull is of the drift without the gain's inner loop", "remove the inner loop"
     return _not_the_law(parts, leaders, found)
 
 
@@ -165,10 +165,12 @@ def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tu
         return text, "set `feedforward: relay`"
     # A leader at its trim makes no velocity beyond it, and its raw input is that of the trim.
     if feedforward is Feedforward.RELAY_VELOCITY and theorem is Theorem.T2 and not leaders.rest:
-        text = "T2 is of the leader's raw input; what each agent makes of its velocity turns with g"
-        return f"{text}, and is not enclosed", "set `feedforward: relay`"
+        text = (
+            "T2 covers the leader's raw input; what each agent computes from its velocity varies "
+        )
+        return f"{text}with g, and is not enclosed", "set `feedforward: relay`"
     if not leaders.agree:
-        return f"{theorem} speaks of one leader, or of leaders that agree", "start them alike"
+        return f"{theorem} covers one leader, or leaders that agree", "start them alike"
     return "", ""
 
 

@@ -47,8 +47,8 @@ def turning(case: Case) -> Iterator[Statement]:
         return
     model, kind = case.parts.model, Kind.SAMPLES
     name, gap = heading_of(model).state, heading_gap(model)
-    text = f"f and g turn with `{name}`, up to {gap:.1g} at samples, so that the law does at any "
-    text += f"`{name}` what it does at the trim"
+    text = f"f and g turn with `{name}`, up to {gap:.1g} at samples, so the law acts at any "
+    text += f"`{name}` as at the trim"
     slowest = slowest_in_turns(case)
     if not slowest:
         yield holds(_NAME, kind, text, gap, f"gap {gap:.1g}")

@@ -34,16 +34,10 @@ _SLACK = 1e-9
 """m; more than floats leave of the sums."""
 
 
-class Arrival(NamedTuple):
-    """From which time (s) on all followers are within 1 cm of their goals."""
-
-    time: float
-
-
 def arrival_of(
     flat: Array, graph: Graph, law: StoppingPoint, coupling: float, position: Sequence[int]
-) -> Arrival | None:
-    """Return when all followers are within 1 cm for good; None where it cannot be told.
+) -> float | None:
+    """Return when (s) all followers are within 1 cm for good; None where it is not known.
 
     Args:
         flat: (N, r, m) starts in flat coordinates, less the offsets.
@@ -52,9 +46,9 @@ def arrival_of(
         coupling: c.
         position: which outputs are one.
     """
-    told = law.feedforward is Feedforward.PARENT
+    by_parents = law.feedforward is Feedforward.PARENT
     apart = np.ptp(flat[list(graph.leaders)], axis=0).max()
-    alone = told or graph.schedule is not None
+    alone = by_parents or graph.schedule is not None
     if not position or apart > _SLACK or alone and len(graph.followers) > _FEW:
         return None
     loop, followers = law.ready, list(graph.followers)
@@ -62,7 +56,7 @@ def arrival_of(
     times = _CELL * np.arange(_MOST + 1)
     square = np.zeros((len(followers), _MOST))
     moved = _all_together if graph.schedule is None else _in_turns
-    moved = _along_links if told else moved
+    moved = _along_links if by_parents else moved
     for k in position:
         own = np.array(law.roots_for(loop.chains.degrees[k] - 1))
         stops = flat[:, :, k] @ loop.weights[:, k]
@@ -72,9 +66,9 @@ def arrival_of(
         square += (reach.weights[:, None] * driven + _left(own, away[:, :, k], times)) ** 2
     outside = np.flatnonzero((np.sqrt(square) + _SLACK >= _WITHIN).any(axis=0))
     if not len(outside):
-        return Arrival(0.0)
+        return 0.0
     last = int(outside[-1]) + 1
-    return None if last >= _MOST else Arrival(float(times[last]))
+    return None if last >= _MOST else float(times[last])
 
 
 class _Reach(NamedTuple):

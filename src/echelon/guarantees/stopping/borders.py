@@ -14,8 +14,8 @@ from echelon.core.words import Kind
 from echelon.guarantees.stopping.chain_clearance import (
     Clearance,
     Push,
-    length_room_of,
-    room_of,
+    clearance_of,
+    length_clearance_of,
 )
 from echelon.guarantees.stopping.chain_response import Chain
 from echelon.guarantees.stopping.path_bounds import Least, least_on_path
@@ -24,7 +24,7 @@ from echelon.guarantees.stopping.stopping_run import StoppingRun
 _ROUNDED = Fraction(1, 10**6)
 """Of a derivative of a flat output: a thousand times what floats leave of it at a start."""
 _LEVEL = 1e-9
-"""What floats leave of a level start, far below the slack of the room."""
+"""What floats leave of a level start, far below the slack of the clearance."""
 _STARTS = 64
 """Starts of agents that are looked at one by one; those that differ in one speed alone are two."""
 
@@ -42,7 +42,7 @@ class Border(NamedTuple):
         led: whether the leader starts on its path in these outputs, and so keeps to it.
         turn: by what angle (deg) a velocity as large as the leader's may be off it at the start;
             infinite where the bound is of no velocity.
-        told: what is claimed, and of what it was computed; ready for JSON.
+        data: what is claimed, and what it was computed of; ready for JSON.
     """
 
     bound: FlatBound
@@ -53,7 +53,7 @@ class Border(NamedTuple):
     fastest: float
     led: bool
     turn: float
-    told: dict[str, Any]
+    data: dict[str, Any]
 
     @property
     def many(self) -> bool:
@@ -93,17 +93,17 @@ def border_of(run: StoppingRun, bound: FlatBound) -> Border:
     own, s = _together(speeds), _together(map(run.speed, places))
     led = max(speeds) < _LEVEL and _is_on_path(run, places)
     none = Fraction(-1), 0.0
-    known = Border(bound, *none, least.kind, least.value, fastest, led, math.inf, {})
+    border = Border(bound, *none, least.kind, least.value, fastest, led, math.inf, {})
     if own is None or s is None:
-        return known
-    asked = _Asked(run, bound, places, chain, own, s, allowed)
-    rooms, starts = _along(asked) if known.many else _upward(asked)
-    left = min(allowed - room.fall for room in rooms)
+        return border
+    case = _BorderCase(run, bound, places, chain, own, s, allowed)
+    clearances, starts = _along(case) if border.many else _upward(case)
+    left = min(allowed - clearance.fall for clearance in clearances)
     # Said of agents behind a leader that keeps to the speed of its path.
-    steepest = float(length_room_of(chain, order, (), s, allowed).steepest)
-    told = {**_told(asked, least, left), **starts, "steepest": steepest}
-    turn = _turn(run, places, steepest) if known.many and order == 0 else math.inf
-    return known._replace(left=left, steepest=steepest, turn=turn, told=told)
+    steepest = float(length_clearance_of(chain, order, (), s, allowed).steepest)
+    data = {**_data(case, least, left), **starts, "steepest": steepest}
+    turn = _turn(run, places, steepest) if border.many and order == 0 else math.inf
+    return border._replace(left=left, steepest=steepest, turn=turn, data=data)
 
 
 def _is_on_path(run: StoppingRun, places: list[int]) -> bool:
@@ -119,7 +119,7 @@ def _turn(run: StoppingRun, places: list[int], chord: float) -> float:
     return math.degrees(2.0 * math.asin(min(1.0, 0.5 * chord / size))) if size > 0.0 else math.inf
 
 
-class _Asked(NamedTuple):
+class _BorderCase(NamedTuple):
     """A border with what it is computed of: bounds of |w| of leader and agent, what is allowed."""
 
     run: StoppingRun
@@ -140,58 +140,58 @@ def _together(speeds: Any) -> Fraction | None:
     return exact[0] if len(exact) == 1 else root_bounds(sum((s**2 for s in exact), Fraction(0)))[1]
 
 
-def _told(asked: _Asked, least: Least, left: Fraction) -> dict[str, Any]:
-    chain, p = asked.chain, len(asked.chain.powers)
+def _data(case: _BorderCase, least: Least, left: Fraction) -> dict[str, Any]:
+    chain, p = case.chain, len(case.chain.powers)
     return {
-        "outputs": list(asked.bound.outputs),
-        "derivative": asked.bound.derivative,
-        "above": asked.bound.above,
+        "outputs": list(case.bound.outputs),
+        "derivative": case.bound.derivative,
+        "above": case.bound.above,
         "path": least.value,
-        "roots": list(asked.run.law.roots_for(p)),
-        "speed": float(asked.speed),
-        "leader_speed": float(asked.own),
+        "roots": list(case.run.law.roots_for(p)),
+        "speed": float(case.speed),
+        "leader_speed": float(case.own),
         "gains": [float(chain.gain(order)) for order in range(p + 1)],
         "left": float(left),
     }
 
 
-def _upward(asked: _Asked) -> tuple[list[Clearance], dict[str, Any]]:
-    """Return the rooms of one output, which may go far on its other side, and the starts."""
-    run, [k], chain = asked.run, asked.places, asked.chain
+def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, Any]]:
+    """Return the clearances of one output, which may go far on its other side, and the starts."""
+    run, [k], chain = case.run, case.places, case.chain
     leads, p = list(run.parts.graph.leaders), len(chain.powers)
     led = _few(run.flat[leads, :, k] - run.ahead[:, k])
     away = _few(run.flat[:, :, k] - run.flat[list(run.parts.graph.nearest_leader()), :, k])
-    rooms = [
-        room_of(
+    clearances = [
+        clearance_of(
             chain,
-            asked.bound.derivative - 1,
+            case.bound.derivative - 1,
             (
-                Push(_exact(lead[1 : p + 1]), asked.own),
-                Push(_exact(start[1 : p + 1]), asked.speed),
+                Push(_exact(lead[1 : p + 1]), case.own),
+                Push(_exact(start[1 : p + 1]), case.speed),
             ),
-            asked.allowed,
+            case.allowed,
         )
         for lead in led
         for start in away
     ]
-    told = {"starts": away, "leader_starts": led}
-    return rooms, {name: starts[:, 1 : p + 1].tolist() for name, starts in told.items()}
+    starts = {"starts": away, "leader_starts": led}
+    return clearances, {name: flat[:, 1 : p + 1].tolist() for name, flat in starts.items()}
 
 
-def _along(asked: _Asked) -> tuple[list[Clearance], dict[str, Any]]:
-    """Return the rooms of several outputs, and the starts against the leader's path."""
-    run, p = asked.run, len(asked.chain.powers)
-    away = (run.flat - run.ahead)[:, 1 : p + 1, asked.places].swapaxes(1, 2)
+def _along(case: _BorderCase) -> tuple[list[Clearance], dict[str, Any]]:
+    """Return the clearances of several outputs, and the starts against the leader's path."""
+    run, p = case.run, len(case.chain.powers)
+    away = (run.flat - run.ahead)[:, 1 : p + 1, case.places].swapaxes(1, 2)
     if p == 1:
         # A length that falls by itself: the longest stands for all.
         away = away[[int(np.linalg.norm(away[:, :, 0], axis=1).argmax())]]
     away = _distinct(away)
-    order, total = asked.bound.derivative - 1, asked.own + asked.speed
-    rooms = [
-        length_room_of(asked.chain, order, list(map(_exact, start)), total, asked.allowed)
+    order, total = case.bound.derivative - 1, case.own + case.speed
+    clearances = [
+        length_clearance_of(case.chain, order, list(map(_exact, start)), total, case.allowed)
         for start in away
     ]
-    return rooms, {"starts": away.tolist()}
+    return clearances, {"starts": away.tolist()}
 
 
 def _exact(values: Array) -> tuple[Fraction, ...]:

@@ -42,7 +42,7 @@ class Clearance(NamedTuple):
     steepest: Fraction
 
 
-def room_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction) -> Clearance:
+def clearance_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction) -> Clearance:
     """Return how far v^(order) falls under all pushes together, and the start that is left.
 
     Args:
@@ -59,10 +59,10 @@ def room_of(chain: Chain, order: int, pushes: Sequence[Push], allowed: Fraction)
     def fallen(low: Fraction, high: Fraction) -> Fraction:
         return Fraction(0) if still else largest_between(free, low, high, negative=True)
 
-    return _room(chain, order, fallen, speed, allowed)
+    return _clearance(chain, order, fallen, speed, allowed)
 
 
-def length_room_of(
+def length_clearance_of(
     chain: Chain,
     order: int,
     starts: Sequence[Sequence[Fraction]],
@@ -84,7 +84,7 @@ def length_room_of(
     def left(low: Fraction, high: Fraction) -> Fraction:
         return root_bounds(sum((_size(p, low, high) ** 2 for p in frees), Fraction(0)))[1]
 
-    return _room(chain, order, left, speed, allowed)
+    return _clearance(chain, order, left, speed, allowed)
 
 
 def _size(p: Poly, low: Fraction, high: Fraction) -> Fraction:
@@ -92,14 +92,14 @@ def _size(p: Poly, low: Fraction, high: Fraction) -> Fraction:
     return max(largest_between(p, low, high, sign) for sign in (False, True))
 
 
-def _room(
+def _clearance(
     chain: Chain,
     order: int,
     left: Callable[[Fraction, Fraction], Fraction],
     speed: Fraction,
     allowed: Fraction,
 ) -> Clearance:
-    """Return the room, where `left` is what the starts leave on a piece of 0 < x <= 1, at most."""
+    """Return the clearance, where `left` bounds what the starts leave on a piece of 0 < x <= 1."""
     fall, steepest = Fraction(0), None
     for low, high, moved, either in _pieces(chain, order):
         down = left(low, high) + speed * moved

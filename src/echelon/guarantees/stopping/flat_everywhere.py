@@ -140,7 +140,7 @@ def _form_of(node: Node) -> _Form:
 def _one(node: Node, args: list[_Form]) -> _Form:
     if node.op == "constant" and np.isfinite(node.value):
         return _tidy({None: Fraction(node.value)})
-    if node.op in ("add", "sub", "apart"):
+    if node.op in ("add", "sub", "unfused_sub"):
         return _sum(args[0], args[1], Fraction(1 if node.op == "add" else -1))
     if node.op == "neg":
         return _sum({}, args[0], Fraction(-1))

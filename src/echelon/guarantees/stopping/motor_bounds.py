@@ -86,8 +86,8 @@ def motors_of(
         pushes: the leader's off its path, and the agent's off the leader; all add up.
     """
     least, largest, slope = None, Fraction(0), Fraction(0)
-    for piece, asked in zip(slices, path, strict=True):
-        found = motors_for(frame, add_pushes(piece, asked, pushes))
+    for piece, demand in zip(slices, path, strict=True):
+        found = motors_for(frame, add_pushes(piece, demand, pushes))
         if found.slope is None:
             return found
         least = found.least if least is None else min(least, found.least)
@@ -104,9 +104,9 @@ def motors_suffice(
     return all(motors_for(frame, add_pushes(*pair, (push,))).within(most) for pair in pairs)
 
 
-def add_pushes(piece: TimeSlice, asked: MotorDemand, pushes: Sequence[Pushed]) -> MotorDemand:
+def add_pushes(piece: TimeSlice, demand: MotorDemand, pushes: Sequence[Pushed]) -> MotorDemand:
     """Return what is asked on a slice of agents that are pushed off the path."""
-    aside, up, turn = list(asked.sideways), [Fraction(0)] * 3, list(asked.turn)
+    aside, up, turn = list(demand.sideways), [Fraction(0)] * 3, list(demand.turn)
     for push in pushes:
         along, upward, around = push.speeds
         for k in range(3):
@@ -116,25 +116,25 @@ def add_pushes(piece: TimeSlice, asked: MotorDemand, pushes: Sequence[Pushed]) -
             turn[k] += piece.first.of(k, push.turn, around)
     return MotorDemand(
         (aside[0], aside[1], aside[2]),
-        asked.low - up[0],
-        asked.high + up[0],
-        (asked.upward[0] + up[1], asked.upward[1] + up[2]),
+        demand.low - up[0],
+        demand.high + up[0],
+        (demand.upward[0] + up[1], demand.upward[1] + up[2]),
         (turn[0], turn[1]),
     )
 
 
-def motors_for(frame: Airframe, asked: MotorDemand) -> Motors:
+def motors_for(frame: Airframe, demand: MotorDemand) -> Motors:
     """Return what the motors give while a path's derivatives are within bounds."""
-    low = asked.low + Fraction(frame.gravity)
+    low = demand.low + Fraction(frame.gravity)
     if low <= 0:
         return Motors(Fraction(-1), Fraction(-1), None)
     Jx, Jy, Jz = map(Fraction, frame.inertia)
-    tan = round_up(asked.sideways[0] / low)
+    tan = round_up(demand.sideways[0] / low)
     sec2 = 1 + tan * tan
     low_sec, high_sec = root_bounds(sec2)
     sec, sine = round_up(high_sec), round_up(tan / low_sec)
-    jerk, snap = (norm_above(asked.sideways[k + 1], asked.upward[k]) for k in range(2))
-    turn, turning = asked.turn
+    jerk, snap = (norm_above(demand.sideways[k + 1], demand.upward[k]) for k in range(2))
+    turn, turning = demand.turn
     # Of roll and pitch, rad/s, and what turns them but for what the yaw does, rad/s^2.
     rate = round_up(jerk / low)
     bend = round_up((snap + jerk * jerk / low) / low)
@@ -146,5 +146,5 @@ def motors_for(frame: Airframe, asked: MotorDemand) -> Motors:
     root = root_bounds(2)[1]
     more = root * tilting / Fraction(frame.arm) + yawing / Fraction(frame.torque_per_thrust)
     mass, more = Fraction(frame.mass), round_up(more) / 4
-    high = norm_above(asked.high + Fraction(frame.gravity), asked.sideways[0])
+    high = norm_above(demand.high + Fraction(frame.gravity), demand.sideways[0])
     return Motors(mass * low / 4 - more, mass * high / 4 + more, tan)

@@ -8,7 +8,7 @@ from echelon.core.numerics import precision
 from echelon.core.words import Feedforward
 from echelon.guarantees.promises.promise import Promise, promise
 from echelon.guarantees.stopping.motor_load import motors_suffice_for
-from echelon.guarantees.stopping.stopping_run import stopping_of
+from echelon.guarantees.stopping.stopping_run import stopping_run_of
 from echelon.laws.stopping_point import StoppingLeader, StoppingPoint
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
@@ -83,7 +83,7 @@ def _certified(parts: Parts, settings: Settings, rate: float, links: int) -> Ite
         try:
             prepared = prepare(tried, settings)
             with precision("float64"):
-                run = stopping_of(prepared.parts, settings, prepared.problem.states)
+                run = stopping_run_of(prepared.parts, settings, prepared.problem.states)
                 sufficient = motors_suffice_for(run)
         except EchelonError:
             # Roots of another number than the model's, say.

@@ -38,7 +38,7 @@ _STARTS = 64
 _STEPS = 8
 """Of a bisection for how far a start may be off: a 250th of where it begins."""
 _ZERO = Fraction(0)
-_UNKNOWN = "no certificate is known of these limits; a run says whether one acted"
+_UNKNOWN = "no certificate is known for these limits; a run reports whether one acted"
 _STILL = Pushed((), (), (), (_ZERO, _ZERO, _ZERO))
 
 
@@ -62,10 +62,10 @@ class Alone(NamedTuple):
         """Return the same in words."""
         rest = ", or level and at rest" if self.rest else ""
         return (
-            "any place and heading, beside a leader on its path but for its place: tilted by "
-            f"{math.degrees(self.tilt):.3g} deg at its velocity, or {self.sideways:.3g} m/s off "
-            f"that sideways, or {self.upward:.3g} m/s upward, or level with {self.rate:.3g} rad/s "
-            f"of roll and pitch{rest}"
+            "any place and heading behind a leader that is on its path but for its place, if one "
+            f"thing alone differs from the leader: a tilt of {math.degrees(self.tilt):.3g} deg at "
+            f"its velocity, or {self.sideways:.3g} m/s sideways, or {self.upward:.3g} m/s upward, "
+            f"or {self.rate:.3g} rad/s of roll and pitch when level{rest}"
         )
 
 
@@ -78,7 +78,7 @@ class MotorLoad(NamedTuple):
         most: that it has, N.
         tilt: the steepest, rad.
         alone: None where agents that start like the leader do not.
-        told: of what it was computed; ready for JSON.
+        data: what it was computed of; ready for JSON.
     """
 
     kind: Kind
@@ -87,12 +87,12 @@ class MotorLoad(NamedTuple):
     most: float
     tilt: float
     alone: Alone | None
-    told: dict[str, Any]
+    data: dict[str, Any]
 
     def sentence(self) -> str:
         """Return what is promised of motors."""
-        text = f"From these starts motors give between {self.least:.3g} and {self.largest:.3g} N "
-        text += f"of their {self.most:.4g} N, and nobody tilts by more than "
+        text = f"From these starts each motor's thrust stays between {self.least:.3g} and "
+        text += f"{self.largest:.3g} N (maximum {self.most:.4g} N), and the tilt is at most "
         text += f"{math.degrees(self.tilt):.3g} deg"
         more = "" if self.alone is None else f"; they suffice from {self.alone.sentence()}"
         return f"{text}{more}."
@@ -101,14 +101,7 @@ class MotorLoad(NamedTuple):
         """Return it ready for JSON."""
         alone = None if self.alone is None else self.alone._asdict()
         numbers = {"least": self.least, "largest": self.largest, "tilt": self.tilt}
-        return {**numbers, "most": self.most, "alone": alone, **self.told}
-
-
-class LoadLine(NamedTuple):
-    """The strain, if it is known and the motors bear it, and the line that says so."""
-
-    strain: MotorLoad | None
-    line: Statement
+        return {**numbers, "most": self.most, "alone": alone, **self.data}
 
 
 class _MotorCase(NamedTuple):
@@ -117,17 +110,19 @@ class _MotorCase(NamedTuple):
     Attributes:
         frame: of the agents.
         chain: of their position.
-        path: what the leader's path asks.
-        led: the leader's start off its path, and its speeds.
+        kind: of the argument about the leader's path.
+        demands: of that path, on each slice of time.
+        leader: its start off its path, and its speeds.
         speeds: of the agents.
-        base: what agents are asked for that start as their leader.
+        base: the demands of agents that start as their leader.
         starts: of the agents.
     """
 
     frame: Airframe
     chain: Chain
-    path: "_Path"
-    led: Pushed
+    kind: Kind
+    demands: tuple[MotorDemand, ...]
+    leader: Pushed
     speeds: tuple[Fraction, Fraction, Fraction]
     base: tuple[MotorDemand, ...]
     starts: Sequence[Pushed]
@@ -138,13 +133,13 @@ class _MotorCase(NamedTuple):
         chain, graph = run.chain(0), run.parts.graph
         speeds = _speeds([run.speed(k) for k in range(4)])
         off = run.flat[list(graph.leaders)] - run.ahead
-        led = _largest([_start(each) for each in off])
-        led = led._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
-        path = _path(run.leader, run.parts.model, run.settings.horizon, chain)
-        base = _pushed(chain, path.asked, led, speeds)
+        leader = _largest([_start(flat) for flat in off])
+        leader = leader._replace(speeds=_speeds([run.own_speed(k) for k in range(4)]))
+        kind, demands = _path_demands(run.leader, run.parts.model, run.settings.horizon, chain)
+        base = _pushed(chain, demands, leader, speeds)
         away = (run.flat - run.flat[list(graph.nearest_leader())])[list(graph.followers)]
-        starts = [_start(each) for each in np.unique(away, axis=0)]
-        return cls(frame, chain, path, led, speeds, base, starts)
+        starts = [_start(flat) for flat in np.unique(away, axis=0)]
+        return cls(frame, chain, kind, demands, leader, speeds, base, starts)
 
 
 def motors_suffice_for(run: StoppingRun) -> bool:
@@ -156,34 +151,34 @@ def motors_suffice_for(run: StoppingRun) -> bool:
     return _from(case)[0].within(Fraction(frame.motor_thrust))
 
 
-def strain_of(run: StoppingRun) -> LoadLine:
-    """Return whether the motors of a run's agents suffice, by T5 with limits."""
+def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
+    """Return the load of the motors of a run's agents, if they suffice, and its line."""
     frame, reason = run.parts.model.airframe, _beyond(run)
     if frame is None or reason:
-        return LoadLine(None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN))
+        return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN)
     case = _MotorCase.of(run, frame)
     found, starts = _from(case)
-    kind, most = case.path.kind, Fraction(frame.motor_thrust)
+    kind, most = case.kind, Fraction(frame.motor_thrust)
     number = None if found.slope is None else float(found.least), _shown(found)
     if not found.within(most):
-        text = "from these starts the motors are not shown to give what is asked"
-        text += f": {number[1]}" if number[1] else ", and the thrust not to vanish"
+        text = "the motors are not proved to suffice from these starts"
+        text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
         remedy += "to the leader's velocity and attitude; `echelon design` finds some"
         # Without a reason: a promise of agents without limits is one too.
-        return LoadLine(None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy))
+        return None, fails(Hypothesis.LIMITS, kind, text, *number, remedy=remedy)
     ahead = _ahead(frame, run.ahead)
-    strain = MotorLoad(
+    load = MotorLoad(
         kind,
         float_below(found.least),
         float_above(found.largest),
         float(most),
         float_above(found.tilt),
         _alone(frame, case.chain, case.base, ahead),
-        _told(case, run.law.roots_for(3), starts, ahead),
+        _data(case, run.law.roots_for(3), starts, ahead),
     )
-    text = "the motors give what is asked from these starts, all the way"
-    return LoadLine(strain, holds(Hypothesis.LIMITS, kind, text, *number))
+    text = "the motors suffice from these starts at all times"
+    return load, holds(Hypothesis.LIMITS, kind, text, *number)
 
 
 def _beyond(run: StoppingRun) -> str:
@@ -207,21 +202,18 @@ def _shown(found: Motors) -> str:
 # ---- the path ------------------------------------------------------------------------------------
 
 
-class _Path(NamedTuple):
-    kind: Kind
-    asked: tuple[MotorDemand, ...]
-
-
 @memoize
-def _path(leader: StoppingLeader, model: ControlAffine, horizon: float, chain: Chain) -> _Path:
-    """Return what a leader's path asks on each slice of time."""
+def _path_demands(
+    leader: StoppingLeader, model: ControlAffine, horizon: float, chain: Chain
+) -> tuple[Kind, tuple[MotorDemand, ...]]:
+    """Return the demands of a leader's path on each slice of time, and the kind of argument."""
     pieces = pieces_of(leader, model, horizon, _OUTPUTS, max(_DEGREES))
     spans = ((piece.begin, piece.end) for piece in slices_of(chain))
-    return _Path(pieces.kind, tuple(_asked(pieces, *span) for span in spans))
+    return pieces.kind, tuple(_demand(pieces, *span) for span in spans)
 
 
-def _asked(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand:
-    """Return what a path asks in a stretch of time."""
+def _demand(pieces: Pieces, begin: Fraction, end: Fraction | None) -> MotorDemand:
+    """Return the demand of a path in a stretch of time."""
     rows = pieces.between(begin, end)
 
     def most(order: int, *outputs: int) -> Fraction:
@@ -261,12 +253,12 @@ def _largest(starts: Sequence[Pushed]) -> Pushed:
 
 @memoize
 def _pushed(
-    chain: Chain, path: tuple[MotorDemand, ...], led: Pushed, speeds: tuple[Fraction, ...]
+    chain: Chain, path: tuple[MotorDemand, ...], leader: Pushed, speeds: tuple[Fraction, ...]
 ) -> tuple[MotorDemand, ...]:
     """Return what is asked of agents that start as their leader, on each slice."""
     own = _STILL._replace(speeds=speeds)
     pairs = zip(slices_of(chain), path, strict=True)
-    return tuple(add_pushes(piece, asked, (led, own)) for piece, asked in pairs)
+    return tuple(add_pushes(piece, demand, (leader, own)) for piece, demand in pairs)
 
 
 def _from(case: _MotorCase) -> tuple[Motors, Sequence[Pushed]]:
@@ -342,20 +334,20 @@ def _alone(
     )
 
 
-def _told(
+def _data(
     case: _MotorCase, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
 ) -> dict[str, Any]:
-    """Return what the strain was computed of, ready for JSON."""
+    """Return what the load was computed of, ready for JSON."""
     return {
         "airframe": case.frame._asdict(),
         "roots": list(roots),
         "speeds": [float(s) for s in case.speeds],
-        "leader": _numbers(case.led),
+        "leader": _numbers(case.leader),
         "starts": [_numbers(start) for start in starts],
         "ahead": {name: float(x) for name, x in ahead._asdict().items()},
         "path": [
-            [float(piece.begin), *(float(x) for part in asked for x in _flat(part))]
-            for piece, asked in zip(slices_of(case.chain), case.path.asked, strict=True)
+            [float(piece.begin), *(float(x) for part in demand for x in _flat(part))]
+            for piece, demand in zip(slices_of(case.chain), case.demands, strict=True)
         ],
     }
 

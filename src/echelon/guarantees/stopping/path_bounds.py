@@ -57,8 +57,8 @@ def pieces_of(
 ) -> Pieces:
     """Return what outputs of a leader's path and their derivatives are until the horizon (s).
 
-    They are enclosed in rationals where the path is made of what has an enclosure, and else seen at
-    samples. A leader without a reference stays where its trim is, and nothing of it moves.
+    They are enclosed in rationals where the path has an enclosure, and else the range of samples. A
+    leader without a reference stays where its trim is, and nothing of it moves.
     """
     if leader.reference is None:
         k = [leader.ready.chains.outputs.index(name) for name in outputs]
@@ -82,9 +82,9 @@ def _pieces(reference: Guide, horizon: float, outputs: tuple[str, ...], order: i
             pass
     fine = np.linspace(0.0, horizon, count * _SAMPLES + 1)
     every = jax.jit(jax.vmap(lambda t: reference.derivatives(t, order, outputs)))
-    seen = np.asarray(every(jnp.asarray(fine)))
-    cut = [seen[k * _SAMPLES : (k + 1) * _SAMPLES + 1] for k in range(count)]
-    return Pieces(Kind.SAMPLES, times, tuple(map(_seen, cut)))
+    samples = np.asarray(every(jnp.asarray(fine)))
+    cut = [samples[k * _SAMPLES : (k + 1) * _SAMPLES + 1] for k in range(count)]
+    return Pieces(Kind.SAMPLES, times, tuple(map(_range_of, cut)))
 
 
 def _enclosed(
@@ -103,7 +103,7 @@ def _enclosed(
     return Pieces(Kind.PROOF, cut, found)
 
 
-def _seen(values: np.ndarray) -> tuple[tuple[Interval, ...], ...]:
+def _range_of(values: np.ndarray) -> tuple[tuple[Interval, ...], ...]:
     """Return the range of samples (T, order + 1, m)."""
     both = np.stack([values.min(axis=0), values.max(axis=0)], axis=-1)
     return tuple(tuple(Interval(*map(Fraction, pair)) for pair in row) for row in both.tolist())

@@ -16,8 +16,8 @@ from echelon.guarantees.stopping.stopping_run import (
     StoppingRun,
     agreement_modes,
     condition_lines,
-    drift_reason,
-    stopping_of,
+    leader_drift_line,
+    stopping_run_of,
 )
 from echelon.guarantees.stopping.tube import Tube, tube_of
 from echelon.simulation.engine.parts import Parts
@@ -46,10 +46,10 @@ class StoppingPromise(Promise):
     def of(cls, prepared: Prepared, settings: Settings, brief: bool = False) -> "StoppingPromise":
         """Return what is guaranteed of prepared parts; `brief` leaves out arrival and motors."""
         parts, states = prepared.parts, prepared.problem.states
-        run, leaders = stopping_of(parts, settings, states), leaders_of(parts, states)
+        run, leaders = stopping_run_of(parts, settings, states), leaders_of(parts, states)
         case = Case(parts, settings, loop_of(parts), leaders)
-        found, drifts = tube_of(run, brief), drift_reason(run)
-        lines = [*agent_lines(case), *condition_lines(run), *found.lines]
+        (tube, tube_lines), drifts = tube_of(run, brief), leader_drift_line(run)
+        lines = [*agent_lines(case), *condition_lines(run), *tube_lines]
         lines += [drifts] if drifts is not None else []
         by_name = {cast(Hypothesis, x.statement): x for x in lines}
         against = any(line.fails and line.reason for line in by_name.values())
@@ -63,7 +63,7 @@ class StoppingPromise(Promise):
             # In float64, which a law computes in only here.
             coupling=run.coupling,
             hold=run.longest_step,
-            tube=None if against else found.tube,
+            tube=None if against else tube,
         )
 
     @classmethod

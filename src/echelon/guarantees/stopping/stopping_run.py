@@ -120,7 +120,7 @@ class StoppingRun(NamedTuple):
         return min(self.leader.speed_of(output), c * float(away))
 
 
-def stopping_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun:
+def stopping_run_of(parts: Parts, settings: Settings, states: Array) -> StoppingRun:
     """Return a run of prepared parts under the law, from states (N, n)."""
     drive = parts.drive
     assert isinstance(drive, Laws) and isinstance(drive.follower, StoppingPoint)
@@ -153,15 +153,15 @@ def condition_lines(run: StoppingRun) -> Iterator[Statement]:
     yield _offsets_line(run)
     text = "in flat coordinates every agent is linear, with or without a trim"
     yield unneeded(Hypothesis.SMOOTH, _PROOF, text)
-    text = f"feedback makes chains of all {n} states and the integrators before inputs"
+    text = f"feedback turns all {n} states and the integrators before inputs into chains"
     yield unneeded(Hypothesis.DETECTABLE, _PROOF, text)
     yield holds(Hypothesis.MATCHED_MOTION, _PROOF, run.law.information[1])
-    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling will do", c, f"c {c:.4g}, edge 0")
-    text = "the slower of the slowest root and c lambda_min; far off, the `speed` is what counts"
+    yield holds(Hypothesis.COUPLING, _PROOF, "any coupling suffices", c, f"c {c:.4g}, edge 0")
+    text = "the slower of the slowest root and c lambda_min; far away the `speed` limits it"
     if run.parts.graph.schedule is not None:
-        text = "the slower of the slowest root and of what is left after a period, or in the end"
+        text = "the slower of the slowest root and of the agreement over a period, or eventually"
     yield holds(Hypothesis.DISAGREEMENT_DECAY, _PROOF, text, -run.rate, f"{-run.rate:.3g} 1/s")
-    text = "the law is linear in flat coordinates wherever it goes"
+    text = "the law is linear in flat coordinates everywhere"
     yield unneeded(Hypothesis.ALONG_PATH, _PROOF, text)
     yield _step_line(run)
     if run.parts.graph.schedule is not None:
@@ -173,10 +173,12 @@ def _switching_line(run: StoppingRun) -> Statement:
     """Say along which edges the leader reaches everybody: checked when the graph was made."""
     schedule = run.parts.graph.schedule
     assert schedule is not None
-    text = f"the leader reaches everybody along the edges from {schedule.starts[-1]:g} s on"
+    text = f"the leader reaches every agent along the edges from {schedule.starts[-1]:g} s on"
     if schedule.period is not None:
-        text = f"the leader reaches everybody along the edges of any {schedule.period:g} s together"
-    text += ", and zeta' is told in spite of edges that are not there"
+        text = (
+            f"the leader reaches every agent along the edges of any {schedule.period:g} s together"
+        )
+    text += ", and zeta' is received whatever edges are present"
     return holds(Hypothesis.SWITCHING, _PROOF, text, run.rate)
 
 
@@ -187,9 +189,9 @@ def _offsets_line(run: StoppingRun) -> Statement:
     others = (names[k] for k in offset if names[k] not in run.law.ready.chains.outputs)
     broken = next(others, None)
     if broken is None:
-        text = "of the flat outputs they are; those of other states are none"
+        text = "offsets of flat outputs are symmetries"
         return holds(Hypothesis.SYMMETRY, _PROOF, text)
-    text, remedy = f"the offset of `{broken}` is none of a flat output", "offset flat outputs only"
+    text, remedy = f"the offset of `{broken}` is not of a flat output", "offset flat outputs only"
     reason = "an offset is no symmetry of the law"
     return fails(Hypothesis.SYMMETRY, _PROOF, text, remedy=remedy, reason=reason)
 
@@ -200,14 +202,14 @@ def _step_line(run: StoppingRun) -> Statement:
     name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
     share = c * run.law.reach.heaviest * dt
     radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
-    led = float(run.leader.strength(dt)) * dt
-    if led > 1.0 + 1e-12:
+    own = float(run.leader.strength(dt)) * dt
+    if own > 1.0 + 1e-12:
         # Its distance from its path would grow, on which the tube and the motors rest.
-        text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {led:.3g} is above 1"
+        text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {own:.3g} is above 1"
         remedy = f"lower `leader.coupling` to {1.0 / dt:.4g}"
-        return fails(name, Kind.LINEARIZATION, text, led, shown, remedy=remedy, reason=text)
+        return fails(name, Kind.LINEARIZATION, text, own, shown, remedy=remedy, reason=text)
     if share <= 1.0 + 1e-12 and radius < 1.0:
-        text = f"Euler's step of zeta grows nowhere; spectral radius {radius:.4g} a step"
+        text = f"Euler's step of zeta does not grow; spectral radius {radius:.4g} a step"
         return holds(name, Kind.LINEARIZATION, text, share, shown)
     text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
     remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
@@ -221,12 +223,12 @@ def _step_line(run: StoppingRun) -> Statement:
 
 def _radius(run: StoppingRun) -> float:
     """Return the spectral radius of a step in flat coordinates, the highest derivatives held."""
-    led = np.array([run.leader.strength(run.settings.dt)])
-    followed = _held(run, run.law.ready, run.coupling * _strengths(run))
-    return max(followed, _held(run, run.leader.ready, led))
+    strength = np.array([run.leader.strength(run.settings.dt)])
+    followed = _step_radius(run, run.law.ready, run.coupling * _strengths(run))
+    return max(followed, _step_radius(run, run.leader.ready, strength))
 
 
-def _held(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
+def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
     """Return the same of agents that feel what is off by so much each (K,), 1/s."""
     found = 0.0
     for k, degree in enumerate(loop.chains.degrees):
@@ -261,7 +263,7 @@ def agreement_modes(graph: Graph, law: StoppingPoint) -> Array:
     return values[np.abs(values) > 1e-12 * np.abs(values).max()]
 
 
-def drift_reason(run: StoppingRun) -> Statement | None:
+def leader_drift_line(run: StoppingRun) -> Statement | None:
     """Return why what lasts carries the leader away for ever; None where it does not."""
     world, model, loop = run.parts.world, run.parts.model, run.leader.ready
     if world.ideal:
@@ -285,7 +287,7 @@ def _drifts(name: str, current: float, force: float, s: float, inner: bool) -> S
     """Say what a current, and a force by what it asks of agreement, do to a leader of speed s."""
     asked = current + force
     what = " and ".join(word for word, d in (("current", current), ("push", force)) if d)
-    text = f"a lasting {what} along `{name}` asks agreement for {asked:.3g} of speed, the "
+    text = f"a lasting {what} along `{name}` demands a speed of {asked:.3g} from agreement, the "
     text += f"leader's is {s:.3g}, and it can drift away for ever"
     helps = "" if inner and current >= s else "set `observer: true`, or "
     remedy = f"{helps}raise the leader's `speed` above {asked:.3g}"

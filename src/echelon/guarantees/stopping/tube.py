@@ -1,4 +1,4 @@
-"""What T5 promises of a run: how far agents go, from which starts, and when they are there."""
+"""The tube of theorem T5: how far agents go, from which starts, and when they arrive."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,33 +10,33 @@ import numpy as np
 from echelon.core.errors import GainError
 from echelon.core.statement import Hypothesis, Statement, fails, holds, unneeded
 from echelon.core.words import Feedforward, Kind, Theorem
-from echelon.guarantees.stopping.arrival import Arrival, arrival_of
+from echelon.guarantees.stopping.arrival import arrival_of
 from echelon.guarantees.stopping.borders import Border, border_of
 from echelon.guarantees.stopping.flat_everywhere import bounds_of
-from echelon.guarantees.stopping.motor_load import MotorLoad, strain_of
+from echelon.guarantees.stopping.motor_load import MotorLoad, motor_load_of
 from echelon.guarantees.stopping.stopping_run import StoppingRun
 
 _PROOF = Kind.PROOF
 
 
-_ANY = ("any graph in which the leader reaches everybody", "this graph")
+_ANY = ("any graph in which the leader reaches every agent", "this graph")
 
 
 class Tube(NamedTuple):
-    """What is promised by T5.
+    """What T5 guarantees.
 
     Attributes:
         kind: of the argument.
-        rate: at which errors shrink in the end, 1/s.
+        rate: at which errors decay eventually, 1/s.
         gains: of the longest chain, sup |v^(l)| over sup |w| for l = 0, 1, ...
         left: how far the nearest agent stays from the border of the chart, at least, in the unit of
             the bounded derivative; infinite where there is no border.
         steepest: how far the bounded output's speed may be off the leader's at the start.
-        arrival: when all are within 1 cm, if it can be told and was asked for.
+        arrival: the time (s) from which on all followers are within 1 cm of their goals; None where
+            it is not known, or was left out.
         who: which starts are meant, in words.
         borders: what is claimed of each border, and of what it was computed; ready for JSON.
-        strain: what the motors give; None where they have no limits, or may not suffice, or were
-            not asked for.
+        motor_load: None where motors have no limits, may not suffice, or were left out.
         graphs: which graphs are meant, and this one, in words.
     """
 
@@ -45,10 +45,10 @@ class Tube(NamedTuple):
     gains: tuple[float, ...]
     left: float
     steepest: float
-    arrival: Arrival | None
+    arrival: float | None
     who: str
     borders: tuple[dict[str, Any], ...]
-    strain: MotorLoad | None
+    motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
 
     @property
@@ -58,81 +58,75 @@ class Tube(NamedTuple):
 
     def sentence(self) -> str:
         """Return what is promised, in one sentence."""
-        when = (
-            ""
-            if self.arrival is None
-            else f"; these starts are within 1 cm from {self.arrival.time:.3g} s on"
-        )
-        return (
-            f"{self.kind.value}: from {self.who}, errors go to zero for any number of agents and "
-            f"{self.graphs[0]}, where the model is exact and zeta' "
-            f"is told at all times (T5); on {self.graphs[1]} in the end at "
-            f"{self.rate:.3g} 1/s or faster{when}."
-            + ("" if self.strain is None else f" {self.strain.sentence()}")
-        )
+        text = f"{self.kind.value}: errors converge to zero from {self.who}, for any number of "
+        text += f"agents and {self.graphs[0]}, if the model is exact and zeta' is received at all "
+        text += f"times (T5). On {self.graphs[1]} they decay at {self.rate:.3g} 1/s or faster "
+        text += "eventually"
+        if self.arrival is not None:
+            text += f"; from these starts all stay within 1 cm after {self.arrival:.3g} s"
+        return f"{text}." if self.motor_load is None else f"{text}. {self.motor_load.sentence()}"
 
     def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
         finite = {name: getattr(self, name) for name in ("left", "steepest")}
         finite = {name: None if math.isinf(x) else x for name, x in finite.items()}
-        when = None if self.arrival is None else self.arrival.time
         return {
             "format": "echelon tube 1",
             "who": self.who,
             "gains": list(self.gains),
             **finite,
-            "within_1_cm_from": when,
+            "within_1_cm_from": self.arrival,
             "borders": list(self.borders),
-            "motors": None if self.strain is None else self.strain.as_mapping(),
+            "motors": None if self.motor_load is None else self.motor_load.as_mapping(),
         }
 
 
-class _Found(NamedTuple):
-    """The tube, if it holds, and the lines that say so."""
+def tube_of(run: StoppingRun, brief: bool = False) -> tuple[Tube | None, list[Statement]]:
+    """Return the tube, if it holds, and its lines: the inner gains, the set, and the starts.
 
-    tube: Tube | None
-    lines: tuple[Statement, ...]
-
-
-def tube_of(run: StoppingRun, briefly: bool = False) -> _Found:
-    """Return what T5 promises, and its lines: the inner gains, the set, and the starts.
-
-    And when agents arrive and what motors give, which is most of the work and on which nothing else
-    rests, unless it is to be said `briefly`.
+    Arrival and motors are most of the work and nothing rests on them: `brief` leaves them out.
     """
     model, chains = run.parts.model, run.law.ready.chains
     longest = int(np.argmax(chains.degrees))
     try:
-        found = run.chain(longest)
-        gains = tuple(float(found.gain(k)) for k in range(max(1, len(found.powers) + 1)))
+        chain = run.chain(longest)
+        gains = tuple(float(chain.gain(k)) for k in range(max(1, len(chain.powers) + 1)))
         bounds = bounds_of(model, chains)
         borders = None if bounds is None else [border_of(run, b) for b in bounds]
     except GainError as error:
         text = str(error).rstrip(".")
-        remedy = "choose `roots` of a larger common unit" if "unit" in text else "let them be alike"
+        remedy = "choose `roots` of a larger common unit" if "unit" in text else "use equal starts"
         return _nothing(text, remedy)
-    text = "T5: of what agreement asks, at most, in speed and its derivatives: no size of the "
+    text = "T5: largest speed and derivatives of outputs per speed that agreement asks, for any "
     number = gains[-1], ", ".join(f"{gain:.4g}" for gain in gains)
-    inner = holds(Hypothesis.REGION, _PROOF, f"{text}formation", *number)
+    inner = holds(Hypothesis.REGION, _PROOF, f"{text}size of the formation", *number)
     if borders is None:
         name = f"`{type(model).__name__}`"
-        text = f"{name} does not say where its flat coordinates end"
+        text = f"{name} does not state where its flat coordinates end"
         return _nothing(text, "state `flat_chains` and `flat_bounds` in the model", inner)
     left = min((b.left for b in borders), default=Fraction(10**9))
     kind = min((b.kind for b in borders), key=lambda kind: kind.strength, default=_PROOF)
     steepest = min((b.steepest for b in borders), default=math.inf)
     lines = [inner, *_set_lines(run, borders, kind)]
     if any(line.fails for line in lines):
-        return _Found(None, tuple(lines))
-    who = _who(run, borders)
-    far = math.inf if not borders else float(left)
-    told = tuple(border.told for border in borders)
-    tube = Tube(kind, run.rate, gains, far, steepest, None, who, told, None, _graphs(run))
-    if briefly:
-        return _Found(tube, tuple(lines))
+        return None, lines
+    tube = Tube(
+        kind,
+        run.rate,
+        gains,
+        math.inf if not borders else float(left),
+        steepest,
+        None,
+        _who(run, borders),
+        tuple(border.data for border in borders),
+        None,
+        _graphs(run),
+    )
+    if brief:
+        return tube, lines
     arrival = arrival_of(run.flat, run.parts.graph, run.law, run.coupling, _positions(run))
-    strain, line = strain_of(run)
-    return _Found(tube._replace(arrival=arrival, strain=strain), (*lines, line))
+    motor_load, line = motor_load_of(run)
+    return tube._replace(arrival=arrival, motor_load=motor_load), [*lines, line]
 
 
 def _graphs(run: StoppingRun) -> tuple[str, str]:
@@ -143,35 +137,35 @@ def _graphs(run: StoppingRun) -> tuple[str, str]:
         return f"any tree in which none is more than {run.links} links from a leader", "this one"
     if schedule is None:
         return _ANY
-    every = "in the end" if schedule.period is None else "in every period"
+    every = "eventually" if schedule.period is None else "in every period"
     along = "along neighbours nearer to it " if law.leaderward else ""
-    return f"any graphs that take turns and by which the leader reaches everybody {along}{every}", (
+    return f"any switching graphs over which the leader reaches every agent {along}{every}", (
         "these"
     )
 
 
-def _nothing(text: str, remedy: str, *before: Statement) -> _Found:
+def _nothing(text: str, remedy: str, *before: Statement) -> tuple[None, list[Statement]]:
     """Return that no tube is known, and why."""
     reason = f"{text}, so no tube is known"
     name = Hypothesis.SET if before else Hypothesis.REGION
     lines = [fails(name, _PROOF, text, None, "none", remedy=remedy, reason=reason)]
     others = (Hypothesis.SET, Hypothesis.STARTS) if not before else (Hypothesis.STARTS,)
     lines += [unneeded(each, _PROOF, "needs a tube") for each in others]
-    return _Found(None, (*before, *lines))
+    return None, [*before, *lines]
 
 
-_NO_BORDER = "no border of flat coordinates can be met"
+_NO_BORDER = "flat coordinates have no border"
 
 
 def _set_lines(run: StoppingRun, borders: Sequence[Border], kind: Kind) -> Iterator[Statement]:
     """Yield what set of starts is certified, and whether this run's lie in it."""
     if not borders:
-        text = "its flat coordinates have no border: any state is a start"
+        text = "its flat coordinates have no border: any start is allowed"
         yield holds(Hypothesis.SET, kind, text, math.inf, "everywhere")
         yield holds(Hypothesis.STARTS, kind, _NO_BORDER, 0.0, "inside")
         return
     nearest = min(borders, key=lambda b: b.left)
-    yield _room_line(run, nearest, kind)
+    yield _set_line(run, nearest, kind)
     if not nearest.steepest > 0.0:
         yield unneeded(Hypothesis.STARTS, kind, "there is no set")
         return
@@ -187,7 +181,7 @@ def _set_lines(run: StoppingRun, borders: Sequence[Border], kind: Kind) -> Itera
     yield fails(Hypothesis.STARTS, kind, text, *number, remedy=remedy, reason=text)
 
 
-def _room_line(run: StoppingRun, border: Border, kind: Kind) -> Statement:
+def _set_line(run: StoppingRun, border: Border, kind: Kind) -> Statement:
     """Say how far starts may be off behind a leader that keeps to its path."""
     bound, steepest = border.bound, border.steepest
     number = steepest, f"{steepest:.3g} off"
@@ -220,11 +214,11 @@ def _who(run: StoppingRun, borders: Sequence[Border]) -> str:
         # Of the leader's speed against its path no more is used than what these starts ask for.
         free = f"{free} of the followers, with {within}, their {speeds} as at these starts"
         return f"{free}, and the leader as at these starts"
-    off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_turned(b)}" for b in borders)
+    off = " and ".join(f"{b.speeds} within {b.steepest:.3g}{_angle(b)}" for b in borders)
     return f"{free}, with {within}, and {off} of the leader's, which keeps to its path there"
 
 
-def _turned(border: Border) -> str:
+def _angle(border: Border) -> str:
     """Return by what angle a velocity of the leader's size may be off it, in words."""
     if math.isinf(border.turn):
         return ""

@@ -1,29 +1,29 @@
 """Machine code of a step: from a graph of scalars to vectors, to the loops around them."""
 
-from echelon.simulation.codegen.angle_differences import winds
-from echelon.simulation.codegen.block_copy import move
-from echelon.simulation.codegen.factoring import shortened
-from echelon.simulation.codegen.ir_blocks import SLOTS, TURN, Body, Plan, stride
+from echelon.simulation.codegen.angle_differences import has_flag
+from echelon.simulation.codegen.block_copy import copy_rows
+from echelon.simulation.codegen.factoring import factored
+from echelon.simulation.codegen.kernel_plan import SLOTS, TASK, Body, Plan, stride
 from echelon.simulation.codegen.kernel_text import program
 from echelon.simulation.codegen.machine_code import Code, aligned, is_installed, vectors
-from echelon.simulation.codegen.tape import fed_widths, from_tape
-from echelon.simulation.codegen.uniform_values import shared
+from echelon.simulation.codegen.scheduling import shared
+from echelon.simulation.codegen.tape import contribution_widths, from_tape
 
 __all__ = [
     "SLOTS",
-    "TURN",
+    "TASK",
     "Body",
     "Code",
     "Plan",
     "aligned",
-    "fed_widths",
+    "contribution_widths",
+    "copy_rows",
+    "factored",
     "from_tape",
+    "has_flag",
     "is_installed",
-    "move",
     "program",
     "shared",
-    "shortened",
     "stride",
     "vectors",
-    "winds",
 ]

@@ -1,10 +1,10 @@
-"""The code of the usual step, and what must hold of it.
+"""The fast path of a step, and the conditions under which it is correct.
 
-Much of a step is written for what seldom happens: an angle beyond 45 degrees, a motor at its limit.
-A truth that is marked as `rare` may be taken to hold always, since what it then chooses is right
-for every number, or never, as long as it does not hold. So a step is written twice: as it usually
-is, without all that, and whole. The first is tried, and left for the second where a lane is not as
-usual. What both make is the same to the bit.
+Much of a step is written for unlikely cases: an angle beyond 45 degrees, a motor at its limit. A
+truth marked as `unlikely` may always be assumed to hold, because what it then selects is correct
+for every number; while it does not hold, it may be assumed not to hold. So a step is written twice:
+without the unlikely cases, and in full. The first is tried, and left for the second if a lane needs
+it. Both compute the same bits.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,48 +14,49 @@ from echelon.simulation.scalars.scalar_graph import Node, rewritten
 
 
 class FastPath(NamedTuple):
-    """What usually is.
+    """A step without its unlikely cases.
 
     Attributes:
-        nodes: a node of the whole step -> what it then is.
-        levels: truths of which none may hold; each level rests on what those before it assume.
+        nodes: a node of the full step -> its node in the fast path.
+        levels: truths of which none may hold; each level depends on the assumptions of those
+            before.
     """
 
     nodes: Mapping[Node, Node]
     levels: Sequence[Sequence[Node]]
 
 
-def whole(results: Sequence[Node]) -> Mapping[Node, Node]:
-    """Return what nodes are where everything that is rare is taken to happen."""
-    return rewritten(results, lambda node, args: True if node.op == "rare" else None)
+def general_case(results: Sequence[Node]) -> Mapping[Node, Node]:
+    """Return each node with every unlikely truth assumed to hold, which is always correct."""
+    return rewritten(results, lambda node, args: True if node.op == "unlikely" else None)
 
 
-def usual(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
-    """Return what nodes are where nothing happens that is rare.
+def find_fast_path(results: Sequence[Node], choices: Iterable[tuple[Node, bool]]) -> FastPath:
+    """Return each node with every unlikely truth assumed not to hold.
 
     Args:
-        results: what is wanted.
-        choices: truths, and whether each seldom holds or seldom does not.
+        results: of the step.
+        choices: further truths, and for each whether it is unlikely to hold, or not to hold.
     """
-    sides, depths, found = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
+    sides, depths, excluded = dict(choices), dict[Node, int](), list[tuple[int, Node]]()
 
     def assume(node: Node, args: Sequence[Node]) -> Node | bool | None:
-        # What is the same for all agents costs next to nothing, and is computed as a whole.
+        # What is the same for all agents costs almost nothing, and is computed in full.
         depth = max((depths[a] for a in node.args), default=0)
         depths[node] = depth
-        if node.op == "rare":
+        if node.op == "unlikely":
             if node.uniform:
                 return True
-            found.append((depth, args[0]))
+            excluded.append((depth, args[0]))
             depths[node] = depth + 1
             return False
         if node not in sides:
             return None
-        made = node.graph.make(node.op, *args)
-        found.append((depth, made if sides[node] else node.graph.make("not", made)))
+        truth = node.graph.make(node.op, *args)
+        excluded.append((depth, truth if sides[node] else node.graph.make("not", truth)))
         depths[node] = depth + 1
         return not sides[node]
 
-    made = rewritten(results, assume)
-    levels = [[n for d, n in found if d == depth] for depth in sorted({d for d, _ in found})]
-    return FastPath(made, [list(dict.fromkeys(level)) for level in levels])
+    nodes = rewritten(results, assume)
+    levels = [[n for d, n in excluded if d == depth] for depth in sorted({d for d, _ in excluded})]
+    return FastPath(nodes, [list(dict.fromkeys(level)) for level in levels])

@@ -1,4 +1,4 @@
-"""Code for this machine from text for LLVM, kept between processes, and called by address."""
+"""Machine code from text for LLVM, cached on disk, and called by address."""
 
 import ctypes
 import hashlib
@@ -22,7 +22,7 @@ def llvm() -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    # Here, since it comes with an extra, and takes long to load.
+    # Not at the top: it comes with an extra, and is slow to import.
     try:
         import llvmlite.binding as binding
     except ImportError:
@@ -36,7 +36,7 @@ def llvm() -> Any:
 
 
 def is_installed() -> bool:
-    """Tell whether native code can be made here."""
+    """Tell whether native code can be generated on this machine."""
     try:
         llvm()
     except MissingExtraError:
@@ -45,14 +45,14 @@ def is_installed() -> bool:
 
 
 _LINKED = platform.system() != "Windows"
-"""Whether code and constants are laid side by side: elsewhere they may lie anywhere in memory, and
-code that reaches only 2 GiB far, as the small model's does, would end the process."""
+"""Whether code and constants are linked side by side: elsewhere they may be anywhere in memory, and
+code of the small model, which reaches only 2 GiB far, would crash the process."""
 _MODEL = "small" if _LINKED else "jitdefault"
 _WIDTHS = {"avx512f": 512, "avx2": 256, "avx": 256}
 
 
 def vectors() -> str:
-    """Return what native code computes with on this machine, in words."""
+    """Return the processor and the vectors that native code uses here, in words."""
     if not is_installed():
         return "none; install `echelon-formation[fast]`"
     has = set(features().split(","))
@@ -63,19 +63,19 @@ def vectors() -> str:
 
 @cache
 def features() -> str:
-    """Return what this machine's processor has, as LLVM writes it."""
+    """Return the features of this machine's processor, as LLVM writes them."""
     return llvm().get_host_cpu_features().flatten()
 
 
 @final
 class Code:
-    """A kernel as machine code, which lives as long as this object."""
+    """A kernel as machine code, which exists as long as this object."""
 
     def __init__(self, text: str, cache_folder: Path | None = None) -> None:
-        """Compile a text, or take what was compiled of it before."""
+        """Compile a text, or load its code from the cache."""
         binding = llvm()
         target = binding.Target.from_default_triple()
-        # By the small model a constant is an operand, and not an address to be kept first.
+        # In the small model a constant is an operand; no address is loaded first.
         self._machine = target.create_target_machine(
             cpu=binding.get_host_cpu_name(),
             features=features(),
@@ -83,20 +83,20 @@ class Code:
             codemodel=_MODEL,
             reloc="pic" if _LINKED else "default",
         )
-        stored = _stored(text, binding, cache_folder)
-        made = None if stored is None else disk_cache.read(stored)
-        if made is None:
-            made = self._compile(binding, text)
+        stored = _cache_file(text, binding, cache_folder)
+        object_code = None if stored is None else disk_cache.read(stored)
+        if object_code is None:
+            object_code = self._compile(binding, text)
             if stored is not None:
-                disk_cache.write(stored, made)
+                disk_cache.write(stored, object_code)
         self._jit = binding.create_lljit_compiler(self._machine, use_jit_link=_LINKED)
         name = f"kernel_{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-        builder = binding.JITLibraryBuilder().add_object_img(made).export_symbol("run")
+        builder = binding.JITLibraryBuilder().add_object_img(object_code).export_symbol("run")
         self._library = builder.link(self._jit, name)
         self._run = ctypes.CFUNCTYPE(None, ctypes.c_void_p)(self._library["run"])
 
     def call(self, slots: np.ndarray) -> None:
-        """Run the kernel on what 64-bit slots hold: addresses and whole numbers, as in `SLOTS`."""
+        """Run the kernel with the arguments in 64-bit slots: addresses and whole numbers."""
         self._run(slots.ctypes.data)
 
     def _compile(self, binding: Any, text: str) -> bytes:
@@ -104,7 +104,7 @@ class Code:
             module = binding.parse_assembly(text)
             module.verify()
         except RuntimeError as error:
-            raise Unsupported(f"what LLVM refuses ({error_summary(error)})") from error
+            raise Unsupported(f"code that LLVM rejects ({error_summary(error)})") from error
         options = binding.create_pipeline_tuning_options(speed_level=2)
         options.loop_vectorization = options.slp_vectorization = False
         passes = binding.create_pass_builder(self._machine, options)
@@ -112,8 +112,8 @@ class Code:
         return self._machine.emit_object(module)
 
 
-def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
-    """Return the file that holds what is made of a text on this machine."""
+def _cache_file(text: str, binding: Any, folder: Path | None) -> Path | None:
+    """Return the file of the code of a text on this machine."""
     if folder is None:
         return None
     import llvmlite
@@ -123,9 +123,9 @@ def _stored(text: str, binding: Any, folder: Path | None) -> Path | None:
     return folder / f"{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()}-native-cache"
 
 
-def aligned(shape: tuple[int, ...], dtype: np.dtype[Any] | type) -> np.ndarray:
-    """Return zeros that begin at a multiple of 64 bytes, as whole vectors are stored."""
+def aligned(shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:
+    """Return zeros that begin at a multiple of 64 bytes, as stores of vectors require."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    room = np.zeros(size + 64, np.uint8)
-    start = -room.ctypes.data % 64
-    return room[start : start + size].view(dtype).reshape(shape)
+    memory = np.zeros(size + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    return memory[start : start + size].view(dtype).reshape(shape)

@@ -1,183 +1,183 @@
-"""What neighbours read of an agent, and what each makes of it: sums over the edges."""
+"""What neighbours read of an agent, and what each computes from it: sums over the edges."""
 
 from collections.abc import Callable, Sequence
 
-from echelon.simulation.codegen.angle_differences import largeness, limits, winds, zeros
+from echelon.simulation.codegen.angle_differences import (
+    angle_flag,
+    has_flag,
+    is_zero,
+    plain_limits,
+)
+from echelon.simulation.codegen.emitter import Emitter
 from echelon.simulation.codegen.ir_blocks import (
-    Body,
     Context,
-    bytes_of,
     either,
-    far_block,
     flag,
     gather,
+    listed_block,
     load_places,
-    load_row,
     loop,
-    store_row,
-    stride,
 )
-from echelon.simulation.codegen.vector_ir import Emitter, Writer
+from echelon.simulation.codegen.kernel_plan import Body, stride
+from echelon.simulation.codegen.vector_ir import Writer
 from echelon.simulation.scalars.scalar_graph import Node, needed
 
 
 def exchange(
     w: Writer,
-    around: Context,
+    context: Context,
     body: Body,
     block: str,
-    heard: Sequence[int],
+    entries: Sequence[int],
     load: Callable[[Node], str],
 ) -> dict[int, str]:
     """Write the sums over the neighbours, slot by slot: the k-th neighbour of each agent."""
-    plan, slots = around.plan, around.slots
-    at = w.put(f"getelementptr i64, ptr {slots['neighbour_starts']}, i64 {block}")
-    after = w.put(f"getelementptr i64, ptr {at}, i64 1")
-    start, end = (w.put(f"load i64, ptr {place}") for place in (at, after))
+    plan, slots = context.plan, context.slots
+    at = w.at("i64", slots["neighbour_starts"], block)
+    after = w.at("i64", at, 1)
+    ends = w.load("i64", at), w.load("i64", after)
     first = w.put(f"mul i64 {block}, {plan.lanes}")
-    alone = 0.0 not in limits(plan).values()
-    some = _AT_ONCE if alone else len(heard)
+    plain = 0.0 not in plain_limits(plan).values()
+    some = _AT_ONCE if plain else len(entries)
 
-    def add_up(smooth: bool) -> list[str]:
-        found = list[str]()
-        for part in (heard[k : k + some] for k in range(0, len(heard), some)):
-            wanted = [body.difference[k] for k in part]
-            leaves = [n for n in needed(wanted) if n.op == "leaf" and n.value[0] == "own"]
-            own = {leaf: body.now[leaf.value[1]] for leaf in leaves}
-            mine = _own(w, around, own, block, load)
-            found += _sums(w, around, (start, end), wanted, mine, smooth)
-        return found
+    def add_up(contiguous: bool) -> list[str]:
+        totals = list[str]()
+        for part in (entries[k : k + some] for k in range(0, len(entries), some)):
+            differences = [body.difference[k] for k in part]
+            leaves = [n for n in needed(differences) if n.op == "leaf" and n.value[0] == "self"]
+            shown = {leaf: body.mirror_before[leaf.value[1]] for leaf in leaves}
+            mine = _own_entries(w, context, shown, block, load)
+            totals += _sums(w, context, ends, differences, mine, contiguous)
+        return totals
 
-    if plan.lines:
-        totals = either(w, flag(w, slots["smooth"], block), add_up)
-    elif plan.together or not alone:
+    if plan.row_major:
+        totals = either(w, flag(w, slots["contiguous"], block), add_up)
+    elif plan.batched or not plain:
         totals = add_up(False)
-    elif not (winds(plan) or plan.ahead):
-        totals = _subtract(w, around, (start, end), first, heard)
+    elif not (has_flag(plan) or plan.leaders_ahead):
+        totals = _subtract(w, context, ends, first, entries)
     else:
-        last = [plan.width - 1] * winds(plan)
-        sums = _subtract(w, around, (start, end), first, [*heard, *last])
-        plain = zeros(w, sums.pop()) if last else "true"
-        if plan.ahead:
-            plain = w.put(f"and i1 {plain}, {flag(w, slots['smooth'], block)}")
-        totals = either(w, plain, lambda plain: sums if plain else add_up(False))
-    return dict(zip(heard, totals, strict=True))
+        last = [plan.width - 1] * has_flag(plan)
+        sums = _subtract(w, context, ends, first, [*entries, *last])
+        small = is_zero(w, sums.pop()) if last else "true"
+        if plan.leaders_ahead:
+            small = w.put(f"and i1 {small}, {flag(w, slots['contiguous'], block)}")
+        totals = either(w, small, lambda small: sums if small else add_up(False))
+    return dict(zip(entries, totals, strict=True))
 
 
 _AT_ONCE = 6
-"""Entries that are added up at once, where none rests on another: so many stay in registers."""
+"""Entries that are added up at once, if none depends on another: so many stay in registers."""
 
 
 def _sums(
     w: Writer,
-    around: Context,
-    slots: tuple[str, str],
-    wanted: Sequence[Node],
+    context: Context,
+    ends: tuple[str, str],
+    differences: Sequence[Node],
     mine: dict[Node, str],
-    smooth: bool,
+    contiguous: bool,
 ) -> list[str]:
     """Write the sums of some entries of the difference over the neighbours."""
-    plan = around.plan
-    leaves = [n for n in needed(wanted) if n.op == "leaf"]
-    entries = sorted({n.value[1] for n in leaves if n.value[0] == "their"})
-    zero = [(w.vector, "zeroinitializer")] * len(wanted)
-    with loop(w, *slots, zero) as (slot, totals, on):
+    plan = context.plan
+    leaves = [n for n in needed(differences) if n.op == "leaf"]
+    entries = sorted({n.value[1] for n in leaves if n.value[0] == "neighbour"})
+    zero = [(w.vector, "zeroinitializer")] * len(differences)
+    with loop(w, *ends, zero) as (slot, totals, following):
         place = w.put(f"mul i64 {slot}, {plan.lanes}")
-        theirs = _shown(w, around, "neighbours", slot, entries, smooth)
-
-        def entry_of(leaf: Node) -> str:
-            return mine[leaf] if leaf.value[0] == "own" else theirs[leaf.value[1]]
-
-        emitter = Emitter(w, entry_of)
-        emitter.emit(wanted)
-        weight = None
-        if plan.weighted:
-            at = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
-            weight = w.put(f"load {w.vector}, ptr {at}, align {plan.lanes * bytes_of(w)}")
-        for k, node in enumerate(wanted):
+        theirs = _listed_entries(w, context, "neighbours", slot, entries, contiguous)
+        emitter = Emitter(
+            w, lambda leaf: mine[leaf] if leaf.value[0] == "self" else theirs[leaf.value[1]]
+        )
+        emitter.emit(differences)
+        weight = w.load(w.vector, context.slots["weights"], place) if plan.weighted else None
+        for k, node in enumerate(differences):
             value = emitter.value(node)
             if weight is not None:
-                value = w.put(f"fmul {w.vector} {value}, {weight}")
-            on[k] = w.put(f"fadd {w.vector} {totals[k]}, {value}")
+                value = w.operation("mul", [value, weight])
+            following[k] = w.operation("add", [totals[k], value])
     return totals
 
 
-def _own(
-    w: Writer, around: Context, own: dict[Node, Node], block: str, load: Callable[[Node], str]
+def _own_entries(
+    w: Writer, context: Context, shown: dict[Node, Node], block: str, load: Callable[[Node], str]
 ) -> dict[Node, str]:
-    """Write what the agents of a block show themselves: leaf -> a vector."""
-    if around.plan.together:
-        begin = w.put(f"mul i64 {block}, {around.plan.mirror}")
-        start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
-        return {leaf: load_row(w, start, leaf.value[1], w.lanes) for leaf in own}
-    if around.plan.lines:
+    """Write what neighbours read of the agents of a block: leaf -> a vector."""
+    if context.plan.batched:
+        start = w.part(context.mirror, block, context.plan.mirror)
+        return {leaf: w.load_row(start, leaf.value[1]) for leaf in shown}
+    if context.plan.row_major:
         first = w.put(f"mul i64 {block}, {w.lanes}")
-        return {leaf: _load_at(w, line(w, around, leaf.value[1], first), 0) for leaf in own}
-    emitter = Emitter(w, load)
-    emitter.emit(list(own.values()))
-    return {leaf: emitter.value(node) for leaf, node in own.items()}
-
-
-def _shown(
-    w: Writer, around: Context, which: str, slot: str, entries: Sequence[int], smooth: bool
-) -> dict[int, str]:
-    """Write the load of what some agents show, whose places stand in a list: entry -> a vector.
-
-    In lines they follow each other if they are smooth.
-    """
-    if around.plan.together:
-        there = far_block(w, around.slots[which], slot, around.mirror)
-        return {k: load_row(w, there, k, w.lanes) for k in entries}
-    first = w.put(f"mul i64 {slot}, {w.lanes}")
-    at = w.put(f"getelementptr i32, ptr {around.slots[which]}, i64 {first}")
-    if around.plan.lines and smooth:
-        place = w.put(f"sext i32 {w.put(f'load i32, ptr {at}, align 4')} to i64")
         return {
-            k: w.put(f"load {w.vector}, ptr {line(w, around, k, place)}, align {bytes_of(w)}")
-            for k in entries
+            leaf: w.load(w.vector, mirror_row(w, context, leaf.value[1], first), 0)
+            for leaf in shown
         }
-    if around.plan.lines:
-        places = load_places(w, around.slots[which], first)
-        return {k: gather(w, line(w, around, k), _kept(w, around, k, places), 0) for k in entries}
-    others = [_their(w, around, at, lane, around.plan.ahead) for lane in range(w.lanes)]
-    found = dict[int, str]()
+    emitter = Emitter(w, load)
+    emitter.emit(list(shown.values()))
+    return {leaf: emitter.value(node) for leaf, node in shown.items()}
+
+
+def _listed_entries(
+    w: Writer,
+    context: Context,
+    which: str,
+    slot: str,
+    entries: Sequence[int],
+    contiguous: bool,
+) -> dict[int, str]:
+    """Write the load of what is read of agents whose places are in a list: entry -> a vector.
+
+    In a row-major mirror they follow each other if they are contiguous.
+    """
+    plan, slots = context.plan, context.slots
+    if plan.batched:
+        there = listed_block(w, slots[which], slot, context.mirror)
+        return {k: w.load_row(there, k) for k in entries}
+    first = w.put(f"mul i64 {slot}, {w.lanes}")
+    at = w.at("i32", slots[which], first)
+    if plan.row_major and contiguous:
+        place = w.load_place(at)
+        addresses = ((k, mirror_row(w, context, k, place)) for k in entries)
+        # Aligned for a number only: the first neighbour is in any lane.
+        return {k: w.put(f"load {w.vector}, ptr {a}, align {w.bits // 8}") for k, a in addresses}
+    if plan.row_major:
+        places = load_places(w, slots[which], first)
+        addresses = ((k, mirror_row(w, context, k)) for k in entries)
+        return {k: gather(w, a, _with_leaders(w, context, k, places), 0) for k, a in addresses}
+    others = [_neighbour_at(w, context, at, lane, plan.leaders_ahead) for lane in range(w.lanes)]
+    vectors, four = dict[int, str](), f"<4 x {w.scalar}>"
     for piece in sorted({k // 4 for k in entries}):
-        # A gather of one number a lane would cost more than turning rows about, four by four.
-        rows = [_joined(w, [_four(w, a, piece) for a in others[j::4]]) for j in range(4)]
-        found |= enumerate(transposed(w, rows), 4 * piece)
-    return found
+        # A gather of one number a lane would cost more than transposing rows, four by four.
+        rows = [
+            _joined(w, [w.load(four, other, 4 * piece) for other in others[j::4]]) for j in range(4)
+        ]
+        vectors |= enumerate(transposed(w, rows), 4 * piece)
+    return vectors
 
 
-def led(w: Writer, around: Context, row: int) -> str:
-    """Write the address of a row of what leaders ahead show."""
-    far = w.put(f"mul i64 {around.led}, {row}")
-    return w.put(f"getelementptr {w.scalar}, ptr {around.ahead}, i64 {far}")
+def mirror_row(w: Writer, context: Context, row: int, place: str = "0", start: str = "") -> str:
+    """Write the address of a place in a row of a row-major mirror."""
+    begin = w.part(start or context.mirror, context.slots["row_stride"], row)
+    return w.at(w.scalar, begin, place)
 
 
-def _kept(w: Writer, around: Context, row: int, places: str) -> str:
-    """Write the places in a row of a mirror, of leaders ahead where they are kept."""
-    if not around.plan.ahead:
+def leader_row(w: Writer, context: Context, row: int) -> str:
+    """Write the address of a row of what leaders ahead showed."""
+    return w.part(context.leader_mirror, context.leader_count, row)
+
+
+def _with_leaders(w: Writer, context: Context, row: int, places: str) -> str:
+    """Write the places in a row of a mirror; those of leaders ahead are where these are stored."""
+    if not context.plan.leaders_ahead:
         return places
-    there, here = (
-        w.put(f"ptrtoint ptr {at} to i64") for at in (led(w, around, row), line(w, around, row))
-    )
+    rows = leader_row(w, context, row), mirror_row(w, context, row)
+    there, here = (w.put(f"ptrtoint ptr {at} to i64") for at in rows)
     shift = 3 if w.bits == 64 else 2
     far = w.put(f"ashr exact i64 {w.put(f'sub i64 {there}, {here}')}, {shift}")
     kind = f"<{w.lanes} x i64>"
-
-    def spread(value: str) -> str:
-        first = w.put(f"insertelement {kind} poison, i64 {value}, i32 0")
-        zeros = f"<{w.lanes} x i32> zeroinitializer"
-        return w.put(f"shufflevector {kind} {first}, {kind} poison, {zeros}")
-
-    leads = w.put(f"icmp slt {kind} {places}, {spread(around.led)}")
-    moved = w.put(f"add {kind} {places}, {spread(far)}")
+    leads = w.put(f"icmp slt {kind} {places}, {w.splat(context.leader_count, 'i64')}")
+    moved = w.put(f"add {kind} {places}, {w.splat(far, 'i64')}")
     return w.put(f"select {w.kind(True, False)} {leads}, {kind} {moved}, {kind} {places}")
-
-
-def _four(w: Writer, start: str, piece: int) -> str:
-    at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {4 * piece}")
-    return w.put(f"load <4 x {w.scalar}>, ptr {at}, align {4 * bytes_of(w)}")
 
 
 def _joined(w: Writer, parts: Sequence[str]) -> str:
@@ -194,105 +194,89 @@ def _joined(w: Writer, parts: Sequence[str]) -> str:
     return parts[0]
 
 
-def line(w: Writer, around: Context, row: int, place: str = "0", start: str = "") -> str:
-    """Write the address of a place in a row of a mirror in lines."""
-    far = w.put(f"mul i64 {around.slots['line']}, {row}")
-    begin = w.put(f"getelementptr {w.scalar}, ptr {start or around.mirror}, i64 {far}")
-    return w.put(f"getelementptr {w.scalar}, ptr {begin}, i64 {place}")
+# ---- plain differences ---------------------------------------------------------------------------
 
 
 def _subtract(
-    w: Writer, around: Context, slots: tuple[str, str], first: str, heard: Sequence[int]
+    w: Writer, context: Context, ends: tuple[str, str], first: str, entries: Sequence[int]
 ) -> list[str]:
-    """Write the sums of plain differences, agent by agent: their numbers lie in whole vectors."""
-    plan, lanes = around.plan, w.lanes
-    pieces = sorted({k // lanes for k in heard})
-    far, found = stride(plan.width, lanes), dict[int, str]()
-    begin = w.put(f"mul i64 {first}, {far}")
-    start = w.put(f"getelementptr {w.scalar}, ptr {around.mirror}, i64 {begin}")
+    """Write the sums of plain differences, agent by agent: their numbers are in whole vectors."""
+    plan, lanes = context.plan, w.lanes
+    pieces = sorted({k // lanes for k in entries})
+    start = w.part(context.mirror, first, stride(plan.width, lanes))
     # So many agents at once that their numbers and sums stay in registers.
     some = max(1, 8 // 2 ** (len(pieces) - 1).bit_length())
-    totals = dict[tuple[int, int], str]()
+    totals, vectors = dict[tuple[int, int], str](), dict[int, str]()
     for agent in range(0, lanes, some):
         places = [(lane, piece) for lane in range(agent, agent + some) for piece in pieces]
-        totals |= zip(places, _subtract_some(w, around, slots, start, places), strict=True)
+        totals |= zip(places, _subtract_some(w, context, ends, start, places), strict=True)
     for piece in pieces:
         rows = [totals[lane, piece] for lane in range(lanes)]
-        found |= enumerate(transposed(w, rows), piece * lanes)
-    return [found[k] for k in heard]
+        vectors |= enumerate(transposed(w, rows), piece * lanes)
+    return [vectors[k] for k in entries]
 
 
 def _subtract_some(
     w: Writer,
-    around: Context,
-    slots: tuple[str, str],
+    context: Context,
+    ends: tuple[str, str],
     start: str,
     places: Sequence[tuple[int, int]],
 ) -> list[str]:
     """Write the sums of some agents' whole vectors: (lane, piece) each."""
-    far = stride(around.plan.width, w.lanes)
-    own = [_load_at(w, start, lane * far + piece * w.lanes) for lane, piece in places]
+    far, weighted = stride(context.plan.width, w.lanes), context.plan.weighted
+    mine = [w.load(w.vector, start, lane * far + piece * w.lanes) for lane, piece in places]
     zero = [(w.vector, "zeroinitializer")] * len(places)
-    with loop(w, *slots, zero) as (slot, totals, on):
+    with loop(w, *ends, zero) as (slot, totals, following):
         place = w.put(f"mul i64 {slot}, {w.lanes}")
-        at = w.put(f"getelementptr i32, ptr {around.slots['neighbours']}, i64 {place}")
-        heavy = w.put(f"getelementptr {w.scalar}, ptr {around.slots['weights']}, i64 {place}")
+        at = w.at("i32", context.slots["neighbours"], place)
+        at_weights = w.at(w.scalar, context.slots["weights"], place)
         lanes = dict.fromkeys(lane for lane, _ in places)
-        others = {lane: _their(w, around, at, lane) for lane in lanes}
-        weighted = around.plan.weighted
-        weights = {lane: _weight(w, heavy, lane) for lane in lanes if weighted}
+        others = {lane: _neighbour_at(w, context, at, lane) for lane in lanes}
+        weights = {lane: w.splat(w.load(w.scalar, at_weights, lane)) for lane in lanes if weighted}
         for k, (lane, piece) in enumerate(places):
-            their = _load_at(w, others[lane], piece * w.lanes)
-            away = w.operation("sub", [own[k], their], False, False)
+            their = w.load(w.vector, others[lane], piece * w.lanes)
+            difference = w.operation("sub", [mine[k], their])
             if weighted:
-                away = w.operation("mul", [away, weights[lane]], False, False)
-            on[k] = w.operation("add", [totals[k], away], False, False)
+                difference = w.operation("mul", [difference, weights[lane]])
+            following[k] = w.operation("add", [totals[k], difference])
     return totals
 
 
-def _their(w: Writer, around: Context, places: str, lane: int, ahead: bool = False) -> str:
-    """Write the address of what a lane's neighbour shows, who may be a leader ahead."""
-    start = around.mirror
-    if ahead:
-        at = w.put(f"getelementptr i32, ptr {places}, i64 {lane}")
-        place = w.put(f"sext i32 {w.put(f'load i32, ptr {at}, align 4')} to i64")
-        end = w.put(f"mul i64 {around.led}, {stride(around.plan.width, w.lanes)}")
+def _neighbour_at(
+    w: Writer, context: Context, places: str, lane: int, leaders_ahead: bool = False
+) -> str:
+    """Write the address of what is read of a lane's neighbour, which may be a leader ahead."""
+    start = context.mirror
+    if leaders_ahead:
+        place = w.load_place(places, lane)
+        end = w.put(f"mul i64 {context.leader_count}, {stride(context.plan.width, w.lanes)}")
         leads = w.put(f"icmp slt i64 {place}, {end}")
-        start = w.put(f"select i1 {leads}, ptr {around.ahead}, ptr {start}")
-    return far_block(w, places, str(lane), start)
+        start = w.put(f"select i1 {leads}, ptr {context.leader_mirror}, ptr {start}")
+    return listed_block(w, places, str(lane), start)
 
 
-def _weight(w: Writer, weights: str, lane: int) -> str:
-    at = w.put(f"getelementptr {w.scalar}, ptr {weights}, i64 {lane}")
-    return w.splat(w.put(f"load {w.scalar}, ptr {at}"))
+# ---- what neighbours read ------------------------------------------------------------------------
 
 
-def _load_at(w: Writer, start: str, place: int) -> str:
-    at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {place}")
-    return w.put(f"load {w.vector}, ptr {at}, align {w.lanes * bytes_of(w)}")
-
-
-def write_mirror(w: Writer, around: Context, values: Sequence[str], block: str) -> None:
+def write_mirror(w: Writer, context: Context, values: Sequence[str], block: str) -> None:
     """Write what neighbours will read: of formations row by row, else agent after agent."""
-    lanes, far = w.lanes, stride(around.plan.width, w.lanes)
-    if around.plan.lines:
+    plan, lanes, far = context.plan, w.lanes, stride(context.plan.width, w.lanes)
+    if plan.row_major:
         first = w.put(f"mul i64 {block}, {lanes}")
         for k, value in enumerate(values):
-            at = line(w, around, k, first, around.following)
-            w.do(f"store {w.vector} {value}, ptr {at}, align {lanes * bytes_of(w)}")
+            w.store(w.vector, value, mirror_row(w, context, k, first, context.next_mirror))
         return
-    begin = w.put(f"mul i64 {block}, {around.plan.mirror}")
-    start = w.put(f"getelementptr {w.scalar}, ptr {around.following}, i64 {begin}")
-    if around.plan.together:
+    start = w.part(context.next_mirror, block, plan.mirror)
+    if plan.batched:
         for k, value in enumerate(values):
-            store_row(w, start, k, lanes, value)
+            w.store_row(value, start, k)
         return
-    shown = [*values, *([largeness(w, around.plan, values)] if winds(around.plan) else [])]
+    shown = [*values, *([angle_flag(w, plan, values)] if has_flag(plan) else [])]
     padded = [*shown, *["zeroinitializer"] * (far - len(shown))]
     for piece in range(0, far, lanes):
         for lane, column in enumerate(transposed(w, padded[piece : piece + lanes])):
-            at = w.put(f"getelementptr {w.scalar}, ptr {start}, i64 {lane * far + piece}")
-            w.do(f"store {w.vector} {column}, ptr {at}, align {lanes * bytes_of(w)}")
+            w.store(w.vector, column, start, lane * far + piece)
 
 
 def transposed(w: Writer, rows: Sequence[str]) -> list[str]:
@@ -319,37 +303,38 @@ def _shuffle(w: Writer, a: str, b: str, order: Sequence[int]) -> str:
     return w.put(f"shufflevector {w.vector} {a}, {w.vector} {b}, <{w.lanes} x i32> <{places}>")
 
 
-def measure_edges(w: Writer, around: Context, start: str, end: str) -> None:
-    """Write the loop that adds up how far distances along edges are from those of the formation.
+# ---- edges ---------------------------------------------------------------------------------------
 
-    A block of edges has the differences of their goals, row by row, the distances that these make,
-    and the sums.
+
+def measure_edges(w: Writer, context: Context, start: str, end: str) -> None:
+    """Write the loop that adds up by how much distances along edges differ from the formation's.
+
+    A block of edges has the differences of their goals, row by row, the distances of these, and the
+    sums.
     """
-    plan, slots = around.plan, around.slots
-    axes = plan.edges
-    size = (len(axes) + 2) * plan.lanes
-    with loop(w, start, end, []) as (block, _, _):
-        begin = w.put(f"mul i64 {block}, {size}")
-        base = w.put(f"getelementptr {w.scalar}, ptr {slots['edges']}, i64 {begin}")
+    plan, slots, axes = context.plan, context.slots, context.plan.edges
+    with loop(w, start, end) as (block, _, _):
+        base = w.part(slots["edges"], block, (len(axes) + 2) * plan.lanes)
         first = w.put(f"mul i64 {block}, 2")
         second = w.put(f"add i64 {first}, 1")
 
-        def ends(smooth: bool, pair: tuple[str, str] = (first, second)) -> list[str]:
-            found = [_shown(w, around, "edge_ends", end, axes, smooth) for end in pair]
-            return [end[axis] for axis in axes for end in found]
+        def read(contiguous: bool, pair: tuple[str, str] = (first, second)) -> list[str]:
+            ends = [_listed_entries(w, context, "edge_ends", k, axes, contiguous) for k in pair]
+            return [end[axis] for axis in axes for end in ends]
 
-        smooth = slots["smooth_edges"]
-        found = either(w, flag(w, smooth, block), ends) if plan.lines else ends(False)
+        ends = (
+            either(w, flag(w, slots["contiguous_edges"], block), read)
+            if plan.row_major
+            else read(False)
+        )
         squares = "zeroinitializer"
         for k in range(len(axes)):
-            apart = w.operation("sub", found[2 * k : 2 * k + 2], False, False)
-            apart = w.operation("add", [apart, load_row(w, base, k, plan.lanes)], False, False)
-            square = w.operation("mul", [apart, apart], False, False)
-            squares = w.operation("add", [squares, square], False, False)
-        distance = w.operation("sqrt", [squares], False, False)
-        wanted = load_row(w, base, len(axes), plan.lanes)
-        off = w.operation("sub", [distance, wanted], False, False)
-        square = w.operation("mul", [off, off], False, False)
-        total = load_row(w, base, len(axes) + 1, plan.lanes)
-        total = w.put(f"fadd {w.vector} {total}, {square}")
-        store_row(w, base, len(axes) + 1, plan.lanes, total)
+            difference = w.operation("sub", ends[2 * k : 2 * k + 2])
+            difference = w.operation("add", [difference, w.load_row(base, k)])
+            square = w.operation("mul", [difference, difference])
+            squares = w.operation("add", [squares, square])
+        distance = w.operation("sqrt", [squares])
+        error = w.operation("sub", [distance, w.load_row(base, len(axes))])
+        square = w.operation("mul", [error, error])
+        total = w.load_row(base, len(axes) + 1)
+        w.store_row(w.operation("add", [total, square]), base, len(axes) + 1)

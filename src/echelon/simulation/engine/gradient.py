@@ -21,7 +21,7 @@ from echelon.simulation.engine.law_drive import Laws, choose_engine
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
 from echelon.simulation.engine.simulate import sample_reference
-from echelon.simulation.native.backward import Backward, Wants
+from echelon.simulation.native.backward import Backward, SlopeNeeds
 from echelon.simulation.native.varying import VaryingNumbers, alike, bare
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.drive import Drive, Problem
@@ -224,7 +224,7 @@ class Native:
         if sums is None:
             raise Unsupported("states beyond the range of its sines")
         value, along = _slopes_of(cost, sums)
-        found = way.pull(along)
+        found = way.slopes(along)
         parts = dict(zip(self._order, found.leaves, strict=True))
         parts |= {"initial": found.states, "offsets": found.offsets}
         if "R" in parts:
@@ -236,8 +236,8 @@ class Native:
     def _way(self, spaced: bool) -> Backward:
         """Return the way back of costs, whether they rest on distances or not."""
         if spaced not in self._ways:
-            run, wants = self.run, Wants(spaced, "offsets" in self.run.values)
-            given = self._own, run.states, run.reference, self.steps, wants
+            run, needs = self.run, SlopeNeeds(spaced, "offsets" in self.run.values)
+            given = self._own, run.states, run.reference, self.steps, needs
             try:
                 self._ways[spaced] = Backward(*given)
             except Unsupported as reason:

@@ -1,6 +1,4 @@
-"""In which order the agents of a large swarm stand, so that those that hear each other are near."""
-
-from typing import Any
+"""The order of the agents of a large swarm in memory, in which neighbours are near each other."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,22 +8,22 @@ from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop
 
 _WINDOW = 256
-"""Agents among which those of one degree are brought together: so few stay near each other."""
+"""Agents among which those of one degree are grouped: so few stay near each other."""
 _LARGE = 10_000
-"""Agents whose numbers no longer stay in a processor's own memory from one to the next."""
+"""Agents from which on their numbers do not stay in a processor's cache."""
 
 
 def is_large(agents: int) -> bool:
-    """Tell whether it matters for so many agents where each stands."""
+    """Tell whether the order of so many agents matters."""
     return agents >= _LARGE
 
 
 def ordered(loop: Loop, lanes: int, near: Array, degrees: Array | None) -> tuple[Array, Array]:
-    """Return the agents in the order of their acting, and the first block of each level.
+    """Return the agents in the order in which they act, and the first block of each level.
 
-    In a level they stand as in an order of all agents, `near`, and within windows of it by their
-    degrees where these are given. A level fills its last block with copies of its last agent, which
-    do what that does and are read by nobody.
+    In a level they are in the order `near` of all agents, and within windows of it by their degrees
+    if these are given. A level fills its last block with copies of its last agent, which compute
+    the same and are not read.
     """
     levels = [loop.followers]
     if loop.levels is not None:
@@ -39,62 +37,63 @@ def ordered(loop: Loop, lanes: int, near: Array, degrees: Array | None) -> tuple
 
 
 def _among(order: Array, some: Array) -> Array:
-    """Return some agents in the order of all."""
+    """Return some agents in an order of all."""
     which = np.zeros(len(order), bool)
     which[some] = True
     return order[which[order]]
 
 
 def windows(degrees: Array) -> Array:
-    """Return numbers by which agents stand window after window, in each by their degrees."""
+    """Return sort keys of agents: window after window, in each by their degrees."""
     return np.arange(len(degrees)) // _WINDOW * (degrees.max(initial=0) + 1) + degrees
 
 
 def nearby(loop: Loop) -> Array:
-    """Return the agents in an order in which those that hear each other are near.
+    """Return the agents in an order in which neighbours are near each other.
 
-    It is their own where that is as good, and of few agents. Numbers of a neighbour that was
-    stepped long ago come from memory: a swarm numbered at random takes three times as long.
+    It is their own order if that is as good, and for few agents. The numbers of a neighbour that
+    was stepped long ago come from main memory: a swarm in random order takes three times as long.
     """
     agents = len(loop.offsets)
-    own = np.arange(agents)
+    original = np.arange(agents)
     if not is_large(agents):
-        return own
+        return original
     i, j = np.asarray(loop.meter.edges, np.int32).T
-    # Both ways, as the order wants a symmetric pattern, and directed edges have none.
+    # Both directions: the order needs a symmetric pattern.
     starts, order = grouped(np.concatenate([i, j]), agents)
     ends = np.concatenate([j, i])[order]
     links = sp.csr_array((np.ones(len(ends)), ends, starts), shape=(agents, agents))
     order = _from_an_end(links)
     rank = np.empty(agents, np.int32)
-    rank[order] = own
+    rank[order] = original
     better = np.abs(rank[i] - rank[j]).sum(dtype=int) < np.abs(i - j).sum(dtype=int)
-    return np.asarray(order, int) if better else own
+    return np.asarray(order, int) if better else original
 
 
-def _from_an_end(links: Any) -> Array:
-    """Return the agents that one reaches from another, by how far they are from one at an end.
+def _from_an_end(links: sp.csr_array) -> Array:
+    """Return connected agents by their distance from one at an end of the graph.
 
-    Neighbours are then at most about two layers apart, which are small where they begin at an end.
+    Neighbours are then at most about two layers apart, and layers are small if they begin at an
+    end.
     """
     reached = csgraph.breadth_first_order(links, 0, return_predecessors=False)
     return csgraph.breadth_first_order(links, reached[-1], return_predecessors=False)
 
 
 def grouped(keys: Array, count: int) -> tuple[Array, Array]:
-    """Return where each of so many numbers begins among sorted keys, and the places of these.
+    """Return where each number below `count` begins among the sorted keys, and the order of these.
 
-    Equal keys stay in their order. It takes a fifth of the time of a sort.
+    The order is stable. It takes a fifth of the time of a sort.
     """
-    # A matrix with an entry a column is turned about: it counts the rows, and fills them in order.
+    # Conversion of a matrix with one entry a column counts its rows, and fills them in order.
     entries = np.ones(len(keys), np.int8), keys.astype(np.int32), np.arange(len(keys) + 1)
-    turned = sp.csc_array(entries, shape=(count, len(keys))).tocsr()
-    return turned.indptr, turned.indices
+    rows = sp.csc_array(entries, shape=(count, len(keys))).tocsr()
+    return rows.indptr, rows.indices
 
 
 def first_places(agents: Array) -> Array:
-    """Return where each agent stands; of copies the first stands for the agent."""
-    of = np.empty(agents.max() + 1, int)
-    # Of places that are written twice the last holds.
-    of[agents[::-1]] = np.arange(len(agents))[::-1]
-    return of
+    """Return the position of each agent; of copies, that of the first."""
+    position = np.empty(agents.max() + 1, int)
+    # If a place is written twice, the last value stays.
+    position[agents[::-1]] = np.arange(len(agents))[::-1]
+    return position

@@ -1,19 +1,19 @@
-"""What one agent does in a step, as scalars, and the rows of a block where they lie.
+"""The step of one agent as scalar operations, and the rows of a block that hold its numbers.
 
-It is traced from the same laws, model, integrator and meter that `loop` runs.
+It is traced from the same laws, model, integrator and meter that `step.loop` runs.
 """
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from echelon.core.types import Array
+from echelon.core.types import Array, PyTree
 from echelon.laws.law import Law, LocalView, Memory
-from echelon.simulation.codegen import Body, shortened
+from echelon.simulation.codegen import Body, factored
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Node, ScalarGraph, Unsupported, lower, nodes
 from echelon.simulation.step.action import act, feedforward_of, limit_sides
@@ -21,17 +21,17 @@ from echelon.simulation.step.loop import Loop
 
 
 class BlockRows(NamedTuple):
-    """Where the numbers of an agent lie in its block; each a range of rows.
+    """Where the numbers of an agent are in its block; each a range of rows.
 
     Attributes:
         state: x (n,).
-        offset: its goal's (n,).
+        offset: of its goal (n,).
         push, noise: what wind adds to its rate (n,), and noise to its input (m,).
         memory: of its law, one number after the other.
-        cut: to which side limits moved each input in the step before (m,).
-        tell: what it sends besides its state.
-        input: what is delivered to it (m,).
-        own: numbers of its law and model that are others in other formations.
+        cut: to which side limits moved each input in the previous step (m,).
+        message: what it sends besides its state.
+        input: that is applied (m,).
+        varying: numbers of its law and model that differ between formations.
         errors, tracking: as in `Sums`, but of the steps before the steady window and in it.
         effort, limited, unsettled, inside, chatter, outputs: as in `Sums`.
         total: how many rows there are.
@@ -43,9 +43,9 @@ class BlockRows(NamedTuple):
     noise: range
     memory: range
     cut: range
-    tell: range
+    message: range
     input: range
-    own: range
+    varying: range
     errors: range
     effort: range
     limited: range
@@ -57,11 +57,11 @@ class BlockRows(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop, own: int = 0) -> "BlockRows":
+    def of(cls, loop: Loop, varying: int = 0) -> "BlockRows":
         """Return the rows of a loop of which so many numbers differ between formations.
 
         Raises:
-            Unsupported: a law remembers what is no number, or messages take time.
+            Unsupported: the memory of a law is not made of numbers, or messages take time.
         """
         if loop.channel is not None:
             raise Unsupported("a network that is not ideal")
@@ -69,18 +69,26 @@ class BlockRows(NamedTuple):
         wind, q = loop.motion.wind, len(loop.model.output_names)
         noisy = wind is not None and wind.noise is not None
         memory = max(memory_size(law) for law in (loop.leader, loop.follower))
-        sizes = [n, n, n if wind else 0, m if noisy else 0, memory, m, told_by(loop), m, own]
+        sizes = [
+            n,
+            n,
+            n if wind else 0,
+            m if noisy else 0,
+            memory,
+            m,
+            message_size(loop),
+            m,
+            varying,
+        ]
         sizes += [2, 1, 1, 1, len(loop.meter.charted), 1, 2, q]
-        ends = np.cumsum([0, *sizes]).tolist()
-        rows: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
-        return cls(*rows)
+        return cls(*row_ranges(sizes))
 
 
 def memory_size(law: Law) -> int:
-    """Return how many numbers one agent under a law remembers.
+    """Return how many numbers the memory of one agent under a law has.
 
     Raises:
-        Unsupported: it remembers what is no number, such as a random key.
+        Unsupported: it is not made of numbers, such as a random key.
     """
     leaves = jax.tree.leaves(law.init())
     for leaf in leaves:
@@ -89,202 +97,212 @@ def memory_size(law: Law) -> int:
     return sum(np.size(leaf) for leaf in leaves)
 
 
-def memories_of(like: Memory, flat: Array) -> Memory:
-    """Return memories of agents, alike to one, from their numbers (agents, numbers)."""
+def unflatten(like: PyTree, flat: Array | jax.Array) -> PyTree:
+    """Return a tree of the structure and shapes of another, or many, from numbers (..., k)."""
     leaves, tree = jax.tree.flatten(like)
     ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
     parts = zip(leaves, ends[:-1], ends[1:], strict=True)
     return tree.unflatten(
-        [flat[:, a:b].reshape(len(flat), *np.shape(leaf)) for leaf, a, b in parts]
+        [flat[..., a:b].reshape((*flat.shape[:-1], *np.shape(leaf))) for leaf, a, b in parts]
     )
 
 
-def told_by(loop: Loop) -> int:
+def row_ranges(sizes: Sequence[int]) -> list[Any]:
+    """Return the ranges of rows of so many numbers each, one after the other, and the last row."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
+
+
+def message_size(loop: Loop) -> int:
     """Return how many numbers an agent sends besides its state."""
     n, m = len(loop.model.state_names), len(loop.model.input_names)
     turning = loop.follower.turning
 
-    # Of what is told alone: a trace of all that a leader does takes as long as the code of it.
-    def told(x: Any, v: Any) -> Any:
+    # Of the message alone: a trace of all that a leader does takes as long as its code.
+    def message(x: jax.Array, v: jax.Array) -> jax.Array:
         follower = loop.follower.facing(x[0]) if turning else loop.follower
         return feedforward_of(follower, loop.model, x, v, loop.leader.init())
 
-    return jax.eval_shape(told, np.zeros(n), np.zeros(m)).shape[0] + turning
+    return jax.eval_shape(message, np.zeros(n), np.zeros(m)).shape[0] + turning
 
 
-def signals_of(loop: Loop) -> int:
-    """Return how many numbers neighbours hear of an agent besides its state."""
-    nothing = jnp.zeros(len(loop.model.state_names))
-    law = loop.follower
-    said = jax.eval_shape(lambda: _said(loop, law, nothing, nothing, law.init()))
-    return said.shape[0]
+def signal_size(loop: Loop) -> int:
+    """Return how many numbers neighbours receive from an agent besides its state."""
+    zero, law = jnp.zeros(len(loop.model.state_names)), loop.follower
+    return jax.eval_shape(lambda: _signal_of(loop, law, zero, zero, law.init())).shape[0]
 
 
-def _said(loop: Loop, law: Law, x: Any, offset: Any, memory: Memory) -> Any:
-    """Return the signal of an agent, of no numbers where it has none."""
+def _signal_of(loop: Loop, law: Law, x: jax.Array, offset: jax.Array, memory: Memory) -> jax.Array:
+    """Return the signal of an agent, of length 0 if it has none."""
     signal = law.signal(loop.model, x, offset, memory)
     return jnp.zeros(0, x.dtype) if signal is None else signal
 
 
-class StepInputs(NamedTuple):
-    """What an agent's step rests on, entry by entry."""
+Entries: TypeAlias = Any
+"""A traced array, an array of nodes, or a list of nodes."""
 
-    t: Any
-    step: Any
-    steady: Any
-    wanted: Any
-    x: Any
-    offset: Any
-    z: Any
-    told: Any
+
+class StepInputs(NamedTuple):
+    """What an agent's step depends on, entry by entry: arrays of nodes, or traced arrays."""
+
+    t: Entries
+    step: Entries
+    steady: Entries
+    reference: Entries
+    x: Entries
+    offset: Entries
+    z: Entries
+    message: Entries
     memory: Memory
-    leader: Any
-    push: Any
-    noise: Any
-    before: Any
+    leader: Entries
+    push: Entries
+    noise: Entries
+    previous_cut: Entries
 
 
 class StepOutputs(NamedTuple):
-    """What it comes to."""
+    """The results of an agent's step."""
 
-    state: Any
+    state: Entries
     memory: Memory
-    cut: Any
-    tell: Any
-    input: Any
-    errors: Any
-    tracking: Any
-    outputs: Any
-    effort: Any
-    limited: Any
-    unsettled: Any
-    inside: Any
-    chatter: Any
-    said: Any
-    saying: Any
+    cut: Entries
+    message: Entries
+    input: Entries
+    errors: Entries
+    tracking: Entries
+    outputs: Entries
+    effort: Entries
+    limited: Entries
+    unsettled: Entries
+    inside: Entries
+    chatter: Entries
+    signal: Entries
+    next_signal: Entries
 
 
 def agent_step(loop: Loop, leads: bool) -> Callable[[StepInputs], StepOutputs]:
-    """Return what a leader or another agent does in a step, as a function for JAX."""
+    """Return the step of a leader, or of another agent, as a function for JAX."""
     law = loop.leader if leads else loop.follower
     model, motion, meter = loop.model, loop.motion, loop.meter
 
-    def step(known: StepInputs) -> StepOutputs:
-        x, offset = known.x, known.offset
-        view = LocalView(known.t, x, offset, known.z, known.told, motion.dt)
-        desired, u, memory, told = act(loop, law, view, known.memory, leads)
+    def step(inputs: StepInputs) -> StepOutputs:
+        x, offset = inputs.x, inputs.offset
+        view = LocalView(inputs.t, x, offset, inputs.z, inputs.message, motion.dt)
+        desired, u, memory, message = act(loop, law, view, inputs.memory, leads)
         limited, cut = limit_sides(u, desired)
-        read = meter.of_agent(known.step, known.steady, x, offset, known.leader, u)
+        metered = meter.of_agent(inputs.step, inputs.steady, x, offset, inputs.leader, u)
         tracking, outputs = jnp.zeros(2), jnp.zeros(len(model.output_names))
-        if known.wanted is not None:
-            tracking, outputs = meter.of_leader(known.steady, x, offset, known.wanted)
-        state = motion.move(x, u, known.push, known.noise)
+        if inputs.reference is not None:
+            tracking, outputs = meter.of_leader(inputs.steady, x, offset, inputs.reference)
+        state = motion.move(x, u, inputs.push, inputs.noise)
         return StepOutputs(
             state=state,
             memory=memory,
             cut=cut,
-            tell=told,
+            message=message,
             input=u,
-            errors=read.errors,
+            errors=metered.errors,
             tracking=tracking,
             outputs=outputs,
-            effort=read.effort,
+            effort=metered.effort,
             limited=jnp.where(limited.any(), 1.0, 0.0),
-            unsettled=read.unsettled,
-            inside=read.inside,
-            chatter=jnp.where((cut * known.before < 0.0).any(), 1.0, 0.0),
-            said=_said(loop, law, x, offset, known.memory),
-            saying=_said(loop, law, state, offset, memory),
+            unsettled=metered.unsettled,
+            inside=metered.inside,
+            chatter=jnp.where((cut * inputs.previous_cut < 0.0).any(), 1.0, 0.0),
+            signal=_signal_of(loop, law, x, offset, inputs.memory),
+            next_signal=_signal_of(loop, law, state, offset, memory),
         )
 
     return step
 
 
 def body_of(
-    own: VaryingNumbers,
+    varying: VaryingNumbers,
     bits: int,
     rows: BlockRows,
     leads: bool,
     follows: bool,
-    tabled: bool = False,
+    in_table: bool = False,
 ) -> Body:
-    """Return what the leaders or all others do in a step.
+    """Return what the leaders or all others compute in a step.
 
     Args:
-        own: the loop of the run, and its numbers that differ between formations.
+        varying: the loop of the run, and its numbers that differ between formations.
         bits: 64 or 32.
-        rows: where its numbers lie.
-        leads: whether leaders are meant.
-        follows: whether they follow a reference, which stands in the table.
-        tabled: whether the loop's own numbers are the same for all, and stand there behind it.
+        rows: where the numbers of an agent are.
+        leads: whether it is the body of the leaders.
+        follows: whether they follow a reference, which is in the table.
+        in_table: whether the varying numbers are the same for all agents, and in the table behind.
 
     Raises:
-        Unsupported: the law or the model uses what has no scalar operations.
+        Unsupported: the law or the model has no scalar operations.
     """
-    graph, loop = ScalarGraph(bits), own.loop
+    graph, loop = ScalarGraph(bits), varying.loop
     law = loop.leader if leads else loop.follower
-    known = known_of(loop, graph, rows, law, leads, follows)
+    inputs = step_inputs(loop, graph, rows, law, leads, follows)
 
-    def act(leaves: list[Any], known: StepInputs) -> StepOutputs:
-        return agent_step(own.filled(leaves), leads)(known)
+    def step(leaves: list[jax.Array], inputs: StepInputs) -> StepOutputs:
+        return agent_step(varying.filled(leaves), leads)(inputs)
 
-    found = lower(act, graph, [own_leaves(own, graph, rows, follows, tabled), known])
+    results = lower(step, graph, [varying_leaves(varying, graph, rows, follows, in_table), inputs])
     shapes = jax.tree.structure(StepOutputs(*[0] * 15)._replace(memory=law.init()))
-    done: StepOutputs = shapes.unflatten([nodes(graph, part) for part in found])
-    remembered = jax.tree.leaves(done.memory, is_leaf=lambda part: isinstance(part, list))
-    stores = {"state": done.state, "cut": done.cut, "memory": sum(remembered, start=[])}
+    outputs: StepOutputs = shapes.unflatten([nodes(graph, part) for part in results])
+    memory = jax.tree.leaves(outputs.memory, is_leaf=lambda part: isinstance(part, list))
+    stores = {"state": outputs.state, "cut": outputs.cut, "memory": sum(memory, start=[])}
     if leads or loop.levels is not None:
-        stores["tell"] = done.tell
-    sums = {name: getattr(done, name) for name in ("effort", "limited", "chatter")}
-    sums |= {"errors": _parted(known, done.errors)}
+        stores["message"] = outputs.message
+    sums = {name: getattr(outputs, name) for name in ("effort", "limited", "chatter")}
+    sums |= {"errors": _before_and_in_window(inputs, outputs.errors)}
     if leads and follows:
-        sums |= {"tracking": _parted(known, done.tracking), "outputs": done.outputs}
-    apart = functools.partial(map, functools.partial(graph.make, "apart"))
+        tracking = _before_and_in_window(inputs, outputs.tracking)
+        sums |= {"tracking": tracking, "outputs": outputs.outputs}
+    subtract = functools.partial(map, functools.partial(graph.make, "unfused_sub"))
     body = Body(
         stores=_placed(rows, stores),
         sums=_placed(rows, sums),
-        greatest=_placed(rows, {"unsettled": done.unsettled}),
-        least=_placed(rows, {"inside": done.inside}),
-        shown=_placed(rows, {"input": done.input}),
-        now=[*apart(known.x, known.offset), *done.said],
-        mirror=[*apart(done.state, known.offset), *done.saying],
-        difference=_difference(loop, graph, len(known.x), len(done.said)),
+        maxima=_placed(rows, {"unsettled": outputs.unsettled}),
+        minima=_placed(rows, {"inside": outputs.inside}),
+        on_request=_placed(rows, {"input": outputs.input}),
+        mirror_before=[*subtract(inputs.x, inputs.offset), *outputs.signal],
+        mirror=[*subtract(outputs.state, inputs.offset), *outputs.next_signal],
+        difference=_difference(loop, graph, len(inputs.x), len(outputs.signal)),
     )
-    return body.become(shortened(body.all()))
+    return body.map_nodes(factored(body.all()))
 
 
-def _parted(known: StepInputs, twice: list[Node]) -> list[Node]:
-    """Return a number of all steps and of the steady window as one before and one in it.
+def _before_and_in_window(inputs: StepInputs, sums: list[Node]) -> list[Node]:
+    """Return a number for all steps and for the steady window as one before and one in the window.
 
-    Only one of the two is then added to at a step.
+    Each step then adds to one of the two only.
     """
-    all_, steady = twice
-    return [all_.graph.make("select", known.steady[()], 0.0, all_), steady]
+    all_, steady = sums
+    return [all_.graph.make("select", inputs.steady[()], 0.0, all_), steady]
 
 
-def own_leaves(
-    own: VaryingNumbers, graph: ScalarGraph, rows: BlockRows, follows: bool, tabled: bool
+def varying_leaves(
+    varying: VaryingNumbers, graph: ScalarGraph, rows: BlockRows, follows: bool, in_table: bool
 ) -> list[np.ndarray]:
-    """Return the leaves of a loop in which numbers are its own: in rows, or in the table."""
+    """Return the leaves of a loop that have varying numbers: in rows, or in the table."""
     begin = len(rows.state) if follows else 0
-    places = range(begin, begin + own.count) if tabled else rows.own
-    return own.leaves(leaves_of(graph, "table" if tabled else "row", places, tabled))
+    places = range(begin, begin + varying.count) if in_table else rows.varying
+    return varying.leaves(leaves_of(graph, "table" if in_table else "row", places, in_table))
 
 
 def _difference(loop: Loop, graph: ScalarGraph, states: int, signals: int) -> list[Node]:
     """Return the differences of what neighbours read: of states by the model, of signals plain."""
-    # Of the model as it is: how far two states are apart is the same for all formations.
-    own, their = (leaves_of(graph, kind, range(states + signals)) for kind in ("own", "their"))
-    [found] = lower(loop.model.difference, graph, [own[:states], their[:states]])
-    plain = zip(own[states:], their[states:], strict=True)
-    return [*nodes(graph, found), *(graph.make("sub", a, b) for a, b in plain)]
+    # Of the first loop's model: the difference of two states is the same for all formations.
+    kinds = "self", "neighbour"
+    mine, theirs = (leaves_of(graph, kind, range(states + signals)) for kind in kinds)
+    [difference] = lower(loop.model.difference, graph, [mine[:states], theirs[:states]])
+    plain = zip(mine[states:], theirs[states:], strict=True)
+    return [*nodes(graph, difference), *(graph.make("sub", a, b) for a, b in plain)]
 
 
-def known_of(
+def step_inputs(
     loop: Loop, graph: ScalarGraph, rows: BlockRows, law: Law, leads: bool, follows: bool
 ) -> StepInputs:
-    """Return what a step rests on as leaves of a graph."""
-    n, signals = len(rows.state), signals_of(loop)
+    """Return what a step depends on as leaves of a graph."""
+    n, signals = len(rows.state), signal_size(loop)
 
     def row(places: range) -> np.ndarray:
         return leaves_of(graph, "row", places)
@@ -295,26 +313,26 @@ def known_of(
         t=single(graph.leaf("time", uniform=True)),
         step=single(graph.leaf("step", uniform=True)),
         steady=single(late),
-        wanted=leaves_of(graph, "table", range(n), True) if leads and follows else None,
+        reference=leaves_of(graph, "table", range(n), True) if leads and follows else None,
         x=x,
         offset=offset,
         z=leaves_of(graph, "z", range(n, n + signals) if signals else range(n)),
-        # Nobody is before a leader whose input it could be sent.
-        told=np.zeros(len(rows.input))
+        # A leader receives no input of another agent.
+        message=np.zeros(len(rows.input))
         if leads
-        else leaves_of(graph, "told", range(len(rows.tell))),
-        memory=shaped(row(rows.memory[:size]), law.init()),
+        else leaves_of(graph, "message", range(len(rows.message))),
+        memory=unflatten(law.init(), row(rows.memory[:size])),
         leader=x - offset if leads else leaves_of(graph, "leader", range(n)),
         push=row(rows.push) if len(rows.push) else None,
         noise=row(rows.noise) if len(rows.noise) else None,
-        before=row(rows.cut),
+        previous_cut=row(rows.cut),
     )
 
 
 def leaves_of(
     graph: ScalarGraph, kind: str, places: Sequence[int], uniform: bool = False
 ) -> np.ndarray:
-    """Return leaves of one kind, a number each."""
+    """Return leaves of one kind, one for each place."""
     entries = np.empty(len(places), object)
     entries[:] = [graph.leaf(kind, place, uniform=uniform) for place in places]
     return entries
@@ -325,14 +343,6 @@ def single(node: Node) -> np.ndarray:
     array = np.empty((), object)
     array[()] = node
     return array
-
-
-def shaped(entries: np.ndarray, like: Memory) -> Memory:
-    """Return a memory whose numbers are entries, in the order of its tree."""
-    leaves, tree = jax.tree.flatten(like)
-    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)]).tolist()
-    parts = zip(leaves, ends[:-1], ends[1:], strict=True)
-    return tree.unflatten([entries[a:b].reshape(np.shape(leaf)) for leaf, a, b in parts])
 
 
 def _placed(rows: BlockRows, named: dict[str, list[Node]]) -> dict[int, Node]:

@@ -1,12 +1,13 @@
-"""A run taken back step by step, by code for this machine: the slopes of a cost of its sums.
+"""Reverse-mode derivatives by machine code: the slopes of a cost of the sums of a run.
 
-Forwards the moments at the beginnings of stretches are kept. Backwards each stretch is run again
-onto a tape, and from it the transposes of its steps are run, the last step first. What neighbours
-made of what they heard is gathered as they gathered it, from the transposed graph.
+In the forward pass the moments at the beginnings of stretches are stored. In the backward pass each
+stretch is run again and recorded on a tape, and the transposes of its steps are run from it, the
+last step first. Cotangents of what agents sent are gathered from their receivers, by the transposed
+graph.
 """
 
 import math
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,9 @@ import numpy as np
 
 from echelon.core.memoize import BoundedCache
 from echelon.core.types import Array
-from echelon.simulation.codegen import SLOTS, Body, aligned, fed_widths
-from echelon.simulation.native.agent_step import BlockRows, signals_of
+from echelon.laws.law import Memory
+from echelon.simulation.codegen import Body, aligned, contribution_widths
+from echelon.simulation.native.agent_step import BlockRows, signal_size, unflatten
 from echelon.simulation.native.blocks import SwarmBlocks
 from echelon.simulation.native.kernel_cache import (
     KERNELS,
@@ -28,96 +30,112 @@ from echelon.simulation.native.kernel_cache import (
 )
 from echelon.simulation.native.schedule import step_by_step
 from echelon.simulation.native.stepper import STEPS, NativeStepper, any_beyond
+from echelon.simulation.native.threads import call
 from echelon.simulation.native.transpose import (
     CotangentRows,
     Transpose,
     TransposedStep,
-    heard_by,
-    lean,
+    disagreement_size,
+    imbalance,
 )
 from echelon.simulation.native.transposed_graph import (
     check_pairs,
-    heard_back,
-    reach_of,
-    turned_about,
+    transpose_graph,
+    transposed_arrays,
+    transposed_disagreement,
 )
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.scalars import Unsupported
+from echelon.simulation.step.drive import Chunk
 from echelon.simulation.step.loop import Loop, Moment
 from echelon.simulation.step.meter import Sums
 from echelon.simulation.step.sequence import begin, signals
 
 BITS = 64
 _TAPE = 256 * 2**20
-"""Bytes of a tape, unless steps are so many that it takes the root of what all would."""
+"""Bytes of a tape, unless there are so many steps that it needs the square root of all of them."""
 _LIGHT = 32 * 2**20
-"""Bytes of a tape that is kept for the next run, since they take a while to be had."""
+"""Bytes up to which a tape is kept for the next run, because new memory is slow."""
 
 
-class Wants(NamedTuple):
-    """Whether slopes come along the sums of distances, and are wanted along goals' offsets."""
+class SlopeNeeds(NamedTuple):
+    """What more is needed than slopes along gains and starts.
 
-    spaced: bool
-    moved: bool
+    Attributes:
+        distances: whether the cost depends on the sums of distance errors.
+        offsets: whether to differentiate with respect to the goals' offsets.
+    """
+
+    distances: bool
+    offsets: bool
 
 
 class _Pair(NamedTuple):
-    """The kernels of a step onto a tape and of its transpose, and the rows of the second."""
+    """The kernels of a recorded step and of its transpose, and the rows of the second."""
 
     forward: Kernel
     backward: Kernel
-    felt: CotangentRows
+    rows: CotangentRows
 
 
 _pairs = BoundedCache[_Pair](MOST)
 
 
-def _pair(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:
-    """Return the kernels for loops alike but for their own numbers, made once."""
-    wind, signature = own.loop.motion.wind, own.signature
-    # The signature is of all but the wind's numbers, which have rows where there is one.
-    key = (signature, wind is None, wind is None or wind.noise is None, lines, wants)
-    return _pairs.get_or_make(None if signature is None else key, lambda: _made(own, lines, wants))
-
-
-def _made(own: VaryingNumbers, lines: tuple[bool, bool], wants: Wants) -> _Pair:
-    loop, rows = own.loop, BlockRows.of(own.loop)
-    felt, wanted = CotangentRows.of(loop, rows, *wants), follows(loop)
-    plan = plan_of(own, rows, BITS, False, lines[0], False, True)
-    ways = [Transpose(own, BITS, rows, felt, leads, wanted).made() for leads in (True, False)]
-    taped = max(1, *(len(way.kept) for way in ways))
-    forward = plan._replace(
-        first=_onto_tape(plan.first, ways[0]), others=_onto_tape(plan.others, ways[1]), taped=taped
+def _pair_of(varying: VaryingNumbers, row_major: tuple[bool, bool], needs: SlopeNeeds) -> _Pair:
+    """Return the kernels for loops that differ only in varying numbers, from a cache."""
+    wind, signature = varying.loop.motion.wind, varying.signature
+    # The signature leaves out the wind's numbers, which have rows if there is wind.
+    key = (signature, wind is None, wind is None or wind.noise is None, row_major, needs)
+    return _pairs.get_or_make(
+        None if signature is None else key, lambda: _compiled_pair(varying, row_major, needs)
     )
-    # What a leader hears may be wanted though it does not act by it.
-    forward = forward._replace(ahead=plan.ahead and not forward.first.hears)
+
+
+def _compiled_pair(
+    varying: VaryingNumbers, row_major: tuple[bool, bool], needs: SlopeNeeds
+) -> _Pair:
+    loop, rows = varying.loop, BlockRows.of(varying.loop)
+    cotangents, tracks = CotangentRows.of(loop, rows, *needs), follows(loop)
+    plan = plan_of(varying, rows, BITS, False, row_major[0], False, True)
+    first, others = (
+        Transpose(varying, BITS, rows, cotangents, leads, tracks).derive()
+        for leads in (True, False)
+    )
+    tape_rows = max(1, len(first.recorded), len(others.recorded))
+    forward = plan._replace(
+        first=_recorded(plan.first, first),
+        others=_recorded(plan.others, others),
+        tape_rows=tape_rows,
+    )
+    # What a leader receives may be recorded even if its input does not depend on it.
+    ahead = plan.leaders_ahead and not forward.first.reads_neighbours
     backward = plan._replace(
-        lines=lines[1],
-        rows=felt.total,
-        width=heard_by(loop) + len(felt.place),
-        first=ways[0].body,
-        others=ways[1].body,
+        row_major=row_major[1],
+        rows=cotangents.total,
+        width=disagreement_size(loop) + len(cotangents.place),
+        first=first.body,
+        others=others.body,
         edges=(),
-        taped=taped,
-        ahead=False,
+        tape_rows=tape_rows,
+        leaders_ahead=False,
         backward=True,
     )
-    onward, back = (compiled(rows, way, KERNELS.codes) for way in (forward, backward))
-    return _Pair(onward, back, felt)
+    forward_kernel = compiled(rows, forward._replace(leaders_ahead=ahead), KERNELS.codes)
+    return _Pair(forward_kernel, compiled(rows, backward, KERNELS.codes), cotangents)
 
 
-def _onto_tape(body: Body, way: TransposedStep) -> Body:
-    """Return the body of a step that leaves on the tape what its transpose wants."""
+def _recorded(body: Body, transpose: TransposedStep) -> Body:
+    """Return the body of a step that records on the tape what its transpose reads."""
     graph = body.mirror[0].graph
-    return body._replace(tape={k: graph.leaf(*name) for k, name in enumerate(way.kept)})
+    return body._replace(tape={k: graph.leaf(*name) for k, name in enumerate(transpose.recorded)})
 
 
 class CostSlopes(NamedTuple):
     """Slopes of a cost.
 
     Attributes:
-        leaves: along the leaves of the loop in which numbers are its own.
-        states: along the starts (N, n).
+        leaves: along the leaves of the loop that have varying numbers.
+        states: along the initial states (N, n).
         offsets: along the goals' offsets (N, n).
     """
 
@@ -128,89 +146,103 @@ class CostSlopes(NamedTuple):
 
 @final
 class Backward:
-    """A run of laws that is taken forwards and then back, as often as is asked.
+    """A run that is differentiated, as often as is asked.
 
     Args:
-        own: the loop, and its numbers along which there are slopes.
+        varying: the loop, and its numbers with respect to which to differentiate.
         states: (N, n) at the beginning.
         reference: (steps, n) what the leaders follow, or None.
         steps: of the run.
-        wants: what more than the least is wanted.
+        needs: what more is needed than slopes along gains and starts.
 
     Raises:
-        Unsupported: a law or the model uses what has no scalar operations.
+        Unsupported: a law or the model has no scalar operations.
     """
 
     def __init__(
-        self, own: VaryingNumbers, states: Array, reference: Array | None, steps: int, wants: Wants
+        self,
+        varying: VaryingNumbers,
+        states: Array,
+        reference: Array | None,
+        steps: int,
+        needs: SlopeNeeds,
     ) -> None:
-        """Write and compile the step and its transpose."""
-        self.own, self.loop, self.steps, self.states = own, own.loop, steps, states
-        self.places = SwarmBlocks(own.loop, LANES[BITS])
-        if wants.spaced:
-            check_pairs(own.loop)
-        if all(wants):
+        """Generate and compile the step and its transpose."""
+        self.varying, self.loop, self.steps, self.states = varying, varying.loop, steps, states
+        self.places = SwarmBlocks(self.loop, LANES[BITS])
+        if needs.distances:
+            check_pairs(self.loop)
+        if all(needs):
             raise Unsupported("slopes of distances along the goals' offsets")
-        turned = turned_about(own.loop, self.places)
-        self.pair = _pair(own, (self.places.lines, turned.lines), wants)
-        self.reach = reach_of(own.loop, self.places, turned, self.pair.backward)
-        self.signals, kernel = signals_of(own.loop), self.pair.forward
+        graph = transpose_graph(self.loop, self.places)
+        self.pair = _pair_of(varying, (self.places.row_major, graph.row_major), needs)
+        self.graph = transposed_arrays(self.loop, self.places, graph, self.pair.backward)
+        self.signals, kernel = signal_size(self.loop), self.pair.forward
         self.stepper = NativeStepper(
-            [own.loop], states, BITS, None, make=lambda *_: kernel, places=self.places
+            [self.loop], states, BITS, None, make=lambda *_: kernel, places=self.places
         )
-        self.reference, self.wants = reference, wants
+        self.reference, self.needs = reference, needs
         self._reserve()
 
     def _reserve(self) -> None:
-        """Make room for slopes, and for a tape of so many steps that all are few."""
+        """Allocate memory for cotangents, and choose the steps of a tape."""
         plan, places = self.pair.backward.plan, self.places
-        shape = (places.blocks, plan.taped, plan.lanes)
+        shape = (places.blocks, plan.tape_rows, plan.lanes)
         size, moment = 8 * math.prod(shape), 8 * self.states.size * 2
-        few = max(_TAPE // size, math.isqrt(self.steps * moment // size))
-        self.stretch = min(self.steps, max(1, few))
-        self.shape, self._room = (self.stretch, *shape), None
-        self.felt = aligned((places.blocks, plan.rows, plan.lanes), np.float64)
-        lined = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
-        self.mirrors = [aligned(lined, np.float64) for _ in range(2)]
-        self.fed = aligned((len(places.agents), max(1, fed_widths(plan)[1])), np.float64)
-        self.forms = [leaf.shape for leaf in self._leaves()]
-        self.totals = aligned((max(1, sum(map(math.prod, self.forms))), plan.lanes), np.float64)
+        most = max(_TAPE // size, math.isqrt(self.steps * moment // size))
+        self.stretch = min(self.steps, max(1, most))
+        self.tape_shape = (self.stretch, *shape)
+        self._tape: Array | None = None
+        self.cotangents = aligned((places.blocks, plan.rows, plan.lanes), np.float64)
+        self.mirrors = places.mirrors(plan, np.float64)
+        width = max(1, contribution_widths(plan)[1])
+        self.contributions = aligned((len(places.agents), width), np.float64)
+        numbers = sum(leaf.size for leaf in self._leaves())
+        self.totals = aligned((max(1, numbers), plan.lanes), np.float64)
 
     @property
     def tape(self) -> Array:
-        """The tape, which is there from the first run on."""
-        if self._room is None:
-            self._room = aligned(self.shape, np.float64)
-        return self._room
+        """The tape, which is allocated by the first run."""
+        if self._tape is None:
+            self._tape = aligned(self.tape_shape, np.float64)
+        return self._tape
 
     def _leaves(self) -> list[Array]:
-        return [leaf.astype(float) for leaf in self.own.leaves(self.own.values[0])]
+        return [leaf.astype(float) for leaf in self.varying.leaves(self.varying.values[0])]
 
     def turn(self, loop: Loop) -> None:
-        """Go on with a loop that its own numbers cover."""
+        """Continue with a loop that differs only in the varying numbers."""
         self.loop = loop
-        self.own.turn(loop)
+        self.varying.turn(loop)
         self.stepper.turn(loop)
 
     @property
     def size(self) -> int:
-        """Bytes of the arrays that are held from one run to the next."""
-        found, blocks = self.stepper.found, (self.stepper.blocks, *self.stepper.mirrors)
-        room = (self.felt, *self.mirrors, self.fed, self.totals, self.table, self._room)
-        return sum(array.nbytes for array in jax.tree.leaves((found, blocks, room, self.reach)))
+        """Bytes of the arrays that are kept from one run to the next."""
+        stepper = self.stepper
+        arrays = (stepper.neighbourhood, stepper.blocks, stepper.mirrors, self.cotangents)
+        arrays += (
+            self.mirrors,
+            self.contributions,
+            self.totals,
+            self.table,
+            self._tape,
+            self.graph,
+        )
+        return sum(array.nbytes for array in jax.tree.leaves(arrays))
 
-    # ---- forwards ----
+    # ---- the forward pass ----
 
     def run(self) -> Sums | None:
-        """Return the sums of the run; None where a state is beyond the range of the kernels."""
+        """Return the sums of the run; None if a state is beyond the range of the kernels."""
         now, self.moments = self.stepper.start(), list[Moment]()
         sums: Sums | None = None
         for first in self._firsts():
             self.moments.append(now)
-            # The last stretch is the first that is taken back.
+            # The backward pass begins with the last stretch.
             self.stepper.record(self.tape if first + self.stretch >= self.steps else None, first)
-            made = self._advance(now, first)
-            now, more = made.now, made.sums.of(0)
+            chunk = self._advance(now, first)
+            now, more = chunk.now, chunk.sums.of(0)
             sums = more if sums is None else sums.plus(more)
             if any_beyond(now.states, BITS):
                 self.moments.clear()
@@ -220,149 +252,145 @@ class Backward:
     def _firsts(self) -> range:
         return range(0, self.steps, self.stretch)
 
-    def _advance(self, now: Moment, first: int) -> Any:
-        """Take the steps of the stretch that begins with one."""
+    def _advance(self, now: Moment, first: int) -> Chunk:
+        """Take the steps of the stretch that begins with step `first`."""
         count = min(self.stretch, self.steps - first)
         columns = [] if self.reference is None else [self.reference[first : first + count]]
-        self.table = np.hstack([*columns, np.tile(self.own.values[:1], (count, 1))])
+        self.table = np.hstack([*columns, np.tile(self.varying.values[:1], (count, 1))])
         return self.stepper.advance(now, np.array([count], np.int32), self.table)
 
-    # ---- backwards ----
+    # ---- the backward pass ----
 
-    def pull(self, slopes: Sums) -> CostSlopes:
-        """Return the slopes of what has these along the sums of the run.
+    def slopes(self, cotangents: Sums) -> CostSlopes:
+        """Return the slopes of a cost with these slopes along the sums of the run.
 
         Raises:
-            Unsupported: the distances of edges have several.
+            Unsupported: those along the distances of edges differ.
         """
-        if np.ptp(slopes.spacing):
+        if np.ptp(cotangents.spacing):
             raise Unsupported("slopes along distances that are not the same for all edges")
-        self._begin(slopes)
+        self._begin(cotangents)
         for first in reversed(self._firsts()):
             if first + self.stretch < self.steps:
                 self.stepper.record(self.tape, first)
                 self._advance(self.moments[first // self.stretch], first)
             self._back(first, min(self.steps, first + self.stretch))
-        found = self._ended()
+        slopes = self._at_start()
         self.moments.clear()
         if self.tape.nbytes > _LIGHT:
-            self._room = None
+            self._tape = None
             self.stepper.record(None, 0)
-        if not self.wants.spaced:
-            return found
-        # The transpose of a step adds what distances were after it; this is before the first.
-        _, pull = jax.vjp(self.loop.meter.spacing, jnp.asarray(self.states))
-        return found._replace(
-            states=found.states + np.asarray(pull(jnp.asarray(slopes.spacing))[0])
-        )
+        if not self.needs.distances:
+            return slopes
+        # The transpose of a step covers the distances after it; these are before the first step.
+        _, transposed = jax.vjp(self.loop.meter.spacing, jnp.asarray(self.states))
+        of_states = np.asarray(transposed(jnp.asarray(cotangents.spacing))[0])
+        return slopes._replace(states=slopes.states + of_states)
 
-    def _begin(self, slopes: Sums) -> None:
-        """Write the slopes along the sums, of each agent once."""
-        felt, places, loop = self.pair.felt, self.places, self.loop
-        rows = np.zeros((len(loop.offsets), felt.total))
-        rows[:, felt.errors] = slopes.errors.T
-        rows[:, felt.effort] = slopes.effort[:, None]
-        rows[:, felt.spacing] = slopes.spacing[0]
-        rows[loop.leaders, felt.tracking.start : felt.tracking.stop] = slopes.tracking.T
-        rows[loop.leaders, felt.outputs.start : felt.outputs.stop] = slopes.outputs
-        once = places.of[places.agents] == np.arange(len(places.agents))
-        shaped = (rows[places.agents] * once[:, None]).reshape(places.blocks, places.lanes, -1)
-        self.felt[:] = shaped.transpose(0, 2, 1)
-        for array in (*self.mirrors, self.fed, self.totals):
+    def _begin(self, cotangents: Sums) -> None:
+        """Write the cotangents of the sums, of each agent once."""
+        rows, places, loop = self.pair.rows, self.places, self.loop
+        values = np.zeros((len(loop.offsets), rows.total))
+        values[:, rows.errors] = cotangents.errors.T
+        values[:, rows.effort] = cotangents.effort[:, None]
+        values[:, rows.spacing] = cotangents.spacing[0]
+        values[loop.leaders, rows.tracking.start : rows.tracking.stop] = cotangents.tracking.T
+        values[loop.leaders, rows.outputs.start : rows.outputs.stop] = cotangents.outputs
+        once = places.position[places.agents] == np.arange(len(places.agents))
+        shaped = (values[places.agents] * once[:, None]).reshape(places.blocks, places.lanes, -1)
+        self.cotangents[:] = shaped.transpose(0, 2, 1)
+        for array in (*self.mirrors, self.contributions, self.totals):
             array[:] = 0.0
 
     def _back(self, first: int, end: int) -> None:
-        """Take back the steps from one to another, the last first."""
+        """Run the transposes of the steps from one to another, the last first."""
         while end > first:
-            # What neighbours heard of the step after this one is gathered by the graph of then.
-            row, begun = self._row_at(end)
-            start = max(first, end - STEPS, min(begun - 1, end - 1))
-            self._lean(row)
+            # What was sent at the step after this one is gathered by the graph of that step.
+            row, since = self._row_at(end)
+            start = max(first, end - STEPS, min(since - 1, end - 1))
+            self._write_imbalance(row)
             self._call(start, end - start, first, row)
             end = start
 
     def _row_at(self, step: int) -> tuple[int, int]:
-        """Return which row of the weights holds at a step, and since when."""
+        """Return the row of the weights at a step, and its first step."""
         if self.loop.switches is None:
             return 0, 0
         steps, rows = self.loop.switches
         place = int(np.searchsorted(steps, step, side="right")) - 1
         return int(rows[place]), int(steps[place])
 
-    def _lean(self, row: int) -> None:
-        if len(self.pair.felt.lean):
-            leaning = lean(self.loop)[row][self.places.agents]
-            self.felt[:, self.pair.felt.lean.start] = leaning.reshape(-1, self.places.lanes)
+    def _write_imbalance(self, row: int) -> None:
+        rows = self.pair.rows.imbalance
+        if len(rows):
+            weight = imbalance(self.loop)[row][self.places.agents]
+            self.cotangents[:, rows.start] = weight.reshape(-1, self.places.lanes)
 
     def _call(self, start: int, steps: int, first: int, row: int) -> None:
-        kernel, places, reach = self.pair.backward, self.places, self.reach
-        segments, tape = places.segments, self.tape[start - first :]
+        kernel, places = self.pair.backward, self.places
         # The last step first, the followers before the leaders.
-        turns = np.ascontiguousarray(step_by_step(segments, 0, steps, 0, 1)[::-1])
-        common = np.empty(max(1, steps * kernel.common))
+        schedule = np.ascontiguousarray(step_by_step(places.segments, 0, steps, 0, 1)[::-1])
         arrays = {
-            "rows": self.felt,
+            "rows": self.cotangents,
             "mirror": self.mirrors[0],
             "next_mirror": self.mirrors[1],
             "table": self.table[start - first :],
-            "turns": turns,
-            "common": common,
-            "tape": tape,
+            "schedule": schedule,
+            "uniform_values": np.empty(max(1, steps * kernel.uniform_count)),
+            "tape": self.tape[start - first :],
             "totals": self.totals,
-            "fed": self.fed,
+            "contributions": self.contributions,
         }
-        arrays |= reach._asdict() | {"weights": reach.weights[row]}
-        told = {name: array.ctypes.data for name, array in arrays.items()}
-        told |= {"first_step": start, "steps": steps, "count": len(turns)}
-        told |= {"groups": 1, "threads": 1, "line": places.line, "tape_step": self.tape[0].size}
-        told["first_steady"] = int(self.loop.meter.first_steady)
-        kernel.code.call(np.array([told.get(name, 0) for name in SLOTS], np.int64))
+        arrays |= self.graph._asdict() | {"weights": self.graph.weights[row]}
+        numbers = {"first_step": start, "steps": steps, "count": len(schedule)}
+        numbers |= {"groups": 1, "threads": 1, "row_stride": places.row_stride}
+        numbers |= {"tape_step": self.tape[0].size}
+        numbers |= {"first_steady": int(self.loop.meter.first_steady)}
+        call(kernel.code, numbers, arrays)
         if steps % 2:
             self.mirrors.reverse()
 
     # ---- at the beginning of the run ----
 
-    def _ended(self) -> CostSlopes:
-        """Return the slopes, with what the beginning of the run adds to them."""
-        felt, loop = self.pair.felt, self.loop
-        found = self.felt.transpose(0, 2, 1).reshape(len(self.places.agents), -1)[self.places.of]
-        ends = np.cumsum([0, *map(math.prod, self.forms)]).tolist()
-        total, parts = self.totals.sum(axis=1), zip(self.forms, ends[:-1], ends[1:], strict=True)
-        leaves = [total[begin:end].reshape(form) for form, begin, end in parts]
-        heard = heard_back(loop, self._shown())
-        states = found[:, felt.state]
-        offsets = found[:, felt.offset] if self.wants.moved else np.zeros_like(states)
-        if not (len(felt.memory) or self.signals):
-            return CostSlopes(leaves, states + heard, offsets - heard)
-        more = self._begun(found[:, felt.memory], heard)
+    def _at_start(self) -> CostSlopes:
+        """Return the slopes, including those by the initial memories and signals."""
+        rows, places = self.pair.rows, self.places
+        values = self.cotangents.transpose(0, 2, 1).reshape(len(places.agents), -1)
+        values = values[places.position]
+        leaves: list[Array] = unflatten(self._leaves(), self.totals.sum(axis=1))
+        sent = transposed_disagreement(self.loop, self._of_disagreement())
+        states = values[:, rows.state]
+        offsets = values[:, rows.offset] if self.needs.offsets else np.zeros_like(states)
+        if not (len(rows.memory) or self.signals):
+            return CostSlopes(leaves, states + sent, offsets - sent)
+        more = self._of_beginning(values[:, rows.memory], sent)
         leaves = [a + np.asarray(b) for a, b in zip(leaves, more[0], strict=True)]
         return CostSlopes(leaves, states + np.asarray(more[1]), offsets + np.asarray(more[2]))
 
-    def _shown(self) -> Array:
-        """Return the slopes along what agents heard at the first step, (N, s)."""
-        places, shown = self.places, self.mirrors[0]
-        lined = self.pair.backward.plan.lines
-        shown = shown.T if lined else shown.reshape(len(places.agents), -1)
-        return shown[places.of, : self.signals or self.states.shape[1]]
+    def _of_disagreement(self) -> Array:
+        """Return the cotangents of the disagreements at the first step, (N, s)."""
+        places, mirror = self.places, self.mirrors[0]
+        in_rows = self.pair.backward.plan.row_major
+        mirror = mirror.T if in_rows else mirror.reshape(len(places.agents), -1)
+        return mirror[places.position, : self.signals or self.states.shape[1]]
 
-    def _begun(self, memory: Array, heard: Array) -> Any:
-        """Return the slopes along leaves, starts and offsets of how agents begin."""
+    def _of_beginning(
+        self, memory: Array, sent: Array
+    ) -> tuple[list[jax.Array], jax.Array, jax.Array]:
+        """Return the slopes along leaves, starts and offsets by how agents begin."""
         loop = self.loop
 
-        def start(leaves: list[Any], states: Any, offsets: Any) -> Any:
-            now = begin(self.own.filled(leaves), states)
-            said = signals(self.own.filled(leaves), now, offsets)
-            said = states - offsets if said is None else said
-            return now.leader_memory, now.follower_memory, said
+        def start(
+            leaves: list[jax.Array], states: jax.Array, offsets: jax.Array
+        ) -> tuple[Memory, Memory, jax.Array]:
+            now = begin(self.varying.filled(leaves), states)
+            signal = signals(self.varying.filled(leaves), now, offsets)
+            signal = states - offsets if signal is None else signal
+            return now.leader_memory, now.follower_memory, signal
 
-        given = jnp.asarray(self.states), jnp.asarray(loop.offsets, float)
-        made, pull = jax.vjp(start, [jnp.asarray(leaf) for leaf in self._leaves()], *given)
-        felt = list[Any]()
-        for who, tree in ((loop.leaders, made[0]), (loop.followers, made[1])):
-            flat, leaves = memory[who], list[Any]()
-            for leaf in jax.tree.leaves(tree):
-                size = leaf[0].size
-                leaves.append(jnp.asarray(flat[:, :size]).reshape(leaf.shape))
-                flat = flat[:, size:]
-            felt.append(jax.tree.unflatten(jax.tree.structure(tree), leaves))
-        return pull((*felt, jnp.asarray(heard)))
+        arguments = jnp.asarray(self.states), jnp.asarray(loop.offsets, float)
+        leaves = [jnp.asarray(leaf) for leaf in self._leaves()]
+        _, transposed = jax.vjp(start, leaves, *arguments)
+        laws = (loop.leader, loop.leaders), (loop.follower, loop.followers)
+        memories = (unflatten(law.init(), jnp.asarray(memory[agents])) for law, agents in laws)
+        return transposed((*memories, jnp.asarray(sent)))

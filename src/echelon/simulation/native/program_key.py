@@ -1,4 +1,4 @@
-"""Which loops are alike but for numbers, so that one program steps them all."""
+"""Which loops differ only in numbers, so that one program steps them all."""
 
 from collections.abc import Hashable, Sequence
 from typing import Any, final
@@ -14,22 +14,22 @@ from echelon.simulation.step.loop import Loop
 from echelon.simulation.step.settings import Settings
 
 _MOST = 256
-"""Kinds of loops of which it is held what they read."""
+"""Kinds of loops for which it is cached which numbers they read."""
 
 
 @final
 class ProgramKeys:
-    """Tells families apart; what a kind of loop reads of its numbers is traced once."""
+    """Returns the keys of loops; which numbers a kind of loop reads is traced once."""
 
     def __init__(self) -> None:
-        """Begin with no kind known."""
+        """Begin with an empty cache."""
         self._fixed = BoundedCache[list[bool]](_MOST)
 
     def of(self, loop: Loop, settings: Settings) -> Hashable:
-        """Return what is the same for all loops that one program can step, each with own numbers.
+        """Return what is equal for all loops that one program can step.
 
-        Their trees, all that is no number, the draws' times, and the numbers that a reference, a
-        memory at its beginning, the weights or the difference of two states rest on.
+        It has the tree, all leaves that are not numbers, the times of the draws, and the numbers
+        that a reference, an initial memory, the weights or the difference of two states depend on.
         """
         leaves, tree = jax.tree.flatten(bare(loop))
         wind = loop.motion.wind
@@ -44,14 +44,14 @@ class ProgramKeys:
 
 
 def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
-    """Return which leaves must be the same in all loops."""
+    """Return which leaves must be equal in all loops."""
     numbers = [k for k, leaf in enumerate(leaves) if is_number(leaf)]
 
-    def outside(given: list[Any]) -> Any:
-        whole = list(leaves)
-        for k, leaf in zip(numbers, given, strict=True):
-            whole[k] = leaf
-        other: Loop = tree.unflatten(whole)
+    def outside(values: list[jax.Array]) -> tuple[Any, ...]:
+        replaced = list(leaves)
+        for k, value in zip(numbers, values, strict=True):
+            replaced[k] = value
+        other: Loop = tree.unflatten(replaced)
         n = len(other.model.state_names)
         return (
             other.leader.reference_states(other.model, jnp.zeros(1)),
@@ -64,7 +64,7 @@ def _fixed(leaves: Sequence[Any], tree: Any) -> list[bool]:
     try:
         traced = jax.make_jaxpr(outside)([jnp.asarray(leaves[k], float) for k in numbers]).jaxpr
     except Exception:
-        # Code of anyone's that wants numbers gets them: such loops share no program.
+        # A user's code may need concrete numbers: such loops share no program.
         return [True] * len(leaves)
     read = {id(v) for each in traced.eqns for v in each.invars} | {id(v) for v in traced.outvars}
     free = {k for k, v in zip(numbers, traced.invars, strict=True) if id(v) not in read}

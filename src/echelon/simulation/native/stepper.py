@@ -1,4 +1,4 @@
-"""The closed loop stepped by code for this machine: agents in the lanes of vectors."""
+"""Steps the closed loop by machine code, with agents in the lanes of vectors."""
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -10,11 +10,11 @@ import numpy as np
 
 from echelon.core.types import Array
 from echelon.simulation.codegen import aligned, stride
-from echelon.simulation.native.agent_step import memories_of, signals_of
-from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, heard
+from echelon.simulation.native.agent_step import signal_size, unflatten
+from echelon.simulation.native.blocks import FormationBlocks, Places, SwarmBlocks, neighbour_slots
 from echelon.simulation.native.buffers import BufferPool
 from echelon.simulation.native.kernel_cache import KERNELS, LANES, Make
-from echelon.simulation.native.signals import offsets_of, shown_by
+from echelon.simulation.native.signals import mirror_values, offsets_of
 from echelon.simulation.native.threads import ThreadPool
 from echelon.simulation.native.varying import VaryingNumbers
 from echelon.simulation.native.wind_draws import draw_holds, holds_at_once
@@ -25,51 +25,48 @@ from echelon.simulation.step.meter import ALWAYS, Sums
 from echelon.simulation.step.sequence import begin
 
 _AGENT_STEPS, _FEWEST = 2_000_000, 4
-"""Of a chunk: some hundredths of a second."""
+"""Agent steps of a chunk, which take some hundredths of a second, and its fewest steps."""
 _OPERATIONS, _ENOUGH = {64: 3e10, 32: 6e10}, 1_000
-"""Of a chunk with no more steps than enough: about a second of one thread."""
+"""Operations of a chunk with at most so many steps: about a second of one thread."""
 _LARGEST = {64: 1e5, 32: 1e3}
-"""Of a state: beyond it the sines of the kernels lose digits, and JAX goes on."""
-STEPS, _TURNS, _KEPT = 2_048, 200_000, 10_000_000
-"""Of a call: what all agents have in common is kept for each of them, and each level has a turn.
-
-And the numbers of leaders ahead that are kept.
-"""
+"""The largest state: beyond it the sines of the kernels lose digits, and JAX continues."""
+STEPS, _TASKS, _LEADER_NUMBERS = 2_048, 200_000, 10_000_000
+"""Limits of a call: steps, each with its uniform values; tasks; stored numbers of leaders ahead."""
 
 
 def beyond(states: Array, bits: int) -> Array:
     """Return which states are beyond the range of the kernels' sines; NaN is not."""
-    # Truths alone, since another array of so many numbers takes longer than all the rest of it.
+    # Truths only: another array of so many numbers takes longer than all the rest.
     return (states > _LARGEST[bits]) | (states < -_LARGEST[bits])
 
 
 def any_beyond(states: Array, bits: int) -> bool:
-    """Tell whether one of the states is beyond that range."""
+    """Tell whether a state is beyond that range."""
     most = _LARGEST[bits]
-    # A third of the time of truths for all; of NaN no comparison holds, and the truths tell.
-    fit = -most <= states.min(initial=0.0) and states.max(initial=0.0) <= most
-    return not fit and bool(beyond(states, bits).any())
+    # A third of the time of truths for all; with NaN no comparison holds, and the truths decide.
+    inside = -most <= states.min(initial=0.0) and states.max(initial=0.0) <= most
+    return not inside and bool(beyond(states, bits).any())
 
 
 @final
 class NativeStepper(Stepper):
-    """Moves the agents of a formation, or of many that are alike, under laws.
+    """Steps the agents of a formation, or of many that differ only in numbers, under laws.
 
     Args:
         loops: of the run, or of each formation.
         states: (N, n) at its beginning, formation by formation.
         bits: 64 or 32, the precision.
-        far: what goes on where a state is beyond the range of the kernels' sines; None where the
-            caller looks.
-        pool: threads that step formations; None for the caller's alone.
-        make: makes the kernel, or has made it before; those of all runs when left out.
-        unlike: a loop like the one of the run: where it differs, `turn` may change it, and the
-            weights of edges anyway; None where nothing is turned.
-        threads: that share the steps of one formation; by its size when left out.
-        places: of the agents, where they are known.
+        fallback: continues if a state is beyond the range of the kernels' sines; None if the caller
+            checks the range.
+        pool: threads that step formations; None for the caller's only.
+        make: returns the kernel; by default from the cache of all runs.
+        variant: a loop of the same structure: `turn` may change the numbers in which it differs,
+            and the weights of edges; None if `turn` is not called.
+        threads: that share the steps of one formation; by default depending on its size.
+        places: of the agents, if they were computed before.
 
     Raises:
-        Unsupported: a law or the model uses what has no scalar operations.
+        Unsupported: a law or the model has no scalar operations.
     """
 
     def __init__(
@@ -77,88 +74,91 @@ class NativeStepper(Stepper):
         loops: Sequence[Loop],
         states: Array,
         bits: int,
-        far: Stepper | None,
+        fallback: Stepper | None,
         pool: Executor | None = None,
         make: Make | None = None,
-        unlike: Loop | None = None,
+        variant: Loop | None = None,
         threads: int | None = None,
         places: Places | None = None,
     ) -> None:
-        """Write and compile the step."""
-        self.own = VaryingNumbers(loops, unlike)
-        self.loop, self.loops, self.states, self.far = loops[0], loops, states, far
+        """Generate and compile the step."""
+        self.varying = VaryingNumbers(loops, variant)
+        self.loop, self.loops, self.states, self.fallback = loops[0], loops, states, fallback
         self.bits, self.dtype = bits, np.dtype(np.float64 if bits == 64 else np.float32)
-        together, lanes = len(loops) > 1, LANES[bits]
-        known = places or (
-            FormationBlocks(loops, lanes) if together else SwarmBlocks(self.loop, lanes)
+        batched, lanes = len(loops) > 1, LANES[bits]
+        self.places: Places = places or (
+            FormationBlocks(loops, lanes) if batched else SwarmBlocks(self.loop, lanes)
         )
-        self.places: Places = known
-        self.crew, self.room = ThreadPool(self.places, pool, threads), BufferPool()
+        self.threads, self.buffers = ThreadPool(self.places, pool, threads), BufferPool()
         # Numbers of formations follow each other.
-        each = len(self.loop.offsets) * np.arange(len(loops))[:, None]
-        self.leaders = (each + self.loop.leaders).reshape(-1)
-        self.followers = (each + self.loop.followers).reshape(-1)
-        lines, turned = self.places.lines, unlike is not None
-        made = (make or KERNELS.of)(self.own, bits, together, lines, turned)
-        self.code, self.rows, self.plan, self.common = made
-        self._signaled = signals_of(self.loop)
-        # Once, since to ask a law takes as long as many small steps.
+        first = len(self.loop.offsets) * np.arange(len(loops))[:, None]
+        self.leaders = (first + self.loop.leaders).reshape(-1)
+        self.followers = (first + self.loop.followers).reshape(-1)
+        kernel = (make or KERNELS.of)(
+            self.varying, bits, batched, self.places.row_major, variant is not None
+        )
+        self.code, self.rows, self.plan, self.uniform_count = kernel
+        self._signals = signal_size(self.loop)
+        # Once, because to call a law takes as long as many small steps.
         self.memories = self.loop.leader.init(), self.loop.follower.init()
         self._work = 1 + len(needed(self.plan.others.results()))
         self._reserve()
-        # What is in the blocks, so that a chunk that goes on from it need not be written there.
-        self._held: Moment | None = None
-        self._drawn, self._left = -1, -1
+        # The moment in the blocks: a chunk that continues from it need not be written there.
+        self._moment: Moment | None = None
+        self._hold, self._fallback_step = -1, -1
         self._tape: Array | None = None
-        self._ahead = holds_at_once(len(states))
+        self._draws_ahead = holds_at_once(len(states))
 
     # ---- memory ----
 
     def _reserve(self) -> None:
-        """Make what never changes during a run, and room for what does."""
+        """Allocate blocks and mirrors, and compute what does not change during a run."""
         places, plan = self.places, self.plan
         self.blocks = aligned((places.blocks, plan.rows, plan.lanes), self.dtype)
-        shape = (plan.width, places.line) if plan.lines else (places.blocks, plan.mirror)
-        self.mirrors = [aligned(shape, self.dtype) for _ in range(2)]
-        self.found = places.find(plan.width, plan.told if plan.ahead else plan.rows, self.dtype)
-        self.led = int(places.segments[1])
-        if plan.ahead:
+        self.mirrors = places.mirrors(plan, self.dtype)
+        message_rows = plan.message_size if plan.leaders_ahead else plan.rows
+        self.neighbourhood = places.neighbourhood(plan.width, message_rows, self.dtype)
+        self.leader_blocks = int(places.segments[1])
+        if plan.leaders_ahead:
             assert isinstance(places, SwarmBlocks)
-            parts = (self.blocks, *self.mirrors, *self.found[1:3], *self.found[5:7])
+            near = self.neighbourhood
+            parts = (self.blocks, *self.mirrors, near.neighbours, near.weights)
+            parts += (near.edges, near.edge_ends)
             bytes_ = sum(part.nbytes for part in parts) // places.blocks
-            far = 1 if plan.lines else stride(plan.width, plan.lanes)
-            places.measure(self.found, far, bytes_)
-        self.edges, self.heavy = self.found.edges, self.found.weights
+            far = 1 if plan.row_major else stride(plan.width, plan.lanes)
+            places.measure_reach(self.neighbourhood, far, bytes_)
+        self.edges, self.edge_weights = self.neighbourhood.edges, self.neighbourhood.weights
 
     def _read(self, rows: range, out: Array) -> Array:
         """Read rows of all agents into an array (N, rows), and return it."""
-        self.crew.move(self.blocks, rows, out)
+        self.threads.copy(self.blocks, rows, out)
         return out
 
     def _write(self, rows: range, values: Array) -> None:
         """Write values of all agents, (N, rows)."""
-        self.crew.move(self.blocks, rows, np.ascontiguousarray(values, self.dtype), inward=True)
+        self.threads.copy(self.blocks, rows, np.ascontiguousarray(values, self.dtype), inward=True)
 
     # ---- steps ----
 
     @property
     def engine(self) -> str:
-        """What computes the steps."""
+        """The name of the engine."""
         return "native"
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Where it left the steps to JAX."""
-        told = (
-            f"JAX stepped the agents from t = {self._left * self.loop.motion.dt:.6g} s on where a "
-            f"state was beyond {_LARGEST[self.bits]:g}, since the sines of native code lose digits "
-            "there."
+        """From when on JAX stepped the agents."""
+        if self._fallback_step < 0:
+            return ()
+        start = self._fallback_step * self.loop.motion.dt
+        return (
+            f"From t = {start:.6g} s on, JAX stepped the agents whenever a state was beyond "
+            f"{_LARGEST[self.bits]:g}, where the sines of native code lose digits.",
         )
-        return (told,) * (self._left >= 0)
 
     @property
     def longest(self) -> int:
-        """Steps that take some tenths of a second, or a few of very many agents."""
+        """Steps that take some tenths of a second, or a few steps of very many agents."""
         agents = len(self.states) // len(self.loops)
         more = int(_OPERATIONS[self.bits] / (self._work * agents))
         return max(_FEWEST, _AGENT_STEPS // agents, min(_ENOUGH, more))
@@ -173,139 +173,140 @@ class NativeStepper(Stepper):
         states = np.asarray(self.states, self.dtype)
         if not len(self.rows.memory):
             return begin_forgetful(self.loop, states)
-        each = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
-        found = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in each]
-        many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(each[1:] for each in found))
-        return Moment(found[0].step, *many)._replace(states=states)
+        pairs = zip(self.loops, np.split(np.asarray(self.states), len(self.loops)), strict=True)
+        moments = [jax.tree.map(np.asarray, begin(loop, jnp.asarray(x))) for loop, x in pairs]
+        parts = (moment[1:] for moment in moments)
+        many = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        return Moment(moments[0].step, *many)._replace(states=states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
-        """Store frames and take steps; what happens on the way is seen afterwards."""
-        if now is not self._held:
+        """Store frames and take steps; divergence is detected afterwards."""
+        if now is not self._moment:
             self._load(now)
-        made = self._fly(now, counts, reference)
-        if self.far is None or not any_beyond(made.states, self.bits):
-            return made
-        self._held = None
-        self._left = int(now.step) if self._left < 0 else self._left
-        return self.far.advance(now, counts, reference)
+        chunk = self._advance(now, counts, reference)
+        if self.fallback is None or not any_beyond(chunk.states, self.bits):
+            return chunk
+        self._moment = None
+        if self._fallback_step < 0:
+            self._fallback_step = int(now.step)
+        return self.fallback.advance(now, counts, reference)
 
     def turn(self, loop: Loop) -> None:
         """Go on in a loop of one formation that is like the one before, but for its numbers."""
         self.loop, self.loops = loop, [loop]
-        self.own.turn(loop)
-        self.heavy[:] = heard(loop, self.places)[2]
+        self.varying.turn(loop)
+        self.edge_weights[:] = neighbour_slots(loop, self.places)[2]
         # Offsets, numbers and the wind are written with a moment.
-        self._held = None
+        self._moment = None
 
     def record(self, tape: Array | None, first: int) -> None:
-        """Keep what derivatives need of the steps from one on: (steps, blocks, taped, lanes)."""
-        self._tape, self._taped_from = tape, first
+        """Record the steps from `first` on for derivatives: (steps, blocks, rows, lanes)."""
+        self._tape, self._tape_start = tape, first
 
-    def _fly(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
+    def _advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
         self._clear_sums()
         first = int(now.step)
         table = None if reference is None else np.ascontiguousarray(reference, self.dtype)
-        step, agents = first, len(self.places.of)
-        begun, sizes = np.asarray(now.states), [len(self.rows.state), len(self.rows.input)]
-        x, u = (self.room.empty((len(counts), agents, size), float) for size in sizes)
-        # Nobody writes to either, and to copy many takes as long as a step.
-        same = len(counts) == 1 and begun.dtype == x.dtype
-        x = begun[None] if same else x
+        step, agents = first, len(self.places.position)
+        start, sizes = np.asarray(now.states), [len(self.rows.state), len(self.rows.input)]
+        x, u = (self.buffers.empty((len(counts), agents, size), float) for size in sizes)
+        # Neither is written to, and a copy for many agents takes as long as a step.
+        same = len(counts) == 1 and start.dtype == x.dtype
+        x = start[None] if same else x
         for k, count in enumerate(counts.tolist()):
             if step > first:
                 self._read(self.rows.state, x[k])
             elif not same:
-                x[k] = begun
+                x[k] = start
             if count:
                 self._run(step, count, first, table)
                 self._read(self.rows.input, u[k])
                 step += count
             elif k == 0 or counts[k - 1]:
-                self._look(step, first, table, u[k])
+                self._read_next_inputs(step, first, table, u[k])
             else:
                 u[k] = u[k - 1]
-        self._held, sums = self._leave(first, step)
-        return Chunk(self._held, x, u, sums)
+        self._moment, sums = self._moment_and_sums(first, step)
+        return Chunk(self._moment, x, u, sums)
 
-    def _look(self, step: int, first: int, table: Array | None, out: Array) -> None:
+    def _read_next_inputs(self, step: int, first: int, table: Array | None, out: Array) -> None:
         """Read the inputs of a step that is not taken."""
-        changed = (self.blocks, self.edges, *self.mirrors)
-        kept, drawn = [array.copy() for array in changed], self._drawn
+        arrays = (self.blocks, self.edges, *self.mirrors)
+        copies, hold = [array.copy() for array in arrays], self._hold
         self._run(step, 1, first, table)
         self._read(self.rows.input, out)
         self.mirrors.reverse()
-        for array, before in zip(changed, kept, strict=True):
+        for array, before in zip(arrays, copies, strict=True):
             array[:] = before
-        # What was drawn for it is gone from the blocks again.
-        self._drawn = drawn
+        # The draws of that step are no longer in the blocks.
+        self._hold = hold
 
     def _run(self, step: int, steps: int, first: int, table: Array | None) -> None:
-        """Take steps under one draw of the wind, and one stretch of the graph, after the other.
+        """Take steps, one draw of the wind and one stretch of the graph after the other.
 
-        The inputs of the first one are left in the rows.
+        The inputs of the first step are then in the rows.
         """
-        wind, shown = self.loop.motion.wind, step
-        most = _TURNS // len(self.places.segments)
-        if self.plan.ahead:
-            each = self.plan.mirror + self.plan.told * self.plan.lanes
-            most = min(most, _KEPT // (self.led * each))
+        wind, input_step = self.loop.motion.wind, step
+        most = _TASKS // len(self.places.segments)
+        if self.plan.leaders_ahead:
+            size = self.plan.mirror + self.plan.message_size * self.plan.lanes
+            most = min(most, _LEADER_NUMBERS // (self.leader_blocks * size))
         while steps:
-            count = min(steps, STEPS, max(1, most), self._switch(step))
+            row, constant = stretch_at(self.loop, step)
+            self.neighbourhood = self.neighbourhood._replace(weights=self.edge_weights[row])
+            count = min(steps, STEPS, max(1, most), constant)
             if wind is not None:
                 hold = int(wind.window)
                 self._draw(step // hold, hold)
                 count = min(count, hold - step % hold)
-            self._call(step, count, shown, None if table is None else table[step - first :])
+            self._call(step, count, input_step, None if table is None else table[step - first :])
             step, steps = step + count, steps - count
 
-    def _switch(self, step: int) -> int:
-        """Take the weights that hold at a step, and return for how many steps they do."""
-        row, count = stretch_at(self.loop, step)
-        self.found = self.found._replace(weights=self.heavy[row])
-        return count
-
     def _draw(self, number: int, hold: int) -> None:
-        """Write what wind and noise are during a hold."""
-        if number == self._drawn:
+        """Write wind and noise of a holding interval."""
+        if number == self._hold:
             return
-        first, at = number - number % self._ahead, number % self._ahead
-        if first != self._drawn - self._drawn % self._ahead or self._drawn < 0:
-            self._winds = draw_holds(self.loops, first + np.arange(self._ahead), hold)
-        self._drawn = number
-        for rows, part in zip((self.rows.push, self.rows.noise), self._winds, strict=True):
+        count = self._draws_ahead
+        first, at = number - number % count, number % count
+        if first != self._hold - self._hold % count or self._hold < 0:
+            self._draws = draw_holds(self.loops, first + np.arange(count), hold)
+        self._hold = number
+        for rows, part in zip((self.rows.push, self.rows.noise), self._draws, strict=True):
             if part is not None:
                 self._write(rows, part[at].reshape(len(self.states), -1))
 
-    def _call(self, step: int, steps: int, shown: int, table: Array | None) -> None:
+    def _call(self, step: int, steps: int, input_step: int, table: Array | None) -> None:
         """Run the kernel; each step exchanges the two mirrors."""
-        places, plan, arrays = self.places, self.plan, self.found._asdict()
-        if plan.ahead:
-            arrays["ahead"] = aligned((steps + 1, *self._led.shape), self.dtype)
-            arrays["told"] = aligned((steps, self.led, plan.told, plan.lanes), self.dtype)
-            arrays["ahead"][0] = self._led
+        places, plan, arrays = self.places, self.plan, self.neighbourhood._asdict()
+        if plan.leaders_ahead:
+            mirrors = aligned((steps + 1, *self._leader_mirror.shape), self.dtype)
+            mirrors[0] = self._leader_mirror
+            size = (steps, self.leader_blocks, plan.message_size, plan.lanes)
+            arrays |= {"leader_mirrors": mirrors, "leader_messages": aligned(size, self.dtype)}
         values = {name: array.ctypes.data for name, array in arrays.items()}
         values |= {} if table is None else {"table": table.ctypes.data}
-        values |= {"first_step": step, "steps": steps, "shown": shown, "led_blocks": self.led}
+        values |= {"first_step": step, "steps": steps, "input_step": input_step}
+        values |= {"leader_blocks": self.leader_blocks, "row_stride": places.row_stride}
         values |= {"blocks": int(places.segments[-1]), "edge_blocks": places.edge_blocks}
-        values |= {"line": places.line, "first_steady": int(self.loop.meter.first_steady)}
+        values |= {"first_steady": int(self.loop.meter.first_steady)}
         if self._tape is not None:
-            now = self._tape[step - self._taped_from]
-            values |= {"tape": now.ctypes.data, "tape_step": now.size}
+            tape = self._tape[step - self._tape_start]
+            values |= {"tape": tape.ctypes.data, "tape_step": tape.size}
         firsts = {"rows": self.blocks, "mirror": self.mirrors[0], "next_mirror": self.mirrors[1]}
         firsts["edges"] = self.edges
-        common = np.empty(steps * self.common, self.dtype)
-        self.crew.run(self.code, values, firsts, common)
+        uniform_values = np.empty(steps * self.uniform_count, self.dtype)
+        self.threads.run(self.code, values, firsts, uniform_values)
         if steps % 2:
             self.mirrors.reverse()
-        if plan.ahead:
-            self._led[:] = arrays["ahead"][-1]
+        if plan.leaders_ahead:
+            self._leader_mirror[:] = arrays["leader_mirrors"][-1]
 
     @property
-    def _led(self) -> Array:
-        """What leaders show."""
-        if self.plan.lines:
-            return self.mirrors[0][:, : self.led * self.plan.lanes]
-        return self.mirrors[0][: self.led]
+    def _leader_mirror(self) -> Array:
+        """What is read of leaders."""
+        if self.plan.row_major:
+            return self.mirrors[0][:, : self.leader_blocks * self.plan.lanes]
+        return self.mirrors[0][: self.leader_blocks]
 
     # ---- moments and sums ----
 
@@ -316,74 +317,75 @@ class NativeStepper(Stepper):
         self._write(rows.state, x)
         self._write(rows.offset, offsets)
         self._write(rows.cut, np.asarray(now.cut))
-        self._write(rows.own, np.repeat(self.own.values, len(self.loop.offsets), axis=0))
-        self._show(shown_by(self.loops, now, x, offsets, bool(self._signaled)))
+        self._write(rows.varying, np.repeat(self.varying.values, len(self.loop.offsets), axis=0))
+        self._write_mirror(mirror_values(self.loops, now, x, offsets, bool(self._signals)))
         memory = np.zeros((len(x), len(rows.memory)))
-        for who, tree in ((self.leaders, now.leader_memory), (self.followers, now.follower_memory)):
-            leaves = [np.asarray(leaf).reshape(len(who), -1) for leaf in jax.tree.leaves(tree)]
-            flat = np.concatenate([np.zeros((len(who), 0)), *leaves], axis=1)
-            memory[who, : flat.shape[1]] = flat
+        trees = (self.leaders, now.leader_memory), (self.followers, now.follower_memory)
+        for agents, tree in trees:
+            leaves = [np.asarray(leaf).reshape(len(agents), -1) for leaf in jax.tree.leaves(tree)]
+            flat = np.concatenate([np.zeros((len(agents), 0)), *leaves], axis=1)
+            memory[agents, : flat.shape[1]] = flat
         self._write(rows.memory, memory)
-        self._drawn = -1
+        self._hold = -1
 
-    def _show(self, values: Array) -> None:
-        """Write what neighbours read of all agents, (N, n), or more beside their states."""
-        if self.plan.lines:
+    def _write_mirror(self, values: Array) -> None:
+        """Write what neighbours read of all agents, (N, s)."""
+        if self.plan.row_major:
             self.mirrors[0][:, : len(self.places.agents)] = values[self.places.agents].T
             return
-        if self.plan.together:
+        if self.plan.batched:
             rows = self.mirrors[0].reshape(self.places.blocks, -1, self.plan.lanes)
-            self.crew.move(rows, range(self.plan.width), values, inward=True)
+            self.threads.copy(rows, range(self.plan.width), values, inward=True)
             return
-        shown = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
-        wide = self.mirrors[0].reshape(*shown.shape[:2], -1)
-        # Whether an angle is large is left open, and seen by the kernel.
+        lanes = values[self.places.agents].reshape(self.places.blocks, self.plan.lanes, -1)
+        wide = self.mirrors[0].reshape(*lanes.shape[:2], -1)
+        # NaN as the flag of large angles: the kernel then checks.
         wide[:, :, : self.plan.width] = np.nan
-        wide[:, :, : values.shape[1]] = shown
+        wide[:, :, : values.shape[1]] = lanes
 
-    def _leave(self, first: int, step: int) -> tuple[Moment, Sums]:
-        """Return what is in the blocks as a moment, and the sums from one step to another."""
+    def _moment_and_sums(self, first: int, step: int) -> tuple[Moment, Sums]:
+        """Return the moment in the blocks, and the sums from one step to another."""
         rows = self.rows
         sums = range(rows.errors.start, rows.tracking.start)
         parts = (rows.state, self.dtype), (rows.memory, self.dtype), (rows.cut, self.dtype)
-        x, memory, cut, kept = (
-            self._read(part, self.room.empty((len(self.places.of), len(part)), kind))
+        x, memory, cut, agent_sums = (
+            self._read(part, self.buffers.empty((len(self.places.position), len(part)), kind))
             for part, kind in (*parts, (sums, np.float64))
         )
-        now: Any = [
+        fields: Any = [
             np.asarray(step, np.int32),
             x,
-            memories_of(self.memories[0], memory[self.leaders]),
-            memories_of(self.memories[1], memory[self.followers]),
+            unflatten(self.memories[0], memory[self.leaders]),
+            unflatten(self.memories[1], memory[self.followers]),
             cut.astype(np.int8),
         ]
-        return Moment(*now), self._sums(first, step, kept)
+        return Moment(*fields), self._sums(first, step, agent_sums)
 
     def _clear_sums(self) -> None:
         rows = self.rows
-        nothing = np.zeros((rows.total, 1), self.dtype)
-        nothing[rows.unsettled.start], nothing[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
-        self.blocks[:, rows.errors.start :] = nothing[rows.errors.start :]
+        initial = np.zeros((rows.total, 1), self.dtype)
+        initial[rows.unsettled.start], initial[rows.inside.start : rows.inside.stop] = -1.0, ALWAYS
+        self.blocks[:, rows.errors.start :] = initial[rows.errors.start :]
         self.edges[..., -1, :] = 0.0
 
-    def _sums(self, first: int, end: int, kept: Array) -> Sums:
-        """Return the sums over the steps from one to another, of which agents keep theirs."""
+    def _sums(self, first: int, end: int, agent_sums: Array) -> Sums:
+        """Return the sums over the steps from one to another; those of agents are given."""
         rows, leaders, meter = self.rows, self.leaders, self.loop.meter
         steady = max(0, end - max(first, int(meter.first_steady)))
         begin = rows.errors.start
 
         def of(places: range) -> Array:
-            return kept[:, places.start - begin : places.stop - begin]
+            return agent_sums[:, places.start - begin : places.stop - begin]
 
-        def led(places: range) -> Array:
-            block, lane = np.divmod(self.places.of[leaders], self.plan.lanes)
+        def of_leaders(places: range) -> Array:
+            block, lane = np.divmod(self.places.position[leaders], self.plan.lanes)
             return self.blocks[block, places.start : places.stop, lane].astype(np.float64)
 
-        found = Sums(
+        sums = Sums(
             steps=np.array([end - first, steady]),
-            errors=_whole(of(rows.errors)),
-            tracking=_whole(led(rows.tracking)),
-            outputs=led(rows.outputs),
+            errors=_total_and_window(of(rows.errors)),
+            tracking=_total_and_window(of_leaders(rows.tracking)),
+            outputs=of_leaders(rows.outputs),
             effort=of(rows.effort)[:, 0],
             spacing=self.places.spacing(self.edges),
             limited=of(rows.limited)[:, 0],
@@ -391,10 +393,10 @@ class NativeStepper(Stepper):
             inside=np.minimum(of(rows.inside), ALWAYS),
             chatter=of(rows.chatter)[:, 0],
         )
-        sums = Sums(*(np.asarray(part, np.float64) for part in found))
+        sums = Sums(*(np.asarray(part, np.float64) for part in sums))
         return sums.split(len(self.loops))
 
 
-def _whole(parted: Array) -> Array:
-    """Return sums of all steps and of the steady window (2, N) from those before it and in it."""
-    return np.stack([parted[:, 0] + parted[:, 1], parted[:, 1]])
+def _total_and_window(sums: Array) -> Array:
+    """Return the sums of all steps and of the steady window (2, N) from those before and in it."""
+    return np.stack([sums[:, 0] + sums[:, 1], sums[:, 1]])

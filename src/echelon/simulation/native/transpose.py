@@ -1,7 +1,7 @@
-"""How what one agent felt of a step is pulled back through it, as scalars: the step's transpose.
+"""The transpose of one agent's step as scalar operations: it maps cotangents backward in time.
 
-It is `jax.vjp` of the very step that is run (`scalars.agent_step`), so that its derivatives are
-those of JAX. Of the step itself it finds on a tape what it rests on.
+It is `jax.vjp` of the step that is run (`agent_step.agent_step`), so that its derivatives are those
+of JAX. It reads from a tape what the step depended on.
 """
 
 import functools
@@ -18,13 +18,14 @@ from echelon.simulation.native.agent_step import (
     BlockRows,
     StepInputs,
     agent_step,
-    known_of,
     leaves_of,
     memory_size,
-    own_leaves,
-    shaped,
-    signals_of,
+    row_ranges,
+    signal_size,
     single,
+    step_inputs,
+    unflatten,
+    varying_leaves,
 )
 from echelon.simulation.native.kernel_cache import LANES
 from echelon.simulation.native.varying import VaryingNumbers
@@ -34,24 +35,24 @@ from echelon.simulation.step.meter import spacing_error
 
 
 class CotangentRows(NamedTuple):
-    """Where the slopes of an agent lie in its block on the way back; each a range of rows.
+    """Where the cotangents of an agent are in its block in the backward pass; ranges of rows.
 
     Attributes:
-        state, memory: the slopes along what the step before made of it.
-        offset: along its goal's offset, added up, where that is wanted.
-        heard: along its disagreement at the step after this, where it is asked for again.
-        place: its position then and that of its goal, where slopes along distances are wanted.
-        lean: by how much weight it then heard more than it was heard, where some do.
-        spacing, errors, tracking, outputs, effort: along what it adds to `Sums` at each step.
+        state, memory: of the results of the previous step.
+        offset: of its goal's offset, added up, if it is needed.
+        disagreement: of its disagreement at the following step, if it is needed again.
+        place: its position then and that of its goal, if distances have cotangents.
+        imbalance: the weight by which it then received more than it sent, if that is not 0 for all.
+        spacing, errors, tracking, outputs, effort: of what it adds to `Sums` at each step.
         total: how many rows there are.
     """
 
     state: range
     memory: range
     offset: range
-    heard: range
+    disagreement: range
     place: range
-    lean: range
+    imbalance: range
     spacing: range
     errors: range
     tracking: range
@@ -60,29 +61,23 @@ class CotangentRows(NamedTuple):
     total: int
 
     @classmethod
-    def of(cls, loop: Loop, rows: BlockRows, spaced: bool, moved: bool) -> "CotangentRows":
-        """Return the rows of a loop of such rows, `spaced` with `place`, `moved` with `offset`."""
-        leaning, n, q = leans(loop), len(rows.state), len(loop.meter.measured)
-        heard = heard_by(loop) * (leaning or spaced)
-        sizes = [n, len(rows.memory), n * moved, heard, 2 * q * spaced]
-        sizes += [int(leaning), 1, 2, 2, len(rows.outputs), 1]
-        ends = np.cumsum([0, *sizes]).tolist()
-        found: Any = [*(range(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)), ends[-1]]
-        return cls(*found)
+    def of(cls, loop: Loop, rows: BlockRows, distances: bool, offsets: bool) -> "CotangentRows":
+        """Return the rows of a loop, with `place` for `distances`, with `offset` for `offsets`."""
+        n, q = len(rows.state), len(loop.meter.measured)
+        unbalanced = bool(imbalance(loop).any())
+        disagreement = disagreement_size(loop) * (unbalanced or distances)
+        sizes = [n, len(rows.memory), n * offsets, disagreement, 2 * q * distances]
+        sizes += [int(unbalanced), 1, 2, 2, len(rows.outputs), 1]
+        return cls(*row_ranges(sizes))
 
 
-def heard_by(loop: Loop) -> int:
-    """Return of how many numbers an agent's disagreement is."""
-    return signals_of(loop) or len(loop.model.state_names)
+def disagreement_size(loop: Loop) -> int:
+    """Return how many numbers the disagreement of an agent has."""
+    return signal_size(loop) or len(loop.model.state_names)
 
 
-def leans(loop: Loop) -> bool:
-    """Tell whether some agent hears more, or less, than it is heard."""
-    return bool(lean(loop).any())
-
-
-def lean(loop: Loop) -> Array:
-    """Return by how much weight each agent hears more than it is heard, (stretches, N)."""
+def imbalance(loop: Loop) -> Array:
+    """Return the weight by which each agent receives more than it sends, (stretches, N)."""
     exchange, agents = loop.exchange, len(loop.offsets)
 
     def sums(ends: Array, weights: Array) -> Array:
@@ -92,195 +87,212 @@ def lean(loop: Loop) -> Array:
     return np.stack([sums(exchange.receivers, w) - sums(exchange.senders, w) for w in rows])
 
 
-class _Moving(NamedTuple):
-    """What of an agent's step there are slopes along."""
+class _Arguments(NamedTuple):
+    """Inputs of an agent's step that have cotangents, or these cotangents."""
 
     x: Any
     offset: Any
     z: Any
-    told: Any
+    message: Any
     memory: Any
     leader: Any
 
 
-_SMOOTH = ("state", "memory", "tell", "errors", "tracking", "outputs", "effort", "saying")
-"""What of a step there are slopes of; the rest is counted."""
+_RESULTS = (
+    "state",
+    "memory",
+    "message",
+    "errors",
+    "tracking",
+    "outputs",
+    "effort",
+    "next_signal",
+)
+"""Outputs of a step that have cotangents; the others are counts."""
 
 
 class TransposedStep(NamedTuple):
-    """The transpose of a step: its body, and the leaves that the step leaves on its tape."""
+    """The transpose of a step: its body, and the leaves that the step records on a tape."""
 
     body: Body
-    kept: list[tuple[str, int]]
+    recorded: list[tuple[str, int]]
 
 
 @final
 class Transpose:
-    """What makes the transpose of the leaders' or of all others' step.
+    """Derives the transpose of the leaders' or of all others' step.
 
     Args:
-        own: the loop, and its numbers along which slopes are wanted.
+        varying: the loop, and its numbers with respect to which to differentiate.
         bits: 64 or 32.
-        rows: where the numbers of an agent lie in a step.
-        felt: where its slopes lie on the way back.
-        leads: whether leaders are meant.
-        follows: whether they follow a reference, which stands in the table.
+        rows: where the numbers of an agent are in a step.
+        cotangents: where its cotangents are in the backward pass.
+        leads: whether it is the step of the leaders.
+        follows: whether they follow a reference, which is in the table.
     """
 
     def __init__(
         self,
-        own: VaryingNumbers,
+        varying: VaryingNumbers,
         bits: int,
         rows: BlockRows,
-        felt: CotangentRows,
+        cotangents: CotangentRows,
         leads: bool,
         follows: bool,
     ) -> None:
         """Begin a graph."""
-        self.own, self.loop, self.rows, self.felt = own, own.loop, rows, felt
+        self.varying, self.loop, self.rows, self.cotangents = (
+            varying,
+            varying.loop,
+            rows,
+            cotangents,
+        )
         self.leads, self.follows, self.graph = leads, follows, ScalarGraph(bits)
-        self.law = own.loop.leader if leads else own.loop.follower
-        self.signals, self.measured = signals_of(own.loop), own.loop.meter.measured
+        self.law = self.loop.leader if leads else self.loop.follower
+        self.has_signals = signal_size(self.loop) > 0
+        self.measured, self.width = list(self.loop.meter.measured), disagreement_size(self.loop)
 
-    def made(self) -> TransposedStep:
+    def derive(self) -> TransposedStep:
         """Return the transpose.
 
-        What is added to totals are the slopes along the numbers of the loop's own, leaf by leaf.
+        Its totals are the slopes along the varying numbers, leaf by leaf.
 
         Raises:
-            Unsupported: the law or the model uses what has no scalar operations.
+            Unsupported: the law or the model has no scalar operations.
         """
         self._check_difference()
-        known = known_of(self.loop, self.graph, self.rows, self.law, self.leads, self.follows)
-        moving = _Moving(*(getattr(known, name) for name in _Moving._fields))
-        leaves = own_leaves(self.own, self.graph, self.rows, self.follows, True)
-        after = self._after()
-        arguments = [leaves, known, moving, self._given(after)]
-        found = [nodes(self.graph, part) for part in lower(self._pull, self.graph, arguments)]
-        tree = jax.tree.structure(moving, is_leaf=lambda part: isinstance(part, np.ndarray))
-        along = [node for part in found[: len(leaves)] for node in part]
-        body = self._body(known, tree.unflatten(found[len(leaves) :]), after, along)
-        return TransposedStep(*from_tape(body, {"felt": "row", "heard": "z"}))
+        inputs = step_inputs(self.loop, self.graph, self.rows, self.law, self.leads, self.follows)
+        arguments = _Arguments(*(getattr(inputs, name) for name in _Arguments._fields))
+        leaves = varying_leaves(self.varying, self.graph, self.rows, self.follows, True)
+        of_mirror = self._of_mirror()
+        values = [leaves, inputs, arguments, self._of_results(of_mirror)]
+        parts = [nodes(self.graph, part) for part in lower(self._transposed, self.graph, values)]
+        tree = jax.tree.structure(arguments, is_leaf=lambda part: isinstance(part, np.ndarray))
+        of_varying = [node for part in parts[: len(leaves)] for node in part]
+        back: _Arguments = tree.unflatten(parts[len(leaves) :])
+        body = self._body(inputs, back, of_mirror, of_varying)
+        return TransposedStep(*from_tape(body, {"cotangent": "row", "gathered": "z"}))
 
-    def _pull(self, leaves: list[Any], known: StepInputs, moving: _Moving, given: Any) -> Any:
-        def act(leaves: list[Any], moving: _Moving) -> tuple[Any, ...]:
-            step = agent_step(self.own.filled(leaves), self.leads)
-            done = step(known._replace(**moving._asdict()))
-            return tuple(getattr(done, name) for name in _SMOOTH)
+    def _transposed(
+        self, leaves: list[jax.Array], inputs: StepInputs, arguments: _Arguments, cotangents: Any
+    ) -> tuple[list[jax.Array], _Arguments]:
+        def step(leaves: list[jax.Array], arguments: _Arguments) -> tuple[Any, ...]:
+            act = agent_step(self.varying.filled(leaves), self.leads)
+            outputs = act(inputs._replace(**arguments._asdict()))
+            return tuple(getattr(outputs, name) for name in _RESULTS)
 
-        return jax.vjp(act, leaves, moving)[1](given)
+        return jax.vjp(step, leaves, arguments)[1](cotangents)
 
-    def _leaf(self, places: range, kind: str = "felt") -> np.ndarray:
+    def _leaf(self, places: range, kind: str = "cotangent") -> np.ndarray:
         return leaves_of(self.graph, kind, places)
 
-    # ---- what neighbours felt ----
+    # ---- neighbours ----
 
     def _check_difference(self) -> None:
-        """Refuse a difference of states whose slopes are not 1 along the one, -1 along the other.
+        """Check that the slopes of the difference of two states are 1 and -1.
 
         Raises:
-            Unsupported: so it is.
+            Unsupported: they are not.
         """
-        if self.signals:
+        if self.has_signals:
             return
         n, difference = len(self.rows.state), self.loop.model.difference
-        given = [self._leaf(range(n), kind) for kind in ("own", "their", "felt")]
+        values = [self._leaf(range(n), kind) for kind in ("self", "neighbour", "cotangent")]
 
-        def pull(own: Any, their: Any, felt: Any) -> Any:
-            return jax.vjp(difference, own, their)[1](felt)
+        def transposed(x: jax.Array, y: jax.Array, w: jax.Array) -> tuple[jax.Array, ...]:
+            return jax.vjp(difference, x, y)[1](w)
 
-        found = [nodes(self.graph, part) for part in lower(pull, self.graph, given)]
-        if found != [list(given[2]), [-node for node in given[2]]]:
-            raise Unsupported("a `difference` of states that is not x - y but for whole turns")
+        slopes = [nodes(self.graph, part) for part in lower(transposed, self.graph, values)]
+        if slopes != [list(values[2]), [-node for node in values[2]]]:
+            raise Unsupported("a `difference` of states that is not x - y up to whole turns")
 
-    def _after(self) -> np.ndarray:
-        """Return the slopes along what neighbours read after a step."""
-        heard = heard_by(self.loop)
-        found = self._leaf(range(heard), "heard")
-        if not len(self.felt.lean):
-            return found
-        # What is gathered has as many of one's own as one was heard by, and not as one heard.
-        return found + self._leaf(self.felt.lean) * self._leaf(self.felt.heard)
+    def _of_mirror(self) -> np.ndarray:
+        """Return the cotangents of what neighbours read after a step."""
+        gathered = self._leaf(range(self.width), "gathered")
+        if not len(self.cotangents.imbalance):
+            return gathered
+        # The sum over receivers has the agent's own cotangent once per receiver, not per sender.
+        weight = self._leaf(self.cotangents.imbalance)
+        return gathered + weight * self._leaf(self.cotangents.disagreement)
 
-    def _now(self, heard: int) -> list[Node]:
-        """Return what neighbours read of an agent at hand."""
-        if not len(self.felt.place):
-            # Plain differences are gathered from memory alone.
-            return [self.graph.constant(0.0)] * heard
-        return [*self._leaf(self.felt.heard), *self._leaf(self.felt.place)]
+    def _mirror_before(self) -> list[Node]:
+        """Return what neighbours read of an agent, from its block."""
+        if not len(self.cotangents.place):
+            # Plain differences are gathered from mirrors only.
+            return [self.graph.constant(0.0)] * self.width
+        return [*self._leaf(self.cotangents.disagreement), *self._leaf(self.cotangents.place)]
 
     def _difference(self) -> list[Node]:
-        """Return what is gathered of what neighbours show, entry by entry."""
-        heard, q = heard_by(self.loop), len(self.measured)
-        own, their = (self._leaf(range(heard + 2 * q), kind) for kind in ("own", "their"))
-        plain = [self.graph.make("sub", a, b) for a, b in zip(own, their, strict=True)]
-        if not len(self.felt.place):
-            return plain[:heard]
+        """Return the differences that are gathered of what neighbours read, entry by entry."""
+        width, q = self.width, len(self.measured)
+        kinds = "self", "neighbour"
+        mine, theirs = (self._leaf(range(width + 2 * q), kind) for kind in kinds)
+        plain = [self.graph.make("sub", a, b) for a, b in zip(mine, theirs, strict=True)]
+        if not len(self.cotangents.place):
+            return plain[:width]
 
-        def pull(own: Any, their: Any) -> Any:
-            goals = jnp.sqrt(jnp.sum((own[q:] - their[q:]) ** 2))
-            return jax.grad(lambda p: spacing_error(jnp.sum((p - their[:q]) ** 2), goals))(own[:q])
+        def slope(x: jax.Array, y: jax.Array) -> jax.Array:
+            goals = jnp.sqrt(jnp.sum((x[q:] - y[q:]) ** 2))
+            return jax.grad(lambda p: spacing_error(jnp.sum((p - y[:q]) ** 2), goals))(x[:q])
 
-        [apart] = lower(pull, self.graph, [own[heard:], their[heard:]])
-        return [*plain[:heard], *nodes(self.graph, apart)]
+        [slopes] = lower(slope, self.graph, [mine[width:], theirs[width:]])
+        return [*plain[:width], *nodes(self.graph, slopes)]
 
     # ---- the step ----
 
-    def _given(self, after: np.ndarray) -> tuple[Any, ...]:
-        """Return the slopes along what a step comes to, in the order of `_SMOOTH`."""
-        felt, told = self.felt, range(len(self.rows.tell))
-        feeds = self.leads or self.loop.levels is not None
-        reads = self.leads and self.follows
-        state = self._leaf(felt.state)
-        if len(felt.place):
-            heard = heard_by(self.loop)
-            apart = self._leaf(range(heard, heard + len(self.measured)), "heard")
-            state[list(self.measured)] += self._leaf(felt.spacing) * apart
+    def _of_results(self, of_mirror: np.ndarray) -> tuple[Any, ...]:
+        """Return the cotangents of the results of a step, in the order of `_RESULTS`."""
+        rows, message = self.cotangents, range(len(self.rows.message))
+        sends = self.leads or self.loop.levels is not None
+        tracks = self.leads and self.follows
+        state = self._leaf(rows.state)
+        if len(rows.place):
+            places = range(self.width, self.width + len(self.measured))
+            slopes = self._leaf(places, "gathered")
+            state[self.measured] += self._leaf(rows.spacing) * slopes
         return (
-            state if self.signals else state + after,
-            shaped(self._leaf(felt.memory[: memory_size(self.law)]), self.law.init()),
-            self._leaf(told, "fed") if feeds else np.zeros(len(told)),
-            self._leaf(felt.errors),
-            self._leaf(felt.tracking) if reads else np.zeros(2),
-            self._leaf(felt.outputs) if reads else np.zeros(len(self.rows.outputs)),
-            single(self._leaf(felt.effort)[0]),
-            after if self.signals else np.zeros(0),
+            state if self.has_signals else state + of_mirror,
+            unflatten(self.law.init(), self._leaf(rows.memory[: memory_size(self.law)])),
+            self._leaf(message, "contribution") if sends else np.zeros(len(message)),
+            self._leaf(rows.errors),
+            self._leaf(rows.tracking) if tracks else np.zeros(2),
+            self._leaf(rows.outputs) if tracks else np.zeros(len(self.rows.outputs)),
+            single(self._leaf(rows.effort)[0]),
+            of_mirror if self.has_signals else np.zeros(0),
         )
 
-    def _body(self, known: StepInputs, back: _Moving, after: np.ndarray, along: list[Node]) -> Body:
-        """Return the body, of the slopes that a step's have become."""
-        felt, measured, place = self.felt, list(self.measured), list[Node]()
+    def _body(
+        self, inputs: StepInputs, back: _Arguments, of_mirror: np.ndarray, of_varying: list[Node]
+    ) -> Body:
+        """Return the body of the transpose, from the cotangents of a step's arguments."""
+        rows, measured, place = self.cotangents, self.measured, list[Node]()
         x, offset = np.array(back.x, object), np.array(back.offset, object)
-        if not self.signals:
-            # What neighbours read is x - offset, after the step.
-            offset = offset - after
+        if not self.has_signals:
+            # Neighbours read x - offset, after the step.
+            offset = offset - of_mirror
         if self.leads:
-            # What followers measured their errors from is its own x - offset.
-            begin = stride(len(self.rows.tell), LANES[self.graph.bits])
-            fed = self._leaf(range(begin, begin + len(measured)), "fed")
-            x[measured] += fed
-            offset[measured] -= fed
-        if len(felt.place):
-            place = [*known.x[measured], *known.offset[measured]]
+            # Followers measured their errors from the leader's x - offset.
+            begin = stride(len(self.rows.message), LANES[self.graph.bits])
+            of_place = self._leaf(range(begin, begin + len(measured)), "contribution")
+            x[measured] += of_place
+            offset[measured] -= of_place
+        if len(rows.place):
+            place = [*inputs.x[measured], *inputs.offset[measured]]
         memory = jax.tree.leaves(back.memory, is_leaf=lambda part: isinstance(part, list))
-        stores = dict(zip(felt.state, x, strict=True))
-        stores |= zip(felt.memory, functools.reduce(operator.add, memory, []), strict=False)
-        stores |= zip(felt.heard, back.z, strict=False)
+        stores = dict(zip(rows.state, x, strict=True))
+        stores |= zip(rows.memory, functools.reduce(operator.add, memory, []), strict=False)
+        stores |= zip(rows.disagreement, back.z, strict=False)
         return Body(
-            stores=stores | dict(zip(felt.place, place, strict=True)),
-            sums=dict(zip(felt.offset, offset, strict=False)),
-            greatest={},
-            least={},
-            shown={},
-            now=self._now(len(back.z)),
+            stores=stores | dict(zip(rows.place, place, strict=True)),
+            sums=dict(zip(rows.offset, offset, strict=False)),
             mirror=[*back.z, *place],
-            difference=self._difference(),
-            totals={k: node for k, node in enumerate(along) if not _is_nothing(node)},
-            to_sources=[] if self.leads else back.told,
+            to_sources=[] if self.leads else back.message,
             to_leaders=[] if self.leads else [back.leader[k] for k in measured],
+            totals={k: n for k, n in enumerate(of_varying) if not _is_zero(n)},
+            mirror_before=self._mirror_before(),
+            difference=self._difference(),
         )
 
 
-def _is_nothing(node: Node) -> bool:
-    """Tell whether a slope is always 0."""
+def _is_zero(node: Node) -> bool:
     return node.op == "constant" and node.value == 0.0

@@ -1,4 +1,4 @@
-"""A graph turned about: who heard each agent, for what is taken back along its edges."""
+"""The transposed graph: the receivers of each agent, for derivatives along its edges."""
 
 from typing import NamedTuple
 
@@ -6,83 +6,103 @@ import numpy as np
 
 from echelon.agents.network.exchange import Exchange
 from echelon.core.types import Array
-from echelon.simulation.codegen import aligned, fed_widths, stride
-from echelon.simulation.native.blocks import SwarmBlocks, heard, senders_of, smooth_blocks
+from echelon.simulation.codegen import contribution_widths, stride
+from echelon.simulation.native.blocks import (
+    SwarmBlocks,
+    aligned_copy,
+    contiguous_blocks,
+    neighbour_slots,
+    senders_of,
+)
 from echelon.simulation.native.kernel_cache import Kernel
 from echelon.simulation.scalars import Unsupported
 from echelon.simulation.step.loop import Loop, stretch_at
 
 
 class TransposedGraph(NamedTuple):
-    """Who heard each agent, as `places.heard` has whom it hears; whose positions are in lines."""
+    """The receivers of each agent, as `blocks.neighbour_slots` has its senders.
+
+    Attributes:
+        starts: (blocks + 1,) the first slot of each block.
+        positions: (slots, lanes) of the receivers.
+        weights: (rows, slots, lanes) of the edges.
+        contiguous: (blocks,) whether the receivers of a block follow each other.
+        row_major: whether the mirror is row-major.
+    """
 
     starts: Array
     positions: Array
     weights: Array
-    smooth: Array
-    lines: bool
+    contiguous: Array
+    row_major: bool
 
 
 class TransposedArrays(NamedTuple):
-    """The same as a kernel reads it, and whom each agent feeds: `places.Found` turned about."""
+    """The same as a kernel reads it, and to whom each agent contributes: a `Neighbourhood`."""
 
     neighbour_starts: Array
     neighbours: Array
     weights: Array
-    smooth: Array
+    contiguous: Array
     sources: Array
     leaders: Array
 
 
 def check_pairs(loop: Loop) -> None:
-    """Refuse edges that are not each heard by both their ends, with a weight of 1.
+    """Check that each edge is in both directions, with a weight of 1.
 
     Raises:
-        Unsupported: some are.
+        Unsupported: an edge is not.
     """
     exchange = loop.exchange
     both = len(exchange.receivers) == 2 * len(loop.meter.edges)
     if not both or loop.switches is not None or (np.asarray(exchange.weights) != 1.0).any():
-        raise Unsupported("slopes along distances of edges that are not all heard both ways alike")
+        raise Unsupported(
+            "slopes along distances of edges that are not all bidirectional with weight 1"
+        )
 
 
-def turned_about(loop: Loop, places: SwarmBlocks) -> TransposedGraph:
-    """Return the graph of a loop turned about."""
+def transpose_graph(loop: Loop, places: SwarmBlocks) -> TransposedGraph:
+    """Return the transposed graph of a loop."""
     exchange = loop.exchange
-    turned = Exchange(exchange.senders, exchange.receivers, exchange.weights)
-    starts, positions, weights = heard(loop, places, turned)
+    reverse = Exchange(exchange.senders, exchange.receivers, exchange.weights)
+    starts, positions, weights = neighbour_slots(loop, places, reverse)
     agents = places.agents.reshape(-1, places.lanes)
-    own = np.arange(agents.size).reshape(agents.shape)
+    itself = np.arange(agents.size).reshape(agents.shape)
     block = np.repeat(np.arange(places.blocks), np.diff(starts))
-    # A copy feels nothing, so that what is added up over all lanes counts each agent once.
-    once = (places.of[agents] == own)[block]
-    positions, weights = np.where(once, positions, own[block]), np.where(once, weights, 0.0)
-    return TransposedGraph(starts, positions, weights, *smooth_blocks(starts, positions))
+    # A copy has no cotangents, so that sums over all lanes count each agent once.
+    once = (places.position[agents] == itself)[block]
+    positions, weights = np.where(once, positions, itself[block]), np.where(once, weights, 0.0)
+    return TransposedGraph(starts, positions, weights, *contiguous_blocks(starts, positions))
 
 
-def reach_of(
-    loop: Loop, places: SwarmBlocks, turned: TransposedGraph, kernel: Kernel
+def transposed_arrays(
+    loop: Loop, places: SwarmBlocks, graph: TransposedGraph, kernel: Kernel
 ) -> TransposedArrays:
-    """Return what a kernel that takes back reads of a graph turned about."""
-    plan, nearest = kernel.plan, np.asarray(loop.meter.nearest)
-    heavy = aligned(turned.weights.shape, np.float64)
-    heavy[:] = turned.weights
-    far, (_, fed) = 1 if plan.lines else stride(plan.width, plan.lanes), fed_widths(plan)
+    """Return what the kernel of the backward pass reads of a transposed graph."""
+    plan, position = kernel.plan, places.position
+    far = 1 if plan.row_major else stride(plan.width, plan.lanes)
+    _, width = contribution_widths(plan)
     return TransposedArrays(
-        turned.starts,
-        np.ascontiguousarray(turned.positions * far, np.int32),
-        heavy,
-        turned.smooth.astype(np.int8),
-        (places.of[senders_of(loop)[places.agents]] * fed).astype(np.int32),
-        (places.of[nearest[places.agents]] * fed).astype(np.int32),
+        graph.starts,
+        np.ascontiguousarray(graph.positions * far, np.int32),
+        aligned_copy(graph.weights, np.float64),
+        graph.contiguous.astype(np.int8),
+        (position[senders_of(loop)[places.agents]] * width).astype(np.int32),
+        (position[np.asarray(loop.meter.nearest)[places.agents]] * width).astype(np.int32),
     )
 
 
-def heard_back(loop: Loop, felt: Array) -> Array:
-    """Return the slopes along what agents show (N, s), of those along what they hear at a start."""
-    exchange, made = loop.exchange, np.zeros_like(felt)
+def transposed_disagreement(loop: Loop, cotangents: Array) -> Array:
+    """Return the cotangents of what agents send (N, s) at the first step.
+
+    Args:
+        loop: of the run.
+        cotangents: of the disagreements, (N, s).
+    """
+    exchange, sent = loop.exchange, np.zeros_like(cotangents)
     weights = np.atleast_2d(np.asarray(exchange.weights))[stretch_at(loop, 0)[0]]
-    along = weights[:, None] * felt[exchange.receivers]
-    np.add.at(made, np.asarray(exchange.receivers), along)
-    np.subtract.at(made, np.asarray(exchange.senders), along)
-    return made
+    along = weights[:, None] * cotangents[exchange.receivers]
+    np.add.at(sent, np.asarray(exchange.receivers), along)
+    np.subtract.at(sent, np.asarray(exchange.senders), along)
+    return sent

@@ -1,6 +1,6 @@
-"""What differs between formations that are stepped together, beside their states and offsets.
+"""Numbers that differ between formations stepped in one batch, besides states and offsets.
 
-Or between one formation now and later, where somebody turns its knobs.
+Or between one formation now and later, if its parameters are changed during a run.
 """
 
 import dataclasses
@@ -17,21 +17,21 @@ from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop
 
 
-def _apart(loop: Loop) -> list[Any]:
-    """Return the parts of a loop that have rows or draws of their own."""
+def _separate_parts(loop: Loop) -> list[Any]:
+    """Return the parts of a loop that have their own rows or draws."""
     return [loop.offsets, loop.meter.offsets, loop.meter.spacings, loop.motion.wind]
 
 
 def bare(loop: Loop) -> Loop:
-    """Return a loop without what has rows or draws of its own."""
-    # By hand, since `tree_at` walks the whole loop several times.
+    """Return a loop without the parts that have their own rows or draws."""
+    # Not by `tree_at`, which walks the whole loop several times.
     meter = dataclasses.replace(loop.meter, offsets=None, spacings=None)
     motion = dataclasses.replace(loop.motion, wind=None)
     return dataclasses.replace(loop, offsets=None, meter=meter, motion=motion)
 
 
 def is_number(leaf: Any) -> bool:
-    """Tell whether a leaf of a loop is made of real numbers."""
+    """Tell whether a leaf of a loop has real numbers."""
     return isinstance(leaf, float) or (
         isinstance(leaf, np.ndarray | jax.Array) and np.issubdtype(leaf.dtype, np.floating)
     )
@@ -39,29 +39,29 @@ def is_number(leaf: Any) -> bool:
 
 @final
 class VaryingNumbers:
-    """Numbers of loops that are alike but for them.
+    """Numbers of loops that differ only in them.
 
     Args:
-        loops: of the formations, alike in their trees and in all that is no number.
-        unlike: another such loop, which none of them is: where it differs others may yet come.
+        loops: of the formations, equal in their trees and in all leaves that are not numbers.
+        variant: another such loop: where it differs from the first, numbers may change later.
 
     Attributes:
         loop: the first.
         values: (loops, k) the numbers that differ, in the order of the tree.
-        signature: a digest of what decides the program, the same for other values; None where it
-            cannot be told, as of a user's class, whose methods may be others when traced again.
+        signature: a digest of what determines the program, equal for other values; None if it is
+            not known: a user's class may have other methods when it is traced again.
     """
 
-    def __init__(self, loops: Sequence[Loop], unlike: Loop | None = None) -> None:
+    def __init__(self, loops: Sequence[Loop], variant: Loop | None = None) -> None:
         """Find the numbers that differ."""
         self._take(loops[0])
-        # By identity: runs that differ in their starts alone share one loop.
+        # By identity: runs that differ only in their initial states share one loop.
         distinct = list({id(loop): loop for loop in loops}.values())
         places = {id(loop): k for k, loop in enumerate(distinct)}
-        others = [] if unlike is None else [unlike]
-        flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in [*distinct[1:], *others])]
+        others = distinct[1:] + ([] if variant is None else [variant])
+        flat = [self._flat, *(jax.tree.leaves(bare(loop)) for loop in others)]
         self._masks = [_differing(leaves) for leaves in zip(*flat, strict=True)]
-        # At once: somebody may write to an array later, and code is made of what stands there now.
+        # Now: somebody may write to an array later, and code is generated from its present numbers.
         constant = self._constant(self._flat)
         self._digest = digest(constant)
         self.signature = digest((self._tree.unflatten(constant), self._masks))
@@ -73,13 +73,13 @@ class VaryingNumbers:
         self._flat, self._tree = jax.tree.flatten(bare(loop))
 
     def of(self, loop: Loop) -> Array:
-        """Return the numbers (k,) of a loop that is like the others."""
+        """Return the numbers (k,) of a loop that differs from the others only in them."""
         return self._values(jax.tree.leaves(bare(loop)))
 
     def _values(self, leaves: Sequence[Any]) -> Array:
         pairs = zip(leaves, self._masks, strict=True)
-        found = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
-        return np.concatenate([np.zeros(0), *found])
+        parts = [np.asarray(leaf, float)[mask] for leaf, mask in pairs if mask.any()]
+        return np.concatenate([np.zeros(0), *parts])
 
     @property
     def count(self) -> int:
@@ -87,14 +87,14 @@ class VaryingNumbers:
         return self.values.shape[1]
 
     def covers(self, loop: Loop) -> bool:
-        """Tell whether a loop is like the first but for these numbers."""
+        """Tell whether a loop differs from the first only in these numbers."""
         leaves, tree = jax.tree.flatten(bare(loop))
         same = _forms(leaves, tree) == _forms(self._flat, self._tree)
-        # The bits of functions are addresses, so that they have no digest.
+        # Functions have no digest: their bits are addresses.
         return same and self._digest is not None and digest(self._constant(leaves)) == self._digest
 
     def turn(self, loop: Loop) -> None:
-        """Take another loop that is like the first but for these numbers in its place."""
+        """Replace the loop by one that differs from it only in these numbers."""
         self._take(loop)
         self.values = self._values(self._flat)[None]
 
@@ -108,28 +108,30 @@ class VaryingNumbers:
         return constant
 
     def leaves(self, entries: Array) -> list[Array]:
-        """Return the leaves in which something differs, of these entries where it does."""
-        found, at = list[Array](), 0
+        """Return the leaves in which numbers differ, with these entries in place of those."""
+        leaves, at = list[Array](), 0
         for leaf, mask in zip(self._flat, self._masks, strict=True):
             if not mask.any():
                 continue
             filled = np.asarray(leaf, float).astype(object)
             filled[mask] = entries[at : at + int(mask.sum())]
-            found.append(filled)
+            leaves.append(filled)
             at += int(mask.sum())
-        return found
+        return leaves
 
     def filled(self, leaves: Sequence[Any]) -> Loop:
-        """Return the loop with these leaves in the place of those in which something differs."""
+        """Return the loop with these leaves in place of those in which numbers differ."""
         if not leaves:
             return self.loop
-        given, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
-        new = self._tree.unflatten([next(given) if m.any() else leaf for leaf, m in pairs])
-        return eqx.tree_at(_apart, new, _apart(self.loop), is_leaf=lambda x: x is None)
+        new_leaves, pairs = iter(leaves), zip(self._flat, self._masks, strict=True)
+        new = self._tree.unflatten([next(new_leaves) if m.any() else leaf for leaf, m in pairs])
+        return eqx.tree_at(
+            _separate_parts, new, _separate_parts(self.loop), is_leaf=lambda x: x is None
+        )
 
 
 def alike(loop: Loop, other: Loop) -> bool:
-    """Tell whether two loops are alike but for what stands in their leaves."""
+    """Tell whether two loops are equal except for the numbers in their leaves."""
     return operator.eq(*(_forms(*jax.tree.flatten(bare(each))) for each in (loop, other)))
 
 
@@ -139,7 +141,7 @@ def _forms(leaves: Sequence[Any], tree: Any) -> tuple[Any, ...]:
 
 
 def _differing(leaves: Sequence[Any]) -> Array:
-    """Return which entries of a leaf are not the same in all loops."""
+    """Return which entries of a leaf are not equal in all loops."""
     if not is_number(leaves[0]) or len(leaves) == 1:
         return np.zeros(np.shape(leaves[0]), bool)
     stacked = np.stack([np.asarray(leaf, float) for leaf in leaves])

@@ -1,4 +1,4 @@
-"""Wind and noise for agents that are stepped by native code, drawn for many holds at once."""
+"""Wind and noise for agents that native code steps, drawn for many holding intervals at once."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,17 +12,17 @@ from echelon.core.types import Array
 from echelon.simulation.step.loop import Loop
 
 _AHEAD, _AT_ONCE = 64, 50_000
-"""Holds of wind that are drawn in a call, and the most draws; a call takes half a millisecond."""
+"""Holding intervals that are drawn in a call, and the most draws; a call takes 0.5 ms."""
 
 
 def holds_at_once(agents: int) -> int:
-    """Return for how many holds is drawn at once."""
+    """Return the number of holding intervals that are drawn at once."""
     return max(1, min(_AHEAD, _AT_ONCE // agents))
 
 
 def draw_holds(loops: Sequence[Loop], holds: Array, hold: int) -> list[Array | None]:
-    """Return what wind adds to the rates (T, F, N, n) and noise to the inputs in T holds."""
-    # What is beyond the end of the run may wrap: nobody asks for it.
+    """Return what wind adds to the rates (T, F, N, n) and noise to the inputs in T intervals."""
+    # Numbers beyond the end of the run may wrap: they are not used.
     steps, agents = (holds * hold).astype(np.int32), np.arange(len(loops[0].offsets))
     drawn = _drawn([loop.motion.wind for loop in loops], steps, agents)
     return [part if part is None else np.asarray(part) for part in drawn]

@@ -1,7 +1,7 @@
 """Elementary functions as operations of a graph, so that no library's code runs lane by lane.
 
-Arguments are brought to a short interval by the function's own symmetries, where a polynomial does
-the rest. What each is off by is measured in the tests, in units of the last place.
+Arguments are reduced to a short interval by the function's symmetries, where a polynomial
+approximates it. Tests measure the error of each, in units in the last place.
 """
 
 import math
@@ -58,14 +58,14 @@ def signed(x: Node, like: Node) -> Node:
 
 
 def _sine_and_cosine(x: Node) -> tuple[Node, Node]:
-    """Return both; the graph keeps what they share once."""
+    """Return both; the graph shares their common operations."""
     g, eps, width = x.graph, EPS[x.graph.bits], 0.62  # (pi / 4)^2 is 0.617
-    # Below, nothing is taken off, and no quarter is turned.
-    far = g.make("rare", _less(g.constant(0.61), x * x))
-    # Adding 1.5 2^52 leaves the whole number nearest to x / (pi / 2) in the last bits.
+    # Below, nothing is subtracted, and the quarter is 0.
+    far = g.make("unlikely", _less(g.constant(0.61), x * x))
+    # Adding 1.5 2^52 puts the whole number nearest to x / (pi / 2) into the last bits.
     magic = 1.5 * 2.0 ** (52 if g.bits == 64 else 23)
     shifted = x * (2.0 / math.pi) + magic
-    r = choose(far, _reduce(x, g.make("apart", shifted, magic), PI / 2), x)
+    r = choose(far, _reduce(x, g.make("unfused_sub", shifted, magic), PI / 2), x)
     s = r * r
     sine = r + r * s * polynomial(s, economized(sine_series, width, eps))
     cosine = polynomial(s, economized(cosine_series, width, eps))
@@ -93,20 +93,20 @@ def tan(x: Node) -> Node:
 
 
 def _scaled_exponential(x: Node) -> tuple[Node, Node, Node]:
-    """Return e^r - 1 and two factors 2^k whose product it is to be scaled by, x = r + k ln 2."""
+    """Return e^r - 1 and two factors whose product is 2^k, with x = r + k ln 2."""
     g, eps = x.graph, EPS[x.graph.bits]
     low, high = (-746.0, 710.0) if g.bits == 64 else (-105.0, 90.0)
     x = g.make("min", g.make("max", x, low), high)
     k = g.make("rint", x * float(1 / LN2))
     r = _reduce(x, k, LN2)
     grown = r + r * r * _both_signs(r, eps)
-    # In two factors, since 2^k alone may be no number where the result is one.
+    # In two factors, because 2^k may overflow when the result does not.
     half = g.make("floor", 0.5 * k)
     return grown, g.make("pow2", half), g.make("pow2", k - half)
 
 
 def _both_signs(r: Node, eps: float) -> Node:
-    """Return (e^r - 1 - r) / r^2 for |r| <= 0.35, even and odd powers apart."""
+    """Return (e^r - 1 - r) / r^2 for |r| <= 0.35, with even and odd powers separate."""
     s = r * r
     even = polynomial(s, economized(even_series, 0.123, eps))
     odd = polynomial(s, economized(odd_series, 0.123, eps))
@@ -120,9 +120,9 @@ def exp(x: Node) -> Node:
 
 
 def expm1(x: Node) -> Node:
-    """Return e^x - 1, without loss near 0."""
+    """Return e^x - 1, without cancellation near 0."""
     grown, first, second = _scaled_exponential(x)
-    # Up to 2^60 the two terms have their digits in common; beyond, 1 is none of them.
+    # Up to 2^60 the digits of the two terms overlap; beyond, subtracting 1 changes nothing.
     factor = first * second
     near = factor * grown + (factor - 1.0)
     large = _less(40.0 if x.graph.bits == 64 else 20.0, x)
@@ -146,25 +146,25 @@ def log(x: Node) -> Node:
     result = e * high - ((half - (s * (half + R) + e * sum(rest))) - f)
     result = choose(g.make("eq", x, math.inf), math.inf, result)
     result = choose(g.make("eq", x, 0.0), -math.inf, result)
-    # Of what is below 0, and of NaN, which is no number at or above it.
+    # NaN below 0, and of NaN, for which the comparison does not hold.
     return choose(g.make("le", 0.0, x), result, math.nan)
 
 
 def log1p(x: Node) -> Node:
-    """Return ln(1 + x), without loss near 0."""
+    """Return ln(1 + x), without cancellation near 0."""
     g, u = x.graph, 1.0 + x
-    # What rounding took from 1 + x, which a compiler may not simplify away: no flag allows it.
-    lost = x - (u - 1.0)
-    result = log(u) + lost / u
+    # The rounding error of 1 + x; without fast-math flags a compiler may not simplify it to 0.
+    error = x - (u - 1.0)
+    result = log(u) + error / u
     plain = g.make("or", g.make("eq", u, math.inf), g.make("le", u, 0.0))
     result = choose(plain, log(u), result)
-    # Keeps the sign of 0, and what is smaller than any change of 1.
+    # Preserves the sign of 0, and numbers too small to change 1.
     return choose(g.make("eq", u, 1.0), x, result)
 
 
 def tanh(x: Node) -> Node:
     """Return tanh x."""
-    # From 22 on it is 1 to the last place; `min` keeps NaN.
+    # From 22 on it is 1 to the last place; `min` preserves NaN.
     grown = expm1(2.0 * x.graph.make("min", size(x), 22.0))
     return signed(grown / (grown + 2.0), x)
 
@@ -214,10 +214,10 @@ def atan2(y: Node, x: Node) -> Node:
     whole = _angle(y, x)
     if not x.at_least_0:
         return whole
-    # What lies ahead mostly does so by less than tan(pi/8): then the ratio is taken as it is.
+    # An angle is mostly below pi/8: then the ratio need not be reduced.
     t = y / x
-    beside = y.graph.make("rare", _less(y.graph.constant(0.41**2), t * t))
-    return choose(beside, whole, signed(_small_angle(t), y))
+    far = y.graph.make("unlikely", _less(y.graph.constant(0.41**2), t * t))
+    return choose(far, whole, signed(_small_angle(t), y))
 
 
 def _small_angle(t: Node) -> Node:
@@ -231,9 +231,9 @@ def _angle(y: Node, x: Node) -> Node:
     """Return the angle of any point (x, y)."""
     g, a, b = y.graph, size(y), size(x)
     low, high = g.make("min", a, b), g.make("max", a, b)
-    # Two infinite sides are alike, and no sides at all make no angle.
+    # Two infinite sides are equal, and two zero sides have the angle 0.
     ratio = choose(g.make("eq", low, high), choose(g.make("eq", high, 0.0), 0.0, 1.0), low / high)
-    # NaN is equal to nothing, so `low / high` keeps it. About 1 instead of 0 beyond tan(pi/8).
+    # NaN equals nothing, so `low / high` preserves it. Beyond tan(pi/8) expanded about 1.
     far = _less(math.tan(math.pi / 8), ratio)
     angle = _small_angle(choose(far, (ratio - 1.0) / (ratio + 1.0), ratio))
     angle = choose(far, math.pi / 4 + angle, angle)
@@ -260,27 +260,27 @@ def acos(x: Node) -> Node:
 
 def cbrt(x: Node) -> Node:
     """Return the cube root of x."""
-    # What is too small to have all its digits is made larger by a cube first.
+    # Subnormal numbers are scaled by a cube first, so that they have all digits.
     low = _less(size(x), x.graph.constant(2.0**-900 if x.graph.bits == 64 else 2.0**-96))
     a = choose(low, size(x) * 2.0**90, size(x))
     root = exp(log(a) / 3.0)
-    # One step of Newton's doubles the digits.
+    # One step of Newton's method doubles the digits.
     better = root - (root * root * root - a) / (3.0 * root * root)
-    usual = x.graph.make("and", _less(0.0, a), _less(a, x.graph.constant(math.inf)))
-    result = choose(usual, better, a)
+    regular = x.graph.make("and", _less(0.0, a), _less(a, x.graph.constant(math.inf)))
+    result = choose(regular, better, a)
     return signed(choose(low, result * 2.0**-30, result), x)
 
 
 def rsqrt(x: Node) -> Node:
-    """Return 1 / sqrt(x), in a quarter of the time that a root and a quotient take."""
+    """Return 1 / sqrt(x), in a quarter of the time of a root and a quotient."""
     g = x.graph
     exact = 1.0 / g.make("sqrt", x)
     if x.op == "constant":
         return exact
     half, y = 0.5 * x, g.make("root_guess", x)
-    # Where x is 0, infinite, negative or subnormal, the guess is none.
-    far = g.make("rare", _less(0.05, size((half * y) * y - 0.5)))
-    # Each step squares the error, and takes it half as often again: 0.034, 1.8e-3, 4.7e-6, 3e-11.
+    # If x is 0, infinite, negative or subnormal, the guess is wrong.
+    far = g.make("unlikely", _less(0.05, size((half * y) * y - 0.5)))
+    # Each step maps the error e to 1.5 e^2: 0.034, 1.8e-3, 4.7e-6, 3e-11.
     for _ in range(4 if g.bits == 64 else 3):
         y = y * (1.5 - (half * y) * y)
     return choose(far, exact, y)
@@ -324,16 +324,16 @@ def erf(x: Node) -> Node:
 
 
 def sign(x: Node) -> Node:
-    """Return 1, -1, or x itself where it is 0 or no number."""
+    """Return 1, -1, or x itself if it is 0 or NaN."""
     return choose(_less(0.0, x), 1.0, choose(_less(x, x.graph.constant(0.0)), -1.0, x))
 
 
 def remainder(x: Node, y: Node) -> Node:
     """Return x - y trunc(x / y), exact while the quotient is small."""
     g = x.graph
-    quotient = g.make("over", x, y)
+    quotient = g.make("exact_div", x, y)
     rest = x - y * signed(g.make("floor", size(quotient)), quotient)
-    # A quotient just below a whole number may be rounded to it, which takes one y too many.
+    # A quotient just below a whole number may be rounded to it; then one y too many is subtracted.
     beyond = _less(rest * signed(g.constant(1.0), x), g.constant(0.0))
     return choose(beyond, rest + signed(y, x), rest)
 

@@ -1,4 +1,4 @@
-"""Choices whose number agents differ in: places of a table, cases, the largest, the order."""
+"""Choices that differ between agents: indices of a table, cases, the largest entry, an order."""
 
 import functools
 import itertools
@@ -7,28 +7,29 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.jaxpr import Algebra, apply, map_entries, walk
-from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
+from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
     LONGEST,
+    Arrays,
+    Params,
+    PrimitiveRule,
     Unsupported,
-    Written,
-    all_of,
-    chosen,
+    array_type,
     entry,
     number,
+    select,
     where,
 )
 
-# ---- places --------------------------------------------------------------------------------------
+# ---- indices -------------------------------------------------------------------------------------
 
 
-def placed(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return what is read or written at places that agents differ in: each place is tried."""
+def at_index(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return what is read or written at indices that differ between agents: each place is tried."""
     rows, ends = _rows(equation, operands), _ends(equation, operands)
     drops = _drops(equation)
     if not drops:
@@ -37,73 +38,66 @@ def placed(
     tried = list(itertools.product(*(range(ends[k] + 1) for k in unknown)))
     if len(tried) > LONGEST:
         raise Unsupported(f"a table of {len(tried)} places{where(equation)}")
-    found = _elsewhere(equation, operands) if drops else None
+    result = _elsewhere(equation, operands) if drops else None
     for place in tried:
-        made = _at(algebra, equation, operands, _filled_in(rows, unknown, place))
-        if found is None:
-            found = made
+        at = rows.copy()
+        at[..., unknown] = place
+        value = _at(algebra, equation, operands, at.astype(np.int64))
+        if result is None:
+            result = value
             continue
         there = map_entries(lambda *e, p=place: _is(graph, e, p), *(rows[..., k] for k in unknown))
-        there = _spread(equation, there, made.ndim)
-        found = map_entries(functools.partial(chosen, graph), there, made, found)
-    assert found is not None
-    return [found]
+        there = _spread(equation, there, value.ndim)
+        result = map_entries(functools.partial(select, graph), there, value, result)
+    assert result is not None
+    return [result]
 
 
 _FIRST = {"dynamic_slice": 1, "dynamic_update_slice": 2}
-"""The first operand that is an index, of those whose indices come one by one."""
+"""The first operand that is an index, of primitives with one operand per index."""
 
 
-def _rows(equation: Any, operands: list[np.ndarray]) -> np.ndarray:
+def _rows(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
     """Return the numbers of each place along the last axis."""
     first = _FIRST.get(equation.primitive.name)
     return operands[1] if first is None else np.stack(operands[first:], axis=-1)
 
 
-def _filled_in(rows: np.ndarray, unknown: list[int], place: tuple[int, ...]) -> np.ndarray:
-    """Return whole numbers in which those that are not known are those of a place."""
-    at = rows.copy()
-    at[..., unknown] = place
-    return at.astype(np.int64)
-
-
-def _at(
-    algebra: Algebra, equation: Any, operands: list[np.ndarray], rows: np.ndarray
-) -> np.ndarray:
-    """Return what an equation makes of known places."""
+def _at(algebra: Algebra, equation: JaxprEqn, operands: Arrays, rows: np.ndarray) -> np.ndarray:
+    """Return the result of an equation at constant indices."""
     first = _FIRST.get(equation.primitive.name)
     if first is None:
-        known = [operands[0], rows, *operands[2:]]
+        constant = [operands[0], rows, *operands[2:]]
     else:
-        known = [*operands[:first], *(rows[..., k] for k in range(rows.shape[-1]))]
-    return apply(equation, known, algebra)[0]
+        constant = [*operands[:first], *(rows[..., k] for k in range(rows.shape[-1]))]
+    return apply(equation, constant, algebra)[0]
 
 
-def _is(graph: ScalarGraph, entries: tuple[Any, ...], place: tuple[int, ...]) -> Any:
-    """Tell whether numbers are those of a place."""
+def _is(graph: ScalarGraph, entries: tuple[Entry, ...], place: tuple[int, ...]) -> Entry:
+    """Return whether numbers are those of a place."""
     same = [graph.make("eq", entry(e), float(p)) for e, p in zip(entries, place, strict=True)]
-    return all_of(graph, same)
+    return functools.reduce(functools.partial(graph.make, "and"), same, True)
 
 
-def _drops(equation: Any) -> bool:
-    """Tell whether nothing is read or written outside of a table; else the nearest place is."""
+def _drops(equation: JaxprEqn) -> bool:
+    """Tell whether indices outside of a table are ignored; otherwise they are clipped."""
     from jax.lax import GatherScatterMode
 
     return equation.params.get("mode") == GatherScatterMode.FILL_OR_DROP
 
 
-def _elsewhere(equation: Any, operands: list[np.ndarray]) -> np.ndarray:
-    """Return what is found where an index points outside: nothing read is no number."""
+def _elsewhere(equation: JaxprEqn, operands: Arrays) -> np.ndarray:
+    """Return the result for an index outside: what is not read is NaN."""
     if equation.primitive.name != "gather":
         return operands[0]
-    value, given = equation.params["fill_value"], equation.outvars[0].aval
-    if value is None and np.dtype(given.dtype).kind != "f":
-        raise Unsupported(f"`gather` from outside of a table of {given.dtype}{where(equation)}")
-    return np.full(given.shape, np.nan if value is None else value)
+    value, out = equation.params["fill_value"], array_type(equation.outvars[0])
+    if value is None and np.dtype(out.dtype).kind != "f":
+        raise Unsupported(f"`gather` from outside of a table of {out.dtype}{where(equation)}")
+    return np.full(out.shape, np.nan if value is None else value)
 
 
-def _ends(equation: Any, operands: list[np.ndarray]) -> list[int]:
-    """Return the last place along each axis that an index has a number for."""
+def _ends(equation: JaxprEqn, operands: Arrays) -> list[int]:
+    """Return the last place along each axis that is indexed."""
     name, params, shape = equation.primitive.name, equation.params, operands[0].shape
     if name == "dynamic_slice":
         return [n - k for n, k in zip(shape, params["slice_sizes"], strict=True)]
@@ -118,14 +112,14 @@ def _ends(equation: Any, operands: list[np.ndarray]) -> list[int]:
 
 
 def _clipped(graph: ScalarGraph, numbers: np.ndarray, end: int) -> np.ndarray:
-    def one(e: Any) -> Any:
+    def clipped(e: Entry) -> Node:
         return graph.make("min", graph.make("max", entry(e), 0.0), float(end))
 
-    return map_entries(one, numbers) if numbers.dtype == object else np.clip(numbers, 0, end)
+    return map_entries(clipped, numbers) if numbers.dtype == object else np.clip(numbers, 0, end)
 
 
-def _spread(equation: Any, there: np.ndarray, axes: int) -> np.ndarray:
-    """Return the truths of some places with axes of length one for what stands at each."""
+def _spread(equation: JaxprEqn, there: np.ndarray, axes: int) -> np.ndarray:
+    """Return the truths of some places with axes of length one for the entries at each."""
     if equation.primitive.name == "gather":
         return np.expand_dims(there, equation.params["dimension_numbers"].offset_dims)
     return there.reshape((1,) * axes)
@@ -134,190 +128,174 @@ def _spread(equation: Any, there: np.ndarray, axes: int) -> np.ndarray:
 # ---- cases ---------------------------------------------------------------------------------------
 
 
-def one_of(graph: ScalarGraph, which: Any, *cases: Any) -> Any:
-    """Return the case whose number is chosen; JAX numbers them from zero, and clips."""
+def one_of(graph: ScalarGraph, which: "Entry | np.ndarray", *cases: Any) -> Any:
+    """Return the case of a number; JAX counts from zero, and clips."""
     if not isinstance(which, Node):
         return cases[min(max(int(which), 0), len(cases) - 1)]
     if which.truth:
-        return chosen(graph, which, cases[1], cases[0])
-    found = cases[0]
+        return select(graph, which, cases[1], cases[0])
+    result = cases[0]
     for k, case in enumerate(cases[1:], 1):
-        found = chosen(graph, graph.make("le", float(k), which), case, found)
-    return found
+        result = select(graph, graph.make("le", float(k), which), case, result)
+    return result
 
 
-def cond(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return what all branches make, entry by entry that of the one that is taken."""
+def cond(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return the results of the branch that is taken, entry by entry; all are computed."""
     which, *rest = operands
     branches = equation.params["branches"]
     if which.dtype != object:
         branches = [one_of(graph, which, *branches)]
-    made = [walk(b.jaxpr, b.consts, rest, algebra) for b in branches]
-    if len(made) == 1:
-        return made[0]
+    results = [walk(b.jaxpr, b.consts, rest, algebra) for b in branches]
+    if len(results) == 1:
+        return results[0]
     [index] = which.flat
     return [
-        map_entries(lambda *cases: one_of(graph, index, *cases), *results)
-        for results in zip(*made, strict=True)
+        map_entries(lambda *cases: one_of(graph, index, *cases), *alternatives)
+        for alternatives in zip(*results, strict=True)
     ]
 
 
 # ---- order ---------------------------------------------------------------------------------------
 
 
-def less(graph: ScalarGraph, a: Any, b: Any) -> Any:
-    """Return whether one number stands before another, where what is no number stands last."""
-    return graph.make("or", graph.make("lt", entry(a), entry(b)), _is_lost(graph, b, a))
+def less(graph: ScalarGraph, a: Entry, b: Entry) -> Node:
+    """Return whether one number is before another in a sorted array, in which NaN is last."""
+    return graph.make("or", graph.make("lt", entry(a), entry(b)), _only_first_is_nan(graph, b, a))
 
 
-def _is_lost(graph: ScalarGraph, a: Any, b: Any) -> Any:
-    """Tell whether the first is no number, and the second is one."""
-    lost, there = (graph.make(op, entry(x), entry(x)) for op, x in (("ne", a), ("eq", b)))
-    return graph.make("and", lost, there)
+def _only_first_is_nan(graph: ScalarGraph, a: Entry, b: Entry) -> Node:
+    nan, not_nan = (graph.make(op, entry(x), entry(x)) for op, x in (("ne", a), ("eq", b)))
+    return graph.make("and", nan, not_nan)
 
 
-def extreme(before: Callable[[Any, Any], tuple[Any, Any]]) -> Written:
-    """Return the rule of the place of the first largest or smallest; what is no number wins."""
+def extreme(before: Callable[[Entry, Entry], tuple[Entry, Entry]]) -> PrimitiveRule:
+    """Return the rule of the index of the first largest or smallest entry; NaN wins."""
 
-    def find(
-        graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-    ) -> list[np.ndarray]:
+    def find(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
         [x] = operands
         [axis] = equation.params["axes"]
         if x.shape[axis] > LONGEST:
             raise Unsupported(f"the extreme of {x.shape[axis]} entries{where(equation)}")
 
-        def farther(a: tuple[Any, Any], b: tuple[Any, Any]) -> tuple[Any, Any]:
+        def better(a: tuple[Entry, Entry], b: tuple[Entry, Entry]) -> tuple[Entry, Entry]:
             beyond = graph.make("lt", *map(entry, before(a[0], b[0])))
-            both = (
-                graph.make("ne", entry(b[0]), entry(b[0])),
-                graph.make("eq", entry(a[0]), entry(a[0])),
-            )
-            it = graph.make("or", beyond, graph.make("and", *both))
-            return chosen(graph, it, b[0], a[0]), chosen(graph, it, b[1], a[1])
+            it = graph.make("or", beyond, _only_first_is_nan(graph, b[0], a[0]))
+            return select(graph, it, b[0], a[0]), select(graph, it, b[1], a[1])
 
         rows = np.moveaxis(map_entries(lambda e: number(graph, e), x), axis, -1)
-        found = np.empty(rows.shape[:-1], object)
-        for place in np.ndindex(*found.shape):
+        indices = np.empty(rows.shape[:-1], object)
+        for place in np.ndindex(*indices.shape):
             pairs = ((e, float(k)) for k, e in enumerate(rows[place]))
-            found[place] = functools.reduce(farther, pairs)[1]
-        return [found]
+            indices[place] = functools.reduce(better, pairs)[1]
+        return [indices]
 
     return find
 
 
-def ordered(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return arrays in the order of the first of them, by exchanges of neighbours."""
+def sorted_by(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return arrays in the order of the first of them, by bubble sort."""
     axis, n = equation.params["dimension"], operands[0].shape[equation.params["dimension"]]
     if n > LARGEST or equation.params["num_keys"] != 1:
         raise Unsupported(f"`sort` of {n} entries{where(equation)}")
     columns = [np.moveaxis(np.array(x, object), axis, 0) for x in operands]
     for end in reversed(range(1, n)):
         for k in range(end):
-            # Slices, since of a row that is a lone entry no array would be left.
+            # Slices, because a single entry would not stay an array.
             one, next_one = slice(k, k + 1), slice(k + 1, k + 2)
             later = map_entries(
                 functools.partial(less, graph), columns[0][next_one], columns[0][one]
             )
             for x in columns:
                 a, b = x[one].copy(), x[next_one].copy()
-                x[one] = map_entries(functools.partial(chosen, graph), later, b, a)
-                x[next_one] = map_entries(functools.partial(chosen, graph), later, a, b)
+                x[one] = map_entries(functools.partial(select, graph), later, b, a)
+                x[next_one] = map_entries(functools.partial(select, graph), later, a, b)
     return [np.moveaxis(x, 0, axis) for x in columns]
 
 
 # ---- whole numbers -------------------------------------------------------------------------------
 
 
-def converted(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
+def convert(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Return entries under another type; a whole number is a number without a fraction."""
-    [x], [given] = operands, equation.invars
-    to, of = np.dtype(equation.params["new_dtype"]), np.dtype(given.aval.dtype)
+    [x], [source] = operands, equation.invars
+    to, of = np.dtype(equation.params["new_dtype"]), np.dtype(array_type(source).dtype)
     if to.kind not in "bfiu":
         raise Unsupported(f"`convert_element_type` to {to}{where(equation)}")
 
-    def one(e: Any) -> Any:
+    def converted(e: Entry) -> Entry:
         if to.kind == "b":
             return e if of.kind == "b" else graph.make("ne", entry(e), 0.0)
         if to.kind == "f" or of.kind == "b":
             return number(graph, e)
         return _whole(graph, e, to, of, where(equation))
 
-    return [map_entries(one, x)]
+    return [map_entries(converted, x)]
 
 
-def _whole(graph: ScalarGraph, e: Any, to: np.dtype, of: np.dtype, at: str) -> Any:
-    """Return a number as a whole one, as XLA makes it: towards 0, nothing beyond, 0 of none."""
+def _whole(graph: ScalarGraph, e: Entry, to: np.dtype, of: np.dtype, at: str) -> Entry:
+    """Return a number as a whole one, as XLA does: truncated and clipped, NaN as 0."""
     if of.kind == "f":
         down, up = (graph.make(op, entry(e)) for op in ("floor", "ceil"))
-        towards = chosen(graph, graph.make("lt", entry(e), 0.0), up, down)
-        towards = chosen(graph, graph.make("eq", entry(e), entry(e)), towards, 0.0)
-        held = np.iinfo(to)
-        return graph.make("min", graph.make("max", towards, float(held.min)), float(held.max))
+        towards = select(graph, graph.make("lt", entry(e), 0.0), up, down)
+        towards = select(graph, graph.make("eq", entry(e), entry(e)), towards, 0.0)
+        limits = np.iinfo(to)
+        return graph.make("min", graph.make("max", towards, float(limits.min)), float(limits.max))
     if to.itemsize < of.itemsize and to.itemsize < 4:
         raise Unsupported(f"`convert_element_type` to {to}{at}")
     if to.kind == "u" and of.kind == "i":
-        return chosen(graph, graph.make("lt", entry(e), 0.0), e + 2.0 ** (8 * to.itemsize), e)
+        return select(graph, graph.make("lt", entry(e), 0.0), e + 2.0 ** (8 * to.itemsize), e)
     return e
 
 
-def divided(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return quotients; those of whole numbers are whole, towards 0."""
-    whole = np.dtype(equation.outvars[0].aval.dtype).kind in "iu"
+def divide(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return quotients; those of whole numbers are truncated."""
+    whole = np.dtype(array_type(equation.outvars[0]).dtype).kind in "iu"
 
-    def one(a: Any, b: Any) -> Any:
-        made = graph.make("over" if whole else "div", entry(a), entry(b))
+    def quotient(a: Entry, b: Entry) -> Node:
+        result = graph.make("exact_div" if whole else "div", entry(a), entry(b))
         if not whole:
-            return made
-        down, up = graph.make("floor", made), graph.make("ceil", made)
-        return chosen(graph, graph.make("lt", made, 0.0), up, down)
+            return result
+        down, up = graph.make("floor", result), graph.make("ceil", result)
+        return select(graph, graph.make("lt", result, 0.0), up, down)
 
-    return [map_entries(one, *operands)]
+    return [map_entries(quotient, *operands)]
 
 
-def logical(name: str) -> Written:
-    """Return the rule of an operation on truths; on the bits of whole numbers there is none."""
+def logical(name: str) -> PrimitiveRule:
+    """Return the rule of an operation on truths; there is none for the bits of whole numbers."""
 
-    def make(
-        graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-    ) -> list[np.ndarray]:
-        if np.dtype(equation.outvars[0].aval.dtype).kind != "b":
+    def rule(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+        if np.dtype(array_type(equation.outvars[0]).dtype).kind != "b":
             raise Unsupported(f"`{name}` of whole numbers{where(equation)}")
         return [map_entries(lambda *e: graph.make(name, *map(entry, e)), *operands)]
 
-    return make
+    return rule
 
 
-def running(join: Callable[[Any, Any], Any]) -> Callable[..., np.ndarray]:
-    """Return the rule of what entries come to one after the other along an axis."""
+def cumulative(join: Callable[[Any, Any], Any]) -> Callable[..., np.ndarray]:
+    """Return the rule of cumulative results along an axis."""
     joined = np.frompyfunc(join, 2, 1)
 
-    def accumulate(params: Any, x: np.ndarray) -> np.ndarray:
-        turned = np.flip(x, params["axis"]) if params["reverse"] else x
-        made = np.asarray(joined.accumulate(turned, axis=params["axis"], dtype=object), object)
-        return np.flip(made, params["axis"]) if params["reverse"] else made
+    def accumulate(params: Params, x: np.ndarray) -> np.ndarray:
+        axis, reverse = params["axis"], params["reverse"]
+        x = np.flip(x, axis) if reverse else x
+        result = np.asarray(joined.accumulate(x, axis=axis, dtype=object), object)
+        return np.flip(result, axis) if reverse else result
 
     return accumulate
 
 
-PICKED: dict[str, Written] = {
-    **{name: placed for name in ("gather", "dynamic_slice", "dynamic_update_slice")},
-    **{name: placed for name in ("scatter", "scatter-add", "scatter_add")},
+INDEXING: dict[str, PrimitiveRule] = {
+    **{name: at_index for name in ("gather", "dynamic_slice", "dynamic_update_slice")},
+    **{name: at_index for name in ("scatter", "scatter-add", "scatter_add")},
     **{name: logical(name) for name in ("and", "or", "xor", "not")},
     "cond": cond,
     "argmax": extreme(lambda a, b: (a, b)),
     "argmin": extreme(lambda a, b: (b, a)),
-    "sort": ordered,
-    "convert_element_type": converted,
-    "div": divided,
+    "sort": sorted_by,
+    "convert_element_type": convert,
+    "div": divide,
 }
-"""Primitives that choose by numbers, or mean another thing for whole ones."""
-RUNNING = {"cumprod": running(operator.mul)}
+"""Primitives that choose by numbers, or differ for whole numbers."""
+CUMULATIVE = {"cumprod": cumulative(operator.mul)}

@@ -1,29 +1,32 @@
 """A function written for JAX as scalars of a graph.
 
-JAX traces the function of one agent, and each equation of the trace is evaluated on nodes. What
-cannot be is told with the primitive, and the file and line where the user wrote it.
+JAX traces the function of one agent, and each equation of the trace is evaluated on nodes. If one
+has no scalar operations, the error names the primitive, and the file and line in the user's code.
 """
 
 import contextlib
 import functools
 import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.jaxpr import Algebra, Rule, dot, entrywise, map_entries, reduction, walk
 from echelon.core.numerics import precision
 from echelon.core.trace import error_summary
 from echelon.simulation.scalars import elementary
-from echelon.simulation.scalars.indexing import PICKED, RUNNING, less, one_of
-from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
-from echelon.simulation.scalars.small_linear_systems import cholesky, factored, solve, triangular
+from echelon.simulation.scalars.indexing import CUMULATIVE, INDEXING, less, one_of
+from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
+from echelon.simulation.scalars.small_linear_systems import cholesky, lu, solve, triangle
 from echelon.simulation.scalars.traced_entries import (
     LONGEST,
+    Arrays,
+    Params,
+    PrimitiveRule,
     Unsupported,
-    Written,
     entry,
     is_truth,
     missing,
@@ -32,9 +35,7 @@ from echelon.simulation.scalars.traced_entries import (
 )
 
 
-def lower(
-    function: Callable[..., Any], graph: ScalarGraph, arguments: Sequence[Any]
-) -> list[np.ndarray]:
+def lower(function: Callable[..., Any], graph: ScalarGraph, arguments: Sequence[Any]) -> Arrays:
     """Return the results of a function for JAX, flattened, as arrays of nodes and numbers.
 
     Args:
@@ -48,15 +49,15 @@ def lower(
     leaves, tree = jax.tree.flatten(list(arguments), is_leaf=lambda a: isinstance(a, np.ndarray))
     shaped = [_shape(leaf) for leaf in leaves]
 
-    def flat(*given: Any) -> Any:
-        return jax.tree.leaves(function(*jax.tree.unflatten(tree, given)))
+    def flat(*entries: jax.Array) -> list[jax.Array]:
+        return jax.tree.leaves(function(*jax.tree.unflatten(tree, entries)))
 
     with precision("float64"):
         closed = jax.make_jaxpr(flat)(*shaped)
         try:
             return walk(closed.jaxpr, closed.consts, leaves, _algebra(graph))
         except (TypeError, ValueError, IndexError, KeyError, AttributeError) as error:
-            # A trace is anyone's: what no rule was written for must end no run that JAX can make.
+            # Users write what is traced: an unforeseen trace must not end a run that JAX can do.
             raise Unsupported(f"a trace that no rule fits ({error_summary(error)})") from error
 
 
@@ -67,8 +68,8 @@ def _shape(leaf: np.ndarray) -> jax.ShapeDtypeStruct:
 
 
 @contextlib.contextmanager
-def _within(equation: Any) -> Iterator[None]:
-    """Say where a call stands if what it calls was traced once for all, far from its caller."""
+def _within(equation: JaxprEqn) -> Iterator[None]:
+    """Add the line of a call to an error if what it calls has no line of its own."""
     try:
         yield
     except Unsupported as error:
@@ -78,11 +79,11 @@ def _within(equation: Any) -> Iterator[None]:
 
 
 def _algebra(graph: ScalarGraph) -> Algebra:
-    def unknown(equation: Any, operands: list[np.ndarray]) -> list[np.ndarray]:
+    def unknown(equation: JaxprEqn, operands: Arrays) -> Arrays:
         name = equation.primitive.name
-        if name in _WRITTEN:
-            return _WRITTEN[name](graph, algebra, equation, operands)
-        if name in _DETOURS:
+        if name in _PRIMITIVES:
+            return _PRIMITIVES[name](graph, algebra, equation, operands)
+        if name in _UNREAD:
             return missing(equation)
         raise Unsupported(f"`{name}`{where(equation)}")
 
@@ -95,15 +96,15 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
         return lambda *args: graph.make(name, *map(entry, args))
 
     def function(of: Callable[..., Node]) -> Callable[..., Node]:
-        def written(*args: Any) -> Node:
-            with graph.as_written():
+        def evaluate(*args: Entry) -> Node:
+            with graph.verbatim():
                 return of(*(node(graph, a) for a in args))
 
-        return written
+        return evaluate
 
-    own = {name: op(name) for name in _SAME}
-    own |= {name: function(getattr(elementary, name)) for name in _ELEMENTARY}
-    own |= {
+    entrywise_rules = {name: op(name) for name in _SAME}
+    entrywise_rules |= {name: function(getattr(elementary, name)) for name in _ELEMENTARY}
+    entrywise_rules |= {
         "gt": lambda a, b: graph.make("lt", entry(b), entry(a)),
         "ge": lambda a, b: graph.make("le", entry(b), entry(a)),
         "rem": function(elementary.remainder),
@@ -117,7 +118,7 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
         "le_to": lambda a, b: graph.make("not", less(graph, b, a)),
         "select_n": functools.partial(one_of, graph),
     }
-    written: dict[str, Rule] = {
+    array_rules: dict[str, Rule] = {
         "integer_pow": lambda params, x: map_entries(
             lambda e: elementary.integer_power(node(graph, e), params["y"]), x
         ),
@@ -131,7 +132,8 @@ def _rules(graph: ScalarGraph) -> dict[str, Rule]:
         "reduce_or": reduction(op("or"), False),
         "cholesky": functools.partial(cholesky, graph),
     }
-    return {name: entrywise(rule) for name, rule in own.items()} | written | RUNNING
+    rules = {name: entrywise(rule) for name, rule in entrywise_rules.items()}
+    return rules | array_rules | CUMULATIVE
 
 
 _SAME = ("abs", "sqrt", "floor", "ceil", "max", "min", "lt", "le", "eq", "ne")
@@ -140,60 +142,57 @@ _ELEMENTARY += ("asinh", "acosh", "atanh", "exp", "expm1", "log", "log1p", "logi
 _ELEMENTARY += ("cbrt", "rsqrt", "sign")
 
 
-def _round(graph: ScalarGraph, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+def _round(graph: ScalarGraph, params: Params, x: np.ndarray) -> np.ndarray:
     to_even = int(params["rounding_method"]) == 1
     if to_even:
         return map_entries(lambda e: graph.make("rint", e), x)
     return map_entries(lambda e: elementary.round_half_away(node(graph, e)), x)
 
 
-# ---- primitives with functions of their own ------------------------------------------------------
+# ---- loops ---------------------------------------------------------------------------------------
 
 
-def _scan(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return what a loop of known length makes, written out."""
+def _scan(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return the results of a loop of fixed length, unrolled."""
     params, body = equation.params, equation.params["jaxpr"]
-    length, fixed, moving = params["length"], params["num_consts"], params["num_carry"]
+    length, constant, carried = params["length"], params["num_consts"], params["num_carry"]
     if length > LONGEST:
         raise Unsupported(f"a loop of {length} rounds{where(equation)}")
-    consts, carry = operands[:fixed], operands[fixed : fixed + moving]
-    rounds, made = range(length), list[list[np.ndarray]]()
+    consts, carry = operands[:constant], operands[constant : constant + carried]
+    rounds, columns = range(length), list[list[np.ndarray]]()
     for k in reversed(rounds) if params["reverse"] else rounds:
-        given = [x[k] for x in operands[fixed + moving :]]
-        given = [np.asarray(x, x.dtype if isinstance(x, np.ndarray) else None) for x in given]
-        results = walk(body.jaxpr, body.consts, [*consts, *carry, *given], algebra)
-        carry = results[:moving]
-        made.append(results[moving:])
-    made = made[::-1] if params["reverse"] else made
-    return [*carry, *(np.stack(column) for column in zip(*made, strict=True))]
+        rows = [x[k] for x in operands[constant + carried :]]
+        rows = [np.asarray(x, x.dtype if isinstance(x, np.ndarray) else None) for x in rows]
+        results = walk(body.jaxpr, body.consts, [*consts, *carry, *rows], algebra)
+        carry = results[:carried]
+        columns.append(results[carried:])
+    columns = columns[::-1] if params["reverse"] else columns
+    return [*carry, *(np.stack(column) for column in zip(*columns, strict=True))]
 
 
-def _while(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return what a loop makes whose end does not depend on the agents."""
+def _while(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return the results of a loop whose end does not depend on the agents."""
     params = equation.params
     tests, bodies = params["cond_nconsts"], params["body_nconsts"]
-    seen, used = operands[:tests], operands[tests : tests + bodies]
+    test_consts, body_consts = operands[:tests], operands[tests : tests + bodies]
     carry, test, body = operands[tests + bodies :], params["cond_jaxpr"], params["body_jaxpr"]
     for _ in range(LONGEST + 1):
-        [more] = walk(test.jaxpr, test.consts, [*seen, *carry], algebra)
+        [more] = walk(test.jaxpr, test.consts, [*test_consts, *carry], algebra)
         if more.dtype == object:
             break
         if not more:
             return carry
-        carry = walk(body.jaxpr, body.consts, [*used, *carry], algebra)
-    raise Unsupported(f"a `while` loop whose end depends on the agent, or is far{where(equation)}")
+        carry = walk(body.jaxpr, body.consts, [*body_consts, *carry], algebra)
+    reason = f"depends on the agent, or is more than {LONGEST} rounds away"
+    raise Unsupported(f"a `while` loop whose end {reason}{where(equation)}")
 
 
-_WRITTEN: dict[str, Written] = PICKED | {
+_PRIMITIVES: dict[str, PrimitiveRule] = INDEXING | {
     "scan": _scan,
     "while": _while,
     "custom_linear_solve": solve,
-    "lu": factored,
-    "triangular_solve": triangular,
+    "lu": lu,
+    "triangular_solve": triangle,
 }
-_DETOURS = {"lu_pivots_to_permutation", "lu_solve"}
-"""What JAX does before it solves; the equations are solved here by themselves."""
+_UNREAD = {"lu_pivots_to_permutation", "lu_solve"}
+"""What JAX computes before it solves equations; `solve` does not read it."""

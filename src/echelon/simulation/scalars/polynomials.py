@@ -1,7 +1,7 @@
-"""Polynomials for elementary functions, and the constants that arguments are brought in by.
+"""Polynomials for elementary functions, and constants for argument reduction.
 
-They are Taylor's, made shorter by Chebyshev's: the highest power is replaced by the combination of
-lower ones that is nearest to it on the interval, which costs 2^(1-2k) of it for degree k.
+They are Taylor polynomials, economized by Chebyshev's: the highest power is replaced by the best
+approximation by lower powers on the interval, with an error of 2^(1-2k) of it for degree k.
 """
 
 import functools
@@ -32,16 +32,16 @@ def _shifted_chebyshev(degree: int, width: Fraction) -> list[Fraction]:
 
 @functools.cache
 def economized(series: Callable[[int], Fraction], width: float, tolerance: float) -> list[float]:
-    """Return coefficients, lowest first, off by less than a tolerance for s in [0, width].
+    """Return coefficients, lowest first, with an error below a tolerance for s in [0, width].
 
-    `series(k)` is Taylor's coefficient of s^k.
+    `series(k)` is the Taylor coefficient of s^k.
     """
     end, rest, count = Fraction(width), Fraction(tolerance), 1
     while abs(series(count)) * end**count > rest / 8:
         count += 1
     coefficients = [series(k) for k in range(count + 1)]
     while len(coefficients) > 2:
-        # Of all polynomials with this highest coefficient, Chebyshev's is least.
+        # Of all polynomials with this leading coefficient, Chebyshev's is smallest.
         chebyshev = _shifted_chebyshev(len(coefficients) - 1, end)
         share = coefficients[-1] / chebyshev[-1]
         if abs(share) > rest / 2:
@@ -61,7 +61,7 @@ def polynomial(s: Node, coefficients: Sequence[float]) -> Node:
 
 
 def parts_of(value: Fraction, bits: int) -> list[float]:
-    """Return numbers that add up to a value, the first ones with few bits."""
+    """Return numbers whose sum is a value, the first ones with few bits."""
     parts, rest = list[float](), value
     for width in _PARTS[bits]:
         scale = Fraction(2) ** (width - math.frexp(float(rest))[1])
@@ -80,35 +80,35 @@ PI = 4 * (4 * _arctan_inverse(5) - _arctan_inverse(239))
 LN2 = sum((Fraction(2, (2 * k + 1) * 3 ** (2 * k + 1)) for k in range(70)), Fraction())
 
 
-# Taylor's coefficients of s^k, s the square of the argument, of what is left of a function when its
-# first terms are taken off.
+# Taylor coefficients of s^k, s the square of the argument, of remainders of functions after their
+# first terms.
 def sine_series(k: int) -> Fraction:
-    """Return the k-th coefficient of what is left of sin x / x - 1."""
+    """Return the k-th coefficient of the remainder of sin x / x - 1."""
     return Fraction((-1) ** (k + 1), math.factorial(2 * k + 3))
 
 
 def cosine_series(k: int) -> Fraction:
-    """Return the k-th coefficient of what is left of cos x - 1 + x^2 / 2."""
+    """Return the k-th coefficient of the remainder of cos x - 1 + x^2 / 2."""
     return Fraction((-1) ** k, math.factorial(2 * k + 4))
 
 
 def even_series(k: int) -> Fraction:
-    """Return the k-th coefficient of what is left of the even part of e^x - 1 - x."""
+    """Return the k-th coefficient of the remainder of the even part of e^x - 1 - x."""
     return Fraction(1, math.factorial(2 * k + 2))
 
 
 def odd_series(k: int) -> Fraction:
-    """Return the k-th coefficient of what is left of the odd part of e^x - 1 - x."""
+    """Return the k-th coefficient of the remainder of the odd part of e^x - 1 - x."""
     return Fraction(1, math.factorial(2 * k + 3))
 
 
 def arctangent_series(k: int) -> Fraction:
-    """Return the k-th coefficient of what is left of arctan x / x - 1."""
+    """Return the k-th coefficient of the remainder of arctan x / x - 1."""
     return Fraction((-1) ** (k + 1), 2 * k + 3)
 
 
 def logarithm_series(k: int) -> Fraction:
-    """Return the k-th coefficient of what is left of 2 artanh x / x - 2."""
+    """Return the k-th coefficient of the remainder of 2 artanh x / x - 2."""
     return Fraction(2, 2 * k + 3)
 
 
@@ -116,7 +116,7 @@ def logarithm_series(k: int) -> Fraction:
 def error_function_fits() -> tuple[list[float], list[float]]:
     """Return fits of erf(x) / x in x^2 for |x| <= 1, and of e^(x^2) erfc(x) for 1 <= x <= 6.5.
 
-    The second is a polynomial in (x - 3) / (x + 3), which is nearly that of a straight line.
+    The second is a polynomial in (x - 3) / (x + 3), of which it is almost a linear function.
     """
     from scipy.special import erf, erfcx
 

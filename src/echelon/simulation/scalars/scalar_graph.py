@@ -1,13 +1,13 @@
-"""Scalar operations as a graph in which nothing is told twice: folded, shared, without dead code.
+"""Scalar operations as a graph: constants folded, equal operations shared, no dead code.
 
 A node is a number that differs from agent to agent, or one that is the same for all of them, such
-as the time. It is made by an operation of `OPERATIONS` from other nodes, and an operation of the
-same operands is the same node. All code for vectors is made from such a graph.
+as the time. It is the result of an operation of `OPERATIONS` on other nodes, and the same operation
+on the same operands is the same node. All vector code is generated from such a graph.
 """
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias, final
 
 import numpy as np
@@ -19,17 +19,17 @@ def _divide(a: float, b: float) -> float:
     return float(np.divide(a, b))
 
 
-# What each operation does to plain numbers; a name is an instruction of `vector_ir` too.
+# The result of each operation for plain numbers; each is an instruction of `codegen.vector_ir` too.
 OPERATIONS: dict[str, Callable[..., Any]] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
-    # A difference that no product is fused into, so that it is the same wherever it is made.
-    "apart": lambda a, b: a - b,
+    # A difference that is not fused with a product, so that it is the same wherever it is computed.
+    "unfused_sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
     "div": _divide,
-    # A quotient that is cut to a whole number: no inverse takes its place, so that 49 / 49 is 1.
-    "over": _divide,
-    # Sums with a product in one operation (`fused`): a b + c, a b - c and c - a b.
+    # A quotient that is truncated: no product with an inverse replaces it, so that 49 / 49 is 1.
+    "exact_div": _divide,
+    # Sums with a product in one operation: a b + c, a b - c and c - a b.
     "fma": lambda a, b, c: a * b + c,
     "fms": lambda a, b, c: a * b - c,
     "fnma": lambda a, b, c: c - a * b,
@@ -58,33 +58,43 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "bit1": lambda x: int(x) // 2 % 2 == 1,
     "exponent": lambda x: float(np.round(np.log2(x))),
     "mantissa": lambda x: x / 2.0 ** float(np.round(np.log2(x))),
-    # Near to 1 / sqrt(a), from where Newton's steps go on.
+    # An estimate of 1 / sqrt(a), from which Newton's method starts.
     "root_guess": lambda a: float(1.0 / np.sqrt(a)),
-    # A truth that may also be taken to hold always (`usual.py`).
-    "rare": lambda a: a,
+    # A truth that may also be assumed to hold always (`codegen.fast_path`).
+    "unlikely": lambda a: a,
 }
-TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "rare"}
+TRUTHS = {"lt", "le", "eq", "ne", "and", "or", "xor", "not", "bit0", "bit1", "unlikely"}
 _COMMUTE = {"add", "mul", "min", "max", "and", "or", "xor", "eq", "ne"}
 _NEVER_FOLDED = {"exponent", "mantissa", "bit0", "bit1", "root_guess"}
 
 
 @final
 class Node:
-    """A scalar of a graph; Python's arithmetic on it makes others.
+    """A scalar of a graph; Python's arithmetic on it returns other nodes.
 
     Attributes:
         graph: that it belongs to.
-        number: its place; operands come before what is made of them.
+        number: its place; operands come before results.
         op: a key of `OPERATIONS`, `constant` or `leaf`.
         args: its operands.
         value: the number of a constant, the name of a leaf.
         uniform: whether it is the same for all agents.
-        truth: whether it is true or false, and no number.
-        at_least_0: whether it is known not to be below 0; it may be none, or -0.
-        kept: whether it is computed as it is written, and not in another order of its sums.
+        truth: whether it is true or false, and not a number.
+        at_least_0: whether it is certainly not below 0; it may be NaN, or -0.
+        verbatim: whether it is computed as it is written; otherwise sums may be rearranged.
     """
 
-    __slots__ = ("args", "at_least_0", "graph", "kept", "number", "op", "truth", "uniform", "value")
+    __slots__ = (
+        "args",
+        "at_least_0",
+        "graph",
+        "number",
+        "op",
+        "truth",
+        "uniform",
+        "value",
+        "verbatim",
+    )
     __array_ufunc__ = None  # so that NumPy's numbers leave arithmetic with a node to the node
 
     def __init__(
@@ -96,7 +106,7 @@ class Node:
         if op == "select":
             self.truth = args[1].truth
         self.at_least_0 = _is_at_least_0(op, args, value)
-        self.kept = False
+        self.verbatim = False
         graph.nodes.append(self)
 
     def __add__(self, other: Entry) -> "Node":
@@ -130,10 +140,10 @@ class Node:
 def _is_at_least_0(op: str, args: tuple[Node, ...], value: Any) -> bool:
     if op == "constant":
         return not math.isnan(value) and value >= 0.0
-    known = [a.at_least_0 for a in args]
+    signs = [a.at_least_0 for a in args]
     if op in ("add", "mul", "div", "min"):
-        return all(known) or op == "mul" and args[0] is args[1]
-    return op in ("sqrt", "abs", "pow2") or op == "max" and any(known)
+        return all(signs) or op == "mul" and args[0] is args[1]
+    return op in ("sqrt", "abs", "pow2") or op == "max" and any(signs)
 
 
 @final
@@ -141,12 +151,12 @@ class ScalarGraph:
     """Nodes, each once.
 
     Args:
-        bits: 64 or 32, the precision in which the code that is made of it computes.
+        bits: 64 or 32, the precision of the code that is generated from it.
     """
 
     def __init__(self, bits: int = 64) -> None:
-        self.bits, self.nodes, self._keeps = bits, list[Node](), False
-        self._known: dict[Any, Node] = {}
+        self.bits, self.nodes, self._verbatim = bits, list[Node](), False
+        self._by_key: dict[Hashable, Node] = {}
 
     def constant(self, value: float | bool) -> Node:
         """Return a plain number as a node."""
@@ -155,12 +165,12 @@ class ScalarGraph:
         key = value if isinstance(value, bool) else np.float64(value).tobytes()
         return self._once(("constant", type(value), key), "constant", (), value, True)
 
-    def leaf(self, *name: Any, uniform: bool = False) -> Node:
-        """Return what is read from memory under a name."""
+    def leaf(self, *name: str | int, uniform: bool = False) -> Node:
+        """Return a number that is read from memory under a name."""
         return self._once(("leaf", name), "leaf", (), name, uniform)
 
     def make(self, op: str, *operands: Entry) -> Node:
-        """Return the result of an operation, folded where it can be."""
+        """Return the result of an operation, simplified if possible."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in operands)
         if op not in _NEVER_FOLDED and all(a.op == "constant" for a in args):
             with np.errstate(all="ignore"):
@@ -173,40 +183,42 @@ class ScalarGraph:
         key = (op, *(a.number for a in args))
         return self._once(key, op, args, None, all(a.uniform for a in args))
 
-    def _once(self, key: Any, op: str, args: tuple[Node, ...], value: Any, uniform: bool) -> Node:
-        if key not in self._known:
-            self._known[key] = Node(self, op, args, value, uniform)
-        self._known[key].kept |= self._keeps
-        return self._known[key]
+    def _once(
+        self, key: Hashable, op: str, args: tuple[Node, ...], value: Any, uniform: bool
+    ) -> Node:
+        if key not in self._by_key:
+            self._by_key[key] = Node(self, op, args, value, uniform)
+        self._by_key[key].verbatim |= self._verbatim
+        return self._by_key[key]
 
     @contextlib.contextmanager
-    def as_written(self) -> Iterator[None]:
-        """Mark what is made meanwhile as `kept`: each rounding is where it was meant to be."""
-        before, self._keeps = self._keeps, True
+    def verbatim(self) -> Iterator[None]:
+        """Mark new nodes as `verbatim`: each rounding is where the author intended it."""
+        before, self._verbatim = self._verbatim, True
         try:
             yield
         finally:
-            self._keeps = before
+            self._verbatim = before
 
 
 def needed(results: Iterable[Node]) -> list[Node]:
-    """Return the nodes that results rest on, operands first."""
-    # In an order that is the same everywhere, since nodes of two graphs have the same numbers.
-    found, todo = dict[Node, None](), list(results)
+    """Return the nodes that results depend on, operands first."""
+    # Not a set: nodes of two graphs may have the same number, and their order must not vary.
+    reached, todo = dict[Node, None](), list(results)
     while todo:
         node = todo.pop()
-        if node not in found:
-            found[node] = None
+        if node not in reached:
+            reached[node] = None
             todo += node.args
-    return sorted(found, key=lambda node: node.number)
+    return sorted(reached, key=lambda node: node.number)
 
 
 Instead: TypeAlias = Callable[[Node, Sequence[Node]], Node | float | bool | None]
-"""(node, what its operands have become) -> what it becomes; None where it stays that operation."""
+"""(node, its new operands) -> its replacement; None if the operation stays."""
 
 
 def rewritten(results: Iterable[Node], instead: Instead) -> dict[Node, Node]:
-    """Return what each needed node becomes, folded again, where some are replaced."""
+    """Return each needed node with some nodes replaced, folded again."""
     after = dict[Node, Node]()
     for node in needed(results):
         args = [after[a] for a in node.args]
@@ -217,14 +229,14 @@ def rewritten(results: Iterable[Node], instead: Instead) -> dict[Node, Node]:
             after[node] = node
         else:
             after[node] = node.graph.make(node.op, *args)
-            after[node].kept |= node.kept
+            after[node].verbatim |= node.verbatim
     return after
 
 
-# ---- what is simpler -----------------------------------------------------------------------------
+# ---- simplifications -----------------------------------------------------------------------------
 #
-# 0 x is 0 for every x that is a number. For one that is none it hides the loss from one entry of a
-# sum, and the frames are looked at in all entries.
+# 0 x is 0 for every finite x. If x is NaN, this hides it in one entry of a sum; frames are checked
+# for NaN in all entries.
 
 
 def _is(node: Node, value: float) -> bool:
@@ -312,16 +324,16 @@ def _either(a: Node, b: Node) -> Node | None:
 
 
 def _at_most(a: Node, b: Node) -> Node | None:
-    """Return a comparison without the root of a number: the largest that has it decides."""
+    """Return sqrt(x) <= b as x <= the largest number whose root is at most b."""
     if a.op != "sqrt" or b.op != "constant" or not b.value > 0.0 or not a.args[0].at_least_0:
         return None
     kind = np.float64 if a.graph.bits == 64 else np.float32
-    wanted = kind(b.value)
-    most = wanted * wanted
-    # Rounded roots do not decrease, so that a few steps find the last one.
+    bound = kind(b.value)
+    most = bound * bound
+    # Rounded roots do not decrease, so a few steps find the last one.
     for _ in range(8):
         most = np.nextafter(most, kind(np.inf))
-    while np.sqrt(most) > wanted:
+    while np.sqrt(most) > bound:
         most = np.nextafter(most, kind(0.0))
     return a.graph.make("le", a.args[0], float(most))
 

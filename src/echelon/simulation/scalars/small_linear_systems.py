@@ -1,27 +1,25 @@
-"""Small systems of linear equations as scalars: eliminated, factored, solved by a triangle."""
-
-from collections.abc import Mapping
-from typing import Any
+"""Small systems of linear equations as scalar operations: elimination, factors, triangles."""
 
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from echelon.core.jaxpr import Algebra, walk
-from echelon.simulation.scalars.scalar_graph import ScalarGraph
+from echelon.simulation.scalars.scalar_graph import Node, ScalarGraph
 from echelon.simulation.scalars.traced_entries import (
     LARGEST,
+    Arrays,
     Missing,
+    Params,
     Unsupported,
-    chosen,
     missing,
     nodes,
+    select,
     where,
 )
 
 
-def solve(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return the solution of linear equations, whose matrix is what they do to unit vectors."""
+def solve(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return the solution of linear equations; images of unit vectors are the matrix's columns."""
     jaxprs, lengths = equation.params["jaxprs"], equation.params["const_lengths"]
     matvec, count = jaxprs.matvec, lengths.matvec
     total = sum(lengths)
@@ -40,17 +38,17 @@ def solve(
     for part in _parts(rows):
         if len(part) > LARGEST:
             raise Unsupported(f"a system of {len(part)} equations{where(equation)}")
-        wanted = np.array(nodes(graph, right), object)[part]
-        solved[part] = _eliminate(graph, rows[np.ix_(part, part)], wanted)
+        rhs = np.array(nodes(graph, right), object)[part]
+        solved[part] = _eliminate(graph, rows[np.ix_(part, part)], rhs)
     return [solved.reshape(right.shape)]
 
 
 def _parts(rows: np.ndarray) -> list[list[int]]:
-    """Return the sets of unknowns that no equation has together with others."""
+    """Return the sets of unknowns that share no equation with others."""
     from scipy.sparse.csgraph import connected_components
 
-    there = np.vectorize(lambda e: not (e.op == "constant" and e.value == 0.0))(rows)
-    count, label = connected_components(there, directed=False)
+    nonzero = np.vectorize(lambda e: not (e.op == "constant" and e.value == 0.0))(rows)
+    count, label = connected_components(nonzero, directed=False)
     return [np.flatnonzero(label == k).tolist() for k in range(count)]
 
 
@@ -65,23 +63,23 @@ def _eliminate(graph: ScalarGraph, matrix: np.ndarray, right: np.ndarray) -> np.
     return _by_triangle(both[:, :n], both[:, n], lower=False, unit=False)
 
 
-def _pivot(graph: ScalarGraph, rows: np.ndarray, k: int, n: int) -> Any:
-    """Exchange row k for that of the largest entry below, and return which that was."""
+def _pivot(graph: ScalarGraph, rows: np.ndarray, k: int, n: int) -> Node:
+    """Exchange row k for that of the largest entry below, and return the index of that row."""
     largest, place = graph.make("abs", rows[k, k]), graph.constant(float(k))
     for i in range(k + 1, n):
         size = graph.make("abs", rows[i, k])
         larger = graph.make("lt", largest, size)
-        largest, place = chosen(graph, larger, size, largest), chosen(graph, larger, i, place)
+        largest, place = select(graph, larger, size, largest), select(graph, larger, i, place)
     here = rows[k].copy()
     for i in range(k + 1, n):
         it = graph.make("eq", place, float(i))
-        rows[k] = [chosen(graph, it, p, q) for p, q in zip(rows[i], rows[k], strict=True)]
-        rows[i] = [chosen(graph, it, q, p) for p, q in zip(rows[i], here, strict=True)]
+        rows[k] = [select(graph, it, p, q) for p, q in zip(rows[i], rows[k], strict=True)]
+        rows[i] = [select(graph, it, q, p) for p, q in zip(rows[i], here, strict=True)]
     return place
 
 
 def _by_triangle(A: np.ndarray, right: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
-    """Return the solution of equations whose matrix is a triangle."""
+    """Return the solution of equations whose matrix is triangular."""
     b, n = right.copy(), len(A)
     for k in range(n) if lower else reversed(range(n)):
         for j in range(k) if lower else range(k + 1, n):
@@ -90,8 +88,8 @@ def _by_triangle(A: np.ndarray, right: np.ndarray, lower: bool, unit: bool) -> n
     return b
 
 
-def cholesky(graph: ScalarGraph, params: Mapping[str, Any], matrix: np.ndarray) -> np.ndarray:
-    """Return L with L L' a matrix."""
+def cholesky(graph: ScalarGraph, params: Params, matrix: np.ndarray) -> np.ndarray:
+    """Return the L with L L' = matrix."""
     n = matrix.shape[-1]
     if matrix.ndim != 2 or n > LARGEST:
         raise Unsupported(f"`cholesky` of shape {matrix.shape}")
@@ -105,10 +103,8 @@ def cholesky(graph: ScalarGraph, params: Mapping[str, Any], matrix: np.ndarray) 
     return L
 
 
-def triangular(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return the solution X of A X = B, or of X A = B, for a triangle A."""
+def triangle(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return the solution X of A X = B, or of X A = B, for a triangular A."""
     A, B = (np.asarray(x, object) for x in operands)
     if any(isinstance(e, Missing) for x in (A, B) for e in x.flat):
         return missing(equation)
@@ -124,12 +120,10 @@ def triangular(
     return [np.array(solved, object).reshape(columns.shape).T if left else np.stack(solved)]
 
 
-def factored(
-    graph: ScalarGraph, algebra: Algebra, equation: Any, operands: list[np.ndarray]
-) -> list[np.ndarray]:
-    """Return L and U in one matrix, the row that each step brought up, and the order of the rows.
+def lu(graph: ScalarGraph, algebra: Algebra, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Return L and U in one matrix, the pivot row of each step, and the order of the rows.
 
-    What is made here on the way to a system that is solved by itself is dead code.
+    If they are computed for a system of equations, nothing reads them: `solve` eliminates itself.
     """
     [matrix] = operands
     n = matrix.shape[-1]

@@ -1,31 +1,36 @@
-"""The entries of a lowered function's arrays: nodes, plain numbers, and what nothing may read."""
+"""Entries of a lowered function's arrays: nodes, plain numbers, stand-ins for unread results."""
 
-import functools
-from collections.abc import Callable
-from typing import Any, NoReturn, TypeAlias, final
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn, TypeAlias, cast, final
 
 import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import JaxprEqn, Literal, Var
 
 from echelon.core.errors import EchelonError
 from echelon.core.jaxpr import Algebra
 from echelon.simulation.scalars.scalar_graph import Entry, Node, ScalarGraph
 
 LONGEST = 64
-"""Rounds of a loop that are written out, and places of a table that are looked through."""
+"""The most rounds of a loop that are unrolled, and places of a table that are searched."""
 LARGEST = 6
-"""Unknowns of a system of equations that is solved, and entries that are sorted."""
+"""The most unknowns of a system of equations, and entries to sort."""
 
-Written: TypeAlias = "Callable[[ScalarGraph, Algebra, Any, list[np.ndarray]], list[np.ndarray]]"
-"""(graph, algebra, equation, operands) -> results: a primitive that needs more than parameters."""
+Arrays: TypeAlias = list[np.ndarray]
+"""The operands or results of an equation: arrays of entries, or of plain numbers."""
+Params: TypeAlias = Mapping[str, Any]
+"""The parameters of a primitive; their types depend on it."""
+PrimitiveRule: TypeAlias = Callable[[ScalarGraph, Algebra, JaxprEqn, Arrays], Arrays]
+"""(graph, algebra, equation, operands) -> results, if these need more than parameters."""
 
 
 class Unsupported(EchelonError):
-    """A function uses what has no scalar operations: which primitive, and where it was written."""
+    """A function has no scalar operations; the text names the primitive and the line."""
 
 
 @final
 class Missing:
-    """Stands for a result that nothing may read; what is left over from a library's detour."""
+    """Stands for a result that nothing may read, such as intermediate results of a library."""
 
     def __init__(self, primitive: str, where: str) -> None:
         self.primitive, self.where = primitive, where
@@ -39,39 +44,36 @@ class Missing:
     __truediv__ = __rtruediv__ = __neg__ = __float__ = __bool__ = _read
 
 
-def missing(equation: Any) -> list[np.ndarray]:
+def missing(equation: JaxprEqn) -> Arrays:
     """Return results of an equation that nothing may read."""
     stand_in = Missing(equation.primitive.name, where(equation))
-    return [filled(v.aval.shape, stand_in) for v in equation.outvars]
+    return [np.full(array_type(v).shape, stand_in, object) for v in equation.outvars]
 
 
-def filled(shape: tuple[int, ...], value: object) -> np.ndarray:
-    """Return an array that holds one entry everywhere."""
-    made = np.empty(shape, object)
-    for place in np.ndindex(*shape):
-        made[place] = value
-    return made
+def array_type(variable: Var | Literal) -> ShapedArray:
+    """Return the shape and type of a variable, which is an array."""
+    return cast(ShapedArray, variable.aval)
 
 
-def where(equation: Any) -> str:
-    """Return where a user wrote what an equation does."""
+def where(equation: JaxprEqn) -> str:
+    """Return where the user's code has an equation."""
     from jax._src import source_info_util as info
 
     frame = info.user_frame(equation.source_info.traceback)
     return "" if frame is None else f" in {frame.file_name}, line {frame.start_line}"
 
 
-def is_truth(value: Any) -> bool:
-    """Tell whether an entry is true or false, and no number."""
+def is_truth(value: Entry) -> bool:
+    """Tell whether an entry is true or false, and not a number."""
     return value.truth if isinstance(value, Node) else isinstance(value, bool | np.bool_)
 
 
-def entry(value: Any) -> Entry:
+def entry(value: Entry) -> Entry:
     """Return an entry as an operand."""
     return value if isinstance(value, Node) else _plain(value)
 
 
-def node(graph: ScalarGraph, value: Any) -> Node:
+def node(graph: ScalarGraph, value: Entry) -> Node:
     """Return an entry as a node."""
     return value if isinstance(value, Node) else graph.constant(_plain(value))
 
@@ -81,21 +83,15 @@ def nodes(graph: ScalarGraph, entries: np.ndarray) -> list[Node]:
     return [node(graph, e) for e in entries.flat]
 
 
-def number(graph: ScalarGraph, value: Any) -> Any:
+def number(graph: ScalarGraph, value: Entry) -> Entry:
     """Return an entry as a number: 1 for true."""
     return graph.make("select", entry(value), 1.0, 0.0) if is_truth(value) else value
 
 
-def chosen(graph: ScalarGraph, which: Any, a: Any, b: Any) -> Any:
+def select(graph: ScalarGraph, which: Entry, a: Entry, b: Entry) -> Node:
     """Return one entry where a truth holds, else another."""
     return graph.make("select", entry(which), entry(a), entry(b))
 
 
-def all_of(graph: ScalarGraph, truths: list[Any]) -> Any:
-    """Return whether all truths hold."""
-    first: Any = True
-    return functools.reduce(lambda a, b: graph.make("and", entry(a), entry(b)), truths, first)
-
-
-def _plain(value: Any) -> float | bool:
+def _plain(value: float | bool) -> float | bool:
     return bool(value) if isinstance(value, bool | np.bool_) else float(value)
