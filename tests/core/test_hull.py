@@ -682,8 +682,6 @@ def test_other_faults_of_a_call_are_refused(monkeypatch):
     box = about_zero(1, 1)
     with pytest.raises(GainError, match="has 2 entries, and must have 3"):
         value_hull(model_jacobian(Pendulum()), box, about_zero(1), ["angle", "rate"])
-    with pytest.raises(GainError, match="one matrix of floats"):
-        value_hull(lambda x, v: x, box, NO_INPUTS)
     monkeypatch.setattr("echelon.core.enclosure.atoms.MOST_VERTICES", 100)
     with pytest.raises(GainError, match="has 128 vertices, and may have 100"):
         value_hull(euler_rate_quadrotor, quadrotor_box(), NO_INPUTS)
@@ -812,6 +810,20 @@ def test_a_derivative_written_by_hand_is_not_believed():
 def test_a_jump_has_no_slopes(function):
     with pytest.raises(JumpError, match="may jump with `x\\[0\\]` inside the domain"):
         slopes(function)
+
+
+def test_a_jump_in_what_no_slope_is_taken_in_leaves_both_slopes():
+    box, inputs = Box([-1.0], [1.0]), Box([0.0], [1.0])
+    for switch in (lambda v: v > 0.5, lambda v: v == 0.5, lambda v: ~(v < 0.2) & (v < 0.7)):
+
+        def switched(x, v, switch=switch):
+            return jnp.where(switch(v), 2.0 * x + 1.0, 5.0 * x)
+
+        hull = slope_hull(switched, box, inputs)
+        assert (hull.vertices.min(), hull.vertices.max()) == (2.0, 5.0)
+    # Two choices by one border may fall otherwise where it is 0.
+    both = scalar_hull(lambda x: 1.0 * (x > 0) - 1.0 * (x >= 0), -1.0, 1.0)
+    assert both[0] <= -1.0 and both[1] >= 0.0
 
 
 @pytest.mark.parametrize("function", [jnp.floor, lambda x: jnp.argmax(jnp.stack([x, -x])) * x])

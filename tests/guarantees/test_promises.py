@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import final
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +10,17 @@ import numpy as np
 import pytest
 
 import echelon as ech
+from echelon.core import statement
 from echelon.core.statement import Hypothesis
 from echelon.core.words import Feedforward, Kind, Theorem, Verdict
 from echelon.experiments.scenario.named_class import resolve
 from echelon.experiments.scenario.registry import METHODS
+from echelon.guarantees.promises.case import Case
+from echelon.guarantees.promises.closed_loop import loop_of
+from echelon.guarantees.promises.hypotheses import agent_lines
+from echelon.guarantees.promises.leaders import leaders_of
+from echelon.guarantees.promises.promise import REQUIRED, Promise, promises
+from echelon.laws.trim_input import TrimInput
 
 # ---- all tellers say the same ----
 
@@ -668,3 +676,54 @@ def test_design_ranks_no_mode_of_a_model_that_bends():
     (row,) = rows.designs
     assert row.stable and row.fastest is None and row.factors is None
     assert "slowest mode" not in rows.because
+
+
+# ---- a law with a theorem of its own ----
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class RestPromise(Promise):
+    """What is guaranteed of followers that rest: nothing grows."""
+
+    @classmethod
+    def of(cls, prepared, settings, brief=False):
+        leaders = leaders_of(prepared.parts, prepared.problem.states)
+        case = Case(prepared.parts, settings, loop_of(prepared.parts), leaders)
+        own = (statement.holds(name, Kind.PROOF, "it rests") for name in REQUIRED)
+        lines = {line.statement: line for line in (*agent_lines(case), *own)}
+        return cls(loop=case.loop, hypotheses=lines, without="", leader_mode=None)
+
+    ground = None
+    rate = slowest = 0.0
+
+    def longest_step(self, settings):
+        return float("inf")
+
+    def guarantee(self):
+        return "Followers rest where they start."
+
+    def why_covered(self):
+        return "nobody moved"
+
+
+class Rest(TrimInput):
+    """Followers that rest, with a theorem of their own."""
+
+    prover = f"{__name__}:RestPromise"
+
+
+def test_a_law_names_what_proves_its_guarantee():
+    model = ech.models.SingleIntegrator(2)
+    goals = ech.Formation(np.zeros((4, 2)))
+    parts = ech.Parts(model, PATH, goals, ech.Laws(TrimInput(), Rest()))
+    found = ech.promise(parts, settings())
+    assert type(found) is RestPromise and found.decays
+    assert found.as_mapping()["sentence"] == "Followers rest where they start."
+    assert ech.check(parts, settings()).promise is found
+    report = ech.report(ech.simulate(parts, settings(horizon=0.1)))
+    assert "Followers rest where they start." in report
+    seeds = [settings()._replace(seed=k) for k in range(2)]
+    assert [type(each) for each in promises(parts, seeds)] == [RestPromise, RestPromise]
+    other = parts.replace(drive=ech.Laws(TrimInput(), TrimInput()))
+    assert not ech.promise(other, settings()).promised

@@ -1,9 +1,9 @@
 """A polytope of matrices that provably contains all values, or slopes, of a function on a box.
 
-The function is traced and evaluated in exact polynomial arithmetic (`rules`, `slopes`); each entry
-is affine in the coordinates of every atom (a variable's powers, an angle's waves), each atom
-lies in a polygon with rational vertices (`curves`), and so the products of these vertices hold
-every value.
+The function is traced and evaluated in exact polynomial arithmetic (`rules`, `sloped`, `slopes`).
+Each entry is affine in the coordinates of every atom (a variable's powers, an angle's waves), and
+each atom lies in a polygon with rational vertices (`curve_polygons`): the products of these
+vertices hold every value.
 """
 
 import math
@@ -17,8 +17,8 @@ import numpy as np
 from echelon.core.enclosure.atoms import Atoms, Corners, CornerValues, check_count, corner_values
 from echelon.core.enclosure.interval import Interval
 from echelon.core.enclosure.polynomial import Polynomial, constant
-from echelon.core.enclosure.rules import polynomials
-from echelon.core.enclosure.slopes import number, slopes_in, variable
+from echelon.core.enclosure.sloped import Sloped, number, variable
+from echelon.core.enclosure.slopes import slopes_in
 from echelon.core.errors import GainError
 from echelon.core.jaxpr import evaluate, map_entries
 from echelon.core.rational import float_above
@@ -85,7 +85,9 @@ def value_hull(function: _Function, states: Box, inputs: Box, names: Sequence[st
             (the primitive is named), or there are more than `MOST_VERTICES` vertices.
     """
     atoms = Atoms()
-    return _hull_of(_values(function, *_variables(atoms, states, inputs, names), atoms), atoms)
+    # Nothing is a variable that slopes are taken in, so that the function may jump.
+    x, v = (map_entries(number, some) for some in _variables(atoms, states, inputs, names))
+    return _hull_of(map_entries(_value, _evaluate(function, x, v, atoms)), atoms)
 
 
 def slope_hull(
@@ -113,12 +115,13 @@ def slope_hull(
     """
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, names)
-    found = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    x, v = _sloped(x), map_entries(number, v)
+    matrix = _slopes(_evaluate(function, x, v, atoms), len(x), atoms)
     if weight is not None:
-        # A weight is asked for its slopes too, which one that jumps has not.
-        beside = _evaluate_sloped(weight, x, v, atoms)
-        found = np.concatenate([found, map_entries(lambda entry: entry.value, beside)], axis=1)
-    return _hull_of(found, atoms)
+        # Its slopes are evaluated too, so that one that jumps is refused.
+        values = map_entries(_value, _evaluate(weight, x, v, atoms))
+        matrix = np.concatenate([matrix, values], axis=1)
+    return _hull_of(matrix, atoms)
 
 
 def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, ...]:
@@ -132,23 +135,23 @@ def slope_columns(function: _Function, states: Box, inputs: Box) -> tuple[int, .
     """
     atoms = Atoms()
     x, v = _variables(atoms, states, inputs, ())
-    slopes = _slopes(_evaluate_sloped(function, x, v, atoms), len(x), atoms)
+    values = _evaluate(function, _sloped(x), map_entries(number, v), atoms)
+    slopes = _slopes(values, len(x), atoms)
     return tuple(k for k in range(len(x)) if not any(p.terms for p in slopes[:, k]))
 
 
-def _values(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
-    """Return the values (k, l) of a matrix function, polynomials."""
-    [found] = evaluate(function, [x, v], polynomials(atoms))
-    if found.ndim != 2 or found.dtype != object:
-        raise GainError("a function of a hull must return one matrix of floats.")
-    return found
+def _value(entry: Sloped) -> Polynomial:
+    return entry.value
 
 
-def _evaluate_sloped(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
-    """Return the values of a function with their slopes in x."""
-    states = np.empty(len(x), object)
-    states[:] = [variable(k, p) for k, p in enumerate(x)]
-    [found] = evaluate(function, [states, map_entries(number, v)], slopes_in(atoms))
+def _sloped(x: np.ndarray) -> np.ndarray:
+    """Return polynomials (n,) as variables that slopes are taken in."""
+    return map_entries(variable, np.arange(len(x)), x)
+
+
+def _evaluate(function: _Function, x: np.ndarray, v: np.ndarray, atoms: Atoms) -> np.ndarray:
+    """Return the values of a function with their slopes."""
+    [found] = evaluate(function, [x, v], slopes_in(atoms))
     return found if found.dtype == object else map_entries(number, found)
 
 

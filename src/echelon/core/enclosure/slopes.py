@@ -9,6 +9,7 @@ either side, the same one wherever the same switch decides.
 
 import dataclasses
 import functools
+import math
 import operator
 from collections.abc import Callable, Mapping
 from fractions import Fraction
@@ -16,46 +17,16 @@ from typing import Any, TypeAlias, final
 
 import numpy as np
 
-from echelon.core.enclosure import rules
+from echelon.core.enclosure import rules, sloped
 from echelon.core.enclosure.atoms import Atoms
+from echelon.core.enclosure.interval import Interval
 from echelon.core.enclosure.polynomial import Polynomial, constant, divides
+from echelon.core.enclosure.sloped import Sloped, chain, number
 from echelon.core.errors import GainError, listing
 from echelon.core.jaxpr import Algebra, dot, map_entries, reduction
 
 Rule: TypeAlias = Callable[..., np.ndarray]
 """(parameters of the primitive, operands) -> result."""
-
-
-@final
-class Sloped:
-    """A value, and its slopes by the number of the variable; a slope left out is 0."""
-
-    __slots__ = ("slopes", "value")
-
-    def __init__(self, value: Polynomial, slopes: Mapping[int, Polynomial]) -> None:
-        self.value = value
-        self.slopes = {k: p for k, p in slopes.items() if p.terms}
-
-    def __add__(self, other: "Sloped") -> "Sloped":
-        return chain(self.value + other.value, (self, constant(1)), (other, constant(1)))
-
-    def __sub__(self, other: "Sloped") -> "Sloped":
-        return self + (-other)
-
-    def __neg__(self) -> "Sloped":
-        return chain(-self.value, (self, constant(-1)))
-
-    def __mul__(self, other: "Sloped") -> "Sloped":
-        return chain(self.value * other.value, (self, other.value), (other, self.value))
-
-
-def chain(value: Polynomial, *parts: tuple[Sloped, Polynomial]) -> Sloped:
-    """Return a value whose slopes are those of its parts, each times the slope in that part."""
-    total: dict[int, Polynomial] = {}
-    for part, factor in parts:
-        for k, slope in part.slopes.items():
-            total[k] = total.get(k, constant(0)) + factor * slope
-    return Sloped(value, total)
 
 
 @final
@@ -66,20 +37,12 @@ class Switch:
     Attributes:
         chosen: 1 where it is yes and 0 where it is no, but for points where a border is 0.
         borders: polynomials, one of which is 0 wherever the answer changes.
+        moves: whether a border has a slope; else the answer is the same at both ends of a secant.
     """
 
     chosen: Polynomial
     borders: tuple[Polynomial, ...]
-
-
-def number(x: float | Polynomial) -> Sloped:
-    """Return a number, taken exactly, or what depends on no variable."""
-    return Sloped(x if isinstance(x, Polynomial) else constant(x), {})
-
-
-def variable(k: int, value: Polynomial) -> Sloped:
-    """Return variable k of those that slopes are taken in."""
-    return Sloped(value, {k: constant(1)})
+    moves: bool
 
 
 def slopes_in(atoms: Atoms) -> Algebra:
@@ -108,87 +71,8 @@ def _parameter(entry: object) -> Polynomial | None:
     return entry.value if isinstance(entry, Sloped) and not entry.slopes else None
 
 
-# ---- functions without a bend --------------------------------------------------------------------
-
-_Made: TypeAlias = Callable[[str, Polynomial], Polynomial]
-_ONE = constant(1)
-
-_DERIVATIVES: dict[str, Callable[[_Made, Polynomial], Polynomial]] = {
-    "reciprocal": lambda made, p: -made("reciprocal", p).power(2),
-    # Slopes are written in the function itself where they can be: its value is an unknown already,
-    # and a second one would widen the hull.
-    "exp": lambda made, p: made("exp", p),
-    "expm1": lambda made, p: made("exp", p),
-    "log": lambda made, p: made("reciprocal", p),
-    "log1p": lambda made, p: made("reciprocal", p + _ONE),
-    # A root has no slope at 0, which its reciprocal refuses.
-    "sqrt": lambda made, p: constant(Fraction(1, 2)) * made("rsqrt", p),
-    "rsqrt": lambda made, p: constant(Fraction(-1, 2)) * made("rsqrt", p).power(3),
-    "tan": lambda made, p: _ONE + made("tan", p).power(2),
-    # At the ends of their range these have no slope, which `rsqrt` refuses.
-    "asin": lambda made, p: made("rsqrt", _ONE - p * p),
-    "acos": lambda made, p: -made("rsqrt", _ONE - p * p),
-    "atan": lambda made, p: made("reciprocal", _ONE + p * p),
-    "sinh": lambda made, p: made("cosh", p),
-    "cosh": lambda made, p: made("sinh", p),
-    "tanh": lambda made, p: _ONE - made("tanh", p).power(2),
-    "logistic": lambda made, p: made("logistic", p) * (_ONE - made("logistic", p)),
-}
-"""The derivatives of the functions of `ELEMENTARY`, but for those that bend or jump."""
-
-
 def _function(function: Callable[..., object]) -> Rule:
     return lambda atoms, params, *arrays: map_entries(functools.partial(function, atoms), *arrays)
-
-
-def _elementary(atoms: Atoms, name: str, p: Sloped) -> Sloped:
-    value = atoms.elementary(name, p.value)
-    # Of a parameter no slope is wanted, and it may have none.
-    return (
-        chain(value, (p, _DERIVATIVES[name](atoms.elementary, p.value)))
-        if p.slopes
-        else number(value)
-    )
-
-
-def _quotient(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
-    # So all that is divided by b shares one unknown 1/b, and their ratios are not lost.
-    return a * _reciprocal(atoms, b)
-
-
-def _reciprocal(atoms: Atoms, p: Sloped) -> Sloped:
-    value = rules.reciprocal(atoms, p.value)
-    return chain(value, (p, -(value * value)))
-
-
-def _whole_power(atoms: Atoms, p: Sloped, k: int) -> Sloped:
-    # Without the case 0 x^-1 would refuse a box that holds 0.
-    slope = constant(k) * rules.whole_power(atoms, p.value, k - 1) if k else constant(0)
-    return chain(rules.whole_power(atoms, p.value, k), (p, slope))
-
-
-def _power(atoms: Atoms, p: Sloped, exponent: Any) -> Sloped:
-    k = exponent.value if isinstance(exponent, Sloped) else constant(int(exponent))
-    value = rules.power(atoms, p.value, k)
-    return (
-        chain(value, (p, k * rules.power(atoms, p.value, k - _ONE))) if p.slopes else number(value)
-    )
-
-
-def _sine(atoms: Atoms, p: Sloped) -> Sloped:
-    cosine, sine = atoms.circle(p.value)
-    return chain(sine, (p, cosine))
-
-
-def _cosine(atoms: Atoms, p: Sloped) -> Sloped:
-    cosine, sine = atoms.circle(p.value)
-    return chain(cosine, (p, -sine))
-
-
-def _atan2(atoms: Atoms, y: Sloped, x: Sloped) -> Sloped:
-    value = rules.atan2(atoms, y.value, x.value)
-    r = rules.reciprocal(atoms, x.value * x.value + y.value * y.value)
-    return chain(value, (y, x.value * r), (x, -(y.value * r)))
 
 
 # ---- functions that bend -------------------------------------------------------------------------
@@ -196,7 +80,7 @@ def _atan2(atoms: Atoms, y: Sloped, x: Sloped) -> Sloped:
 
 def _mixture(value: Polynomial, side: Polynomial, one: Sloped, other: Sloped) -> Sloped:
     """Return a value with the slopes of `one` where the side is 1 and of `other` where it is 0."""
-    return chain(value, (one, side), (other, _ONE - side))
+    return chain(value, (one, side), (other, constant(1) - side))
 
 
 def _larger(atoms: Atoms, a: Sloped, b: Sloped) -> Sloped:
@@ -243,6 +127,8 @@ def _sign(atoms: Atoms, p: Sloped) -> Sloped:
     reached = atoms.range(p.value)
     if reached.lo > 0 or reached.hi < 0 or reached.lo == reached.hi:
         return number((reached.lo > 0) - (reached.hi < 0))
+    if not p.slopes:
+        return number(atoms.elementary("sign", p.value))
     raise _jump(atoms, "a `sign` changes", p.value)
 
 
@@ -253,11 +139,11 @@ def _comparison(name: str) -> Rule:
     def compare(atoms: Atoms, a: object, b: object) -> bool | Switch:
         if not (isinstance(a, Sloped) and isinstance(b, Sloped)):
             raise GainError("the model compares answers that the domain does not decide.")
-        difference = a.value - b.value
-        reached = atoms.range(difference)
+        difference = a - b
+        border, reached = difference.value, atoms.range(difference.value)
         if certain(reached) or never(reached):
             return certain(reached)
-        return Switch(chosen(atoms.side, difference), (difference,))
+        return Switch(chosen(atoms.side, border), (border,), bool(difference.slopes))
 
     return _function(compare)
 
@@ -275,7 +161,7 @@ _COMPARED: dict[str, tuple[Callable[..., bool], Callable[..., bool], Callable[..
 
 
 def _not(atoms: Atoms, a: bool | Switch) -> bool | Switch:
-    return Switch(_ONE - a.chosen, a.borders) if isinstance(a, Switch) else not a
+    return dataclasses.replace(a, chosen=constant(1) - a.chosen) if isinstance(a, Switch) else not a
 
 
 def _and(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
@@ -283,7 +169,7 @@ def _and(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
         return b if a else False
     if not isinstance(b, Switch):
         return a if b else False
-    return Switch(a.chosen * b.chosen, a.borders + b.borders)
+    return Switch(a.chosen * b.chosen, a.borders + b.borders, a.moves or b.moves)
 
 
 def _or(atoms: Atoms, a: bool | Switch, b: bool | Switch) -> bool | Switch:
@@ -300,13 +186,18 @@ def _choose(atoms: Atoms, which: Any, *cases: Any) -> Any:
         return _bend(atoms, which, no, yes)
     if not all(isinstance(case, bool | np.bool_ | Switch) for case in cases):
         raise _jump(atoms, "a comparison picks a whole number", *which.borders)
+    # Answers that agree need no decision.
+    if not any(isinstance(case, Switch) for case in cases) and no == yes:
+        return yes
     return _or(atoms, _and(atoms, which, yes), _and(atoms, _not(atoms, which), no))
 
 
 def _bend(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
-    """Return a choice of cases that agree wherever the answer changes."""
+    """Return a choice of cases that agree wherever the answer changes between two points."""
     difference = yes.value - no.value
     if not all(divides(border, difference) for border in which.borders):
+        if not which.moves:
+            return _either(atoms, which, no, yes)
         raise _jump(atoms, "the cases of a choice are not the same at its border", *which.borders)
     if which.chosen.value() is not None:
         return yes if which.chosen.value() else no
@@ -319,18 +210,56 @@ def _bend(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
     return _mixture(value, which.chosen, yes, no)
 
 
+def _either(atoms: Atoms, which: Switch, no: Sloped, yes: Sloped) -> Sloped:
+    """Return what may be either case, the same one at both ends of every secant."""
+    reached = atoms.range(no.value).union(atoms.range(yes.value))
+    # Unknowns of their own: at a border another choice between the same cases may fall otherwise.
+    value = atoms.fresh(("choice", object()), reached, no.value, yes.value, *which.borders)
+    return _mixture(value, _undecided(atoms), yes, no)
+
+
+def _undecided(atoms: Atoms) -> Polynomial:
+    """Return an unknown between 0 and 1."""
+    return atoms.fresh(("undecided", object()), Interval(Fraction(0), Fraction(1)))
+
+
 def _convert(atoms: Atoms, params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     """Return entries under another type; a change of float precision is none to the reals."""
     kind = np.dtype(params["new_dtype"]).kind
-    for entry in x.flat:
-        if isinstance(entry, Switch) and kind != "b":
-            raise _jump(atoms, "a comparison becomes a number", *entry.borders)
-        if isinstance(entry, Sloped) and entry.slopes and kind in "biu":
-            raise _jump(atoms, "a state becomes a whole number", entry.value)
     if kind not in "biu":
-        return map_entries(lambda e: e if isinstance(e, Sloped) else number(int(e)), x)
-    plain = map_entries(lambda e: e.value if isinstance(e, Sloped) else e, x)
-    return rules.convert(atoms, params, plain)
+        return map_entries(functools.partial(_as_number, atoms), x)
+    answers = map_entries(functools.partial(_as_integer, atoms, kind), x)
+    decided = not any(isinstance(entry, Switch) for entry in answers.flat)
+    return answers.astype(params["new_dtype"]) if decided else answers
+
+
+def _as_number(atoms: Atoms, entry: Any) -> Sloped:
+    if isinstance(entry, Sloped):
+        return entry
+    if not isinstance(entry, Switch):
+        return number(int(entry))
+    if entry.moves:
+        raise _jump(atoms, "a comparison becomes a number", *entry.borders)
+    return number(_undecided(atoms))
+
+
+def _as_integer(atoms: Atoms, kind: str, entry: Any) -> bool | int | Switch:
+    """Return an entry as a boolean or as a whole number, which is cut towards 0."""
+    if isinstance(entry, Switch):
+        if kind == "b":
+            return entry
+        raise _jump(atoms, "a comparison becomes a number", *entry.borders)
+    if not isinstance(entry, Sloped):
+        return entry
+    value = entry.value.value()
+    if entry.slopes:
+        raise _jump(atoms, "a state becomes a whole number", entry.value)
+    if value is None:
+        raise GainError(
+            "the model turns a state into a whole number, "
+            "which the hull of Jacobians does not know."
+        )
+    return bool(value) if kind == "b" else math.trunc(value)
 
 
 def _reduction(join: Callable[[Atoms, Sloped, Sloped], Sloped]) -> Rule:
@@ -339,18 +268,18 @@ def _reduction(join: Callable[[Atoms, Sloped, Sloped], Sloped]) -> Rule:
 
 _RULES: dict[str, Rule] = {
     **{
-        name: _function(lambda atoms, p, name=name: _elementary(atoms, name, p))
-        for name in _DERIVATIVES
+        name: _function(lambda atoms, p, name=name: sloped.elementary(atoms, name, p))
+        for name in sloped.DERIVATIVES
         if name != "reciprocal"  # JAX has none
     },
-    "div": _function(_quotient),
+    "div": _function(sloped.quotient),
     "integer_pow": lambda atoms, params, x: map_entries(
-        lambda p: _whole_power(atoms, p, params["y"]), x
+        lambda p: sloped.whole_power(atoms, p, params["y"]), x
     ),
-    "pow": _function(_power),
-    "sin": _function(_sine),
-    "cos": _function(_cosine),
-    "atan2": _function(_atan2),
+    "pow": _function(sloped.power),
+    "sin": _function(sloped.sine),
+    "cos": _function(sloped.cosine),
+    "atan2": _function(sloped.atan2),
     "abs": _function(_absolute),
     "max": _function(_larger),
     "min": _function(_smaller),
@@ -364,12 +293,8 @@ _RULES: dict[str, Rule] = {
     "not": _function(_not),
     "select_n": _function(_choose),
     "convert_element_type": _convert,
-    "reduce_max": lambda atoms, params, x: reduction(functools.partial(_larger, atoms), None)(
-        params, x
-    ),
-    "reduce_min": lambda atoms, params, x: reduction(functools.partial(_smaller, atoms), None)(
-        params, x
-    ),
+    "reduce_max": _reduction(_larger),
+    "reduce_min": _reduction(_smaller),
 }
 """What each primitive of JAX does to values and slopes, beyond what the walk itself knows."""
 

@@ -1,1 +1,1 @@
-"""The one place that says what is promised of what runs."""
+"""Guarantees for a run, with the hypotheses on which they rest."""

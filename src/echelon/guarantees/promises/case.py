@@ -1,4 +1,4 @@
-"""What a promise is asked of."""
+"""The data of a run from which its guarantee is computed."""
 
 from typing import NamedTuple
 
@@ -15,17 +15,17 @@ from echelon.synthesis.certificates.domain import Domain
 
 
 class Case(NamedTuple):
-    """What a promise is asked of.
+    """The data of a run from which its guarantee is computed.
 
     Attributes:
-        parts: what runs, prepared.
-        settings: how.
+        parts: prepared.
+        settings: of the run.
         loop: the closed loop near the trim.
-        leaders: what they do by themselves.
-        region: what is promised on a domain; None for nothing.
+        leaders: what is known of them without a run.
+        region: the certificate on a domain; None without one.
         slopes: (K, n, n) the slopes of the drift on all sides of the trim, if it bends there and
-            they could be found; else None.
-        frozen: the law along the leader's path and at the starts; None where it is not asked.
+            they are known; else None.
+        frozen: the law along the leader's path and at the starts; None where it is not needed.
     """
 
     parts: Parts
@@ -66,8 +66,8 @@ class Case(NamedTuple):
     def disturbed(self) -> str:
         """What acts that no promise covers, in words; empty without any."""
         world = self.parts.world
-        found = {
+        sources = {
             "wind or noise acts on the agents": world.disturbance,
             "the agents differ from the model": world.plant,
         }
-        return " and ".join(text for text, what in found.items() if what is not None)
+        return " and ".join(text for text, what in sources.items() if what is not None)

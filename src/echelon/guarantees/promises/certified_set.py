@@ -1,4 +1,4 @@
-"""The set of starts from which no follower leaves the domain of a promise."""
+"""Certified set: starts from which no follower leaves the domain of a guarantee."""
 
 from typing import NamedTuple
 
@@ -108,29 +108,36 @@ def size_of(parts: Parts, states: Array) -> float:
     return float(np.sqrt(np.einsum("ia,ab,ib->", delta, gain.P, delta)))
 
 
-def set_line(region: RegionCertificate | None, found: CertifiedSet | None) -> Statement:
+def set_line(region: RegionCertificate | None, certified: CertifiedSet | None) -> Statement:
     """Say which set of starts is certified."""
-    if found is None:
+    if certified is None:
         return unneeded(Hypothesis.SET, Kind.PROOF, _no_set(region))
-    if found.radius > 0.0:
-        number = found.radius, f"radius {found.radius:.3g}"
-        return holds(Hypothesis.SET, found.kind, found.why, *number)
-    return fails(Hypothesis.SET, found.kind, found.why, found.radius, "empty", remedy=found.remedy)
+    if certified.radius > 0.0:
+        number = certified.radius, f"radius {certified.radius:.3g}"
+        return holds(Hypothesis.SET, certified.kind, certified.why, *number)
+    return fails(
+        Hypothesis.SET,
+        certified.kind,
+        certified.why,
+        certified.radius,
+        "empty",
+        remedy=certified.remedy,
+    )
 
 
 def starts_line(
-    parts: Parts, states: Array, region: RegionCertificate | None, found: CertifiedSet | None
+    parts: Parts, states: Array, region: RegionCertificate | None, certified: CertifiedSet | None
 ) -> Statement:
     """Say whether starts (N, n) lie in the set."""
-    if found is None:
+    if certified is None:
         return unneeded(Hypothesis.STARTS, Kind.PROOF, _no_set(region))
     size = size_of(parts, states)
-    number = size, f"{size:.3g} of {found.radius:.3g}"
-    if size <= found.radius:
+    number = size, f"{size:.3g} of {certified.radius:.3g}"
+    if size <= certified.radius:
         text = "no follower leaves the domain from these starts"
-        return holds(Hypothesis.STARTS, found.kind, text, *number)
+        return holds(Hypothesis.STARTS, certified.kind, text, *number)
     text, remedy = "the starts are outside the certified set", "start nearer to the goals"
-    return fails(Hypothesis.STARTS, found.kind, text, *number, remedy=remedy)
+    return fails(Hypothesis.STARTS, certified.kind, text, *number, remedy=remedy)
 
 
 def _no_set(region: RegionCertificate | None) -> str:

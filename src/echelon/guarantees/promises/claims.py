@@ -1,4 +1,4 @@
-"""What a gain says of itself, compared with what is computed for what runs."""
+"""Compare the certificate stored in a gain with the one computed for this run."""
 
 import numpy as np
 
@@ -15,24 +15,26 @@ _SAME = 1e-6
 _ROUNDING = 1e-9  # of the fastest mode, in the slowest
 
 
-def claims_line(parts: Parts, loop: LinearLoop, found: RegionCertificate | None) -> Statement:
+def claims_line(parts: Parts, loop: LinearLoop, region: RegionCertificate | None) -> Statement:
     """Return whether the certificate that a gain carries is of what runs.
 
     Args:
         parts: what runs.
         loop: near the trim.
-        found: what the gain's metric promises here where the leader's input is relayed.
+        region: what the gain's metric promises here where the leader's input is relayed.
     """
     gain, name, kind = parts.drive.gain, Hypothesis.CLAIMS, Kind.LINEARIZATION
     if gain is None:
         return unneeded(name, kind, "there is no gain")
-    text = _difference(parts, gain, loop, found)
+    text = _difference(parts, gain, loop, region)
     if text:
         return fails(name, kind, text, remedy="the guarantee here is computed from what runs")
     return holds(name, kind, "they agree with this model, graph and coupling")
 
 
-def _difference(parts: Parts, gain: Gain, loop: LinearLoop, found: RegionCertificate | None) -> str:
+def _difference(
+    parts: Parts, gain: Gain, loop: LinearLoop, region: RegionCertificate | None
+) -> str:
     """Return the first difference in words; empty without any."""
     claim, low = gain.certificate, parts.graph.spectrum().low
     if abs(claim.lambda_min - low) > _SAME * low:
@@ -50,7 +52,7 @@ def _difference(parts: Parts, gain: Gain, loop: LinearLoop, found: RegionCertifi
     if claim.edge is not None and loop.certificate.edge is None:
         text = f"the gain says that every mode decays from coupling {claim.edge:.4g} on"
         return f"{text}, and here its argument does not hold"
-    ours, theirs = _rate(found), _rate(claim.region)
+    ours, theirs = _rate(region), _rate(claim.region)
     return "" if ours == theirs else f"the gain says {theirs} on its domain, and here it is {ours}"
 
 

@@ -1,4 +1,4 @@
-"""The closed loop near the trim: the modes into which the disagreement splits."""
+"""Closed loop linearized at the trim, and the modes of the disagreement between agents."""
 
 from typing import NamedTuple
 

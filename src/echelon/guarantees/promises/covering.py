@@ -1,4 +1,4 @@
-"""Whether what a theorem promises covers a run: where it started, and whether it stayed inside."""
+"""Whether a finished run kept to the conditions of its guarantee: its starts, domain and limits."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -52,12 +52,12 @@ def first_exit(result: Result, promise: Promise) -> Exit | None:
     domain, leads, local = region.domain, list(graph.leaders), promise.theorem is Theorem.T2
     who = leads if local else list(range(graph.agents))
     x = (result.states - result.formation.offsets)[:, who] - np.asarray(model.trim[0], float)
-    found = [_outside(result, x, (domain.lower, domain.upper), who, model.state_names)]
+    exits = [_outside(result, x, (domain.lower, domain.upper), who, model.state_names)]
     if local:
         v = model.normalized(result.inputs[:, leads])
         box = (domain.input_lower, domain.input_upper)
-        found.append(_outside(result, v, box, leads, model.input_names))
-    return min((each for each in found if each is not None), default=None)
+        exits.append(_outside(result, v, box, leads, model.input_names))
+    return min((one for one in exits if one is not None), default=None)
 
 
 def _outside(

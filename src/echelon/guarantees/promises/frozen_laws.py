@@ -1,4 +1,4 @@
-"""The laws frozen at states away from the trim: along the leader's path, and where agents start.
+"""Linearizations away from the trim: along the leader's path, and where agents start.
 
 Behind a leader at x(t) small errors obey delta' = (A - lambda B K) delta with A, B and K those of
 x(t), and split by the eigenvalues of the graph as they do at the trim. What these do in turn, each
@@ -175,11 +175,11 @@ class FrozenLaws(NamedTuple):
 
     def growth(self) -> Growth:
         """Return what errors do along the path, of those who do worse."""
-        found = (
+        growths = (
             each.along(self.times, who)
             for each, who in zip(self.on_path, ("followers'", "leader's"))
         )
-        return max(found, key=lambda one: (one.lost, one.rate))
+        return max(growths, key=lambda one: (one.lost, one.rate))
 
     def longest_step(self, settings: Settings) -> float:
         """Return the longest step (s) with which the laws decay wherever they are frozen."""
@@ -209,16 +209,16 @@ def frozen_of(
     path = leader_path_of(parts, settings, leaders)
     if not len(path.times) and (starts == trim).all():
         return None
-    begun = frozen_starts(parts, loop, path, states[None])
+    starts_there = frozen_starts(parts, loop, path, states[None])
     if not len(path.times):
-        none = ModeMatrices(*(part[:0] for part in begun))
-        return FrozenLaws(path, none, None, begun)
+        none = ModeMatrices(*(part[:0] for part in starts_there))
+        return FrozenLaws(path, none, None, starts_there)
     along = _followers(parts, loop, path.rows)
-    own = _leader(parts, path.own_headings(parts), along)
-    found = FrozenLaws(path, along, own, begun)
-    if not found.growth().lost:
-        return found
-    return found._replace(culprit=_culprit(parts, loop, path, found))
+    leader = _leader(parts, path.own_headings(parts), along)
+    frozen = FrozenLaws(path, along, leader, starts_there)
+    if not frozen.growth().lost:
+        return frozen
+    return frozen._replace(culprit=_culprit(parts, loop, path, frozen))
 
 
 def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Array) -> ModeMatrices:
@@ -230,11 +230,11 @@ def frozen_starts(parts: Parts, loop: LinearLoop, path: LeaderPath, states: Arra
     starts = starts[:, _few(starts[0])]
     rows = path.at_start(parts.model, starts.reshape(-1, starts.shape[2]))
     size = MOMENTS + _STARTS
-    found = [
+    parts_of = [
         _followers(parts, loop, PathSamples._make(part[k : k + size] for part in rows))
         for k in range(0, len(rows.times), size)
     ]
-    return ModeMatrices._make(map(np.concatenate, zip(*found, strict=True)))
+    return ModeMatrices._make(map(np.concatenate, zip(*parts_of, strict=True)))
 
 
 def _few(starts: Array) -> Array:
@@ -303,16 +303,16 @@ def _leader(parts: Parts, headings: Array, along: ModeMatrices) -> ModeMatrices 
     return along._replace(gains=fed_back[:, None])
 
 
-def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, found: FrozenLaws) -> str:
+def _culprit(parts: Parts, loop: LinearLoop, path: LeaderPath, frozen: FrozenLaws) -> str:
     """Return the state whose return to the trim helps most where the law is worst, in words."""
     assert isinstance(parts.drive, Laws)
     model, trim = parts.model, np.asarray(parts.model.trim[0], float)
-    n, k = len(trim), int(np.flatnonzero(path.times == found.growth().when)[0])
+    n, k = len(trim), int(np.flatnonzero(path.times == frozen.growth().when)[0])
     there = np.tile(path.states[k], (n, 1))
     np.fill_diagonal(there, trim)
     here = PathSamples(*(np.repeat(part[k : k + 1], n, axis=0) for part in path.rows))
     slopes = _followers(parts, loop, here._replace(leaders=there, states=there))
-    own = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
-    growth = slopes.growth() if own is None else np.maximum(slopes.growth(), own.growth())
+    leader = _leader(parts, np.repeat(path.own_headings(parts)[k], n), slopes)
+    growth = slopes.growth() if leader is None else np.maximum(slopes.growth(), leader.growth())
     j = int(growth.argmin())
     return f"`{model.state_names[j]}` {path.states[k, j]:.3g} {model.state_units[j]}".rstrip()

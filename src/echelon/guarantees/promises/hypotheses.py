@@ -1,7 +1,6 @@
-"""What a promise rests on, a line each: its verdict, its number, and what would be needed.
+"""Hypotheses of a guarantee about agents, leaders and offsets, a line of `check` each.
 
-A line whose `reason` is not empty stands against any promise where it fails; the others say what is
-left of one, or why.
+A failed line with a `reason` rules out any guarantee; without one it weakens or explains it.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Where the leader goes, in the axes in which the law sees it."""
+"""The leader's path, in the axes in which the followers' law works."""
 
 from typing import NamedTuple
 
@@ -84,19 +84,19 @@ def leader_path_of(parts: Parts, settings: Settings, leaders: Leaders) -> Leader
     model, times = parts.model, np.linspace(0.0, settings.horizon, MOMENTS)
     trim, m = np.asarray(model.trim[0], float), len(model.input_names)
     twice = jax.device_put(np.concatenate([times, times + _SHORT]))
-    wanted = parts.drive.reference_states(model, twice)
-    if wanted is not None:
-        states, soon = np.split(np.asarray(wanted), 2)
+    desired = parts.drive.reference_states(model, twice)
+    if desired is not None:
+        states, soon = np.split(np.asarray(desired), 2)
         v = _inputs(model, states, soon)
-        known = np.isfinite(states).all(axis=1) & np.isfinite(v).all(axis=1)
-        return _as_sensed(parts, times[known], states[known], v[known])
-    own = None
+        finite = np.isfinite(states).all(axis=1) & np.isfinite(v).all(axis=1)
+        return _as_sensed(parts, times[finite], states[finite], v[finite])
+    paths = None
     if leaders.rest and not (leaders.starts == trim).all():
-        own = own_paths(parts, settings, leaders.starts[:1])
-    if own is None:
+        paths = own_paths(parts, settings, leaders.starts[:1])
+    if paths is None:
         return _as_sensed(parts, np.zeros(0), np.zeros((0, len(trim))), np.zeros((0, m)))
-    frames = np.linspace(0, len(own) - 1, MOMENTS).round().astype(int)
-    return _as_sensed(parts, times, own[frames, 0], np.zeros((MOMENTS, m)))
+    frames = np.linspace(0, len(paths) - 1, MOMENTS).round().astype(int)
+    return _as_sensed(parts, times, paths[frames, 0], np.zeros((MOMENTS, m)))
 
 
 def _as_sensed(parts: Parts, times: Array, states: Array, inputs: Array) -> LeaderPath:
@@ -133,10 +133,10 @@ def _in_heading(
 
 def _inputs(model: ControlAffine, now: Array, soon: Array) -> Array:
     """Return the normalized inputs that take agents from states to others _SHORT later."""
-    found, maps = map(np.asarray, _pushes(model, now, soon))
-    known = np.isfinite(found).all(axis=1) & np.isfinite(maps).all(axis=(1, 2))
+    velocities, maps = map(np.asarray, _pushes(model, now, soon))
+    finite = np.isfinite(velocities).all(axis=1) & np.isfinite(maps).all(axis=(1, 2))
     inputs = np.full((len(maps), maps.shape[2]), np.nan)
-    inputs[known] = np.einsum("kmn,kn->km", np.linalg.pinv(maps[known]), found[known])
+    inputs[finite] = np.einsum("kmn,kn->km", np.linalg.pinv(maps[finite]), velocities[finite])
     return inputs
 
 

@@ -1,4 +1,4 @@
-"""What the leaders do by themselves: whether they agree, and how far they go."""
+"""Leaders without followers: whether they agree, and how far they move from the trim."""
 
 from typing import NamedTuple
 

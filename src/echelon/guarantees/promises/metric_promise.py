@@ -70,9 +70,9 @@ class MetricPromise(Promise):
         lines = list(hypotheses(case))
         region = weaken(parts, region, lines)
         certificate = region.certificate
-        found = certified_set(parts, settings, leaders, certificate)
-        lines += [region.line, set_line(certificate, found)]
-        lines += [starts_line(parts, states, certificate, found)]
+        certified = certified_set(parts, settings, leaders, certificate)
+        lines += [region.line, set_line(certificate, certified)]
+        lines += [starts_line(parts, states, certificate, certified)]
         lines += [claims_line(parts, loop, region.relayed)]
         return cls(
             loop=loop,
@@ -80,7 +80,7 @@ class MetricPromise(Promise):
             without=case.disturbed,
             leader_mode=None if leaders.rest else leaders.slowest,
             region=certificate,
-            certified=found,
+            certified=certified,
             domain="" if certificate is None else certificate.domain.in_words(parts.model),
             case=case,
             turns=turns_in_words(case),
@@ -162,18 +162,19 @@ class MetricPromise(Promise):
 
     def _regional(self, region: RegionCertificate) -> str:
         """Return what the region adds, as strong as its own argument and no stronger."""
-        found, condition, theorem = self.certified, self.condition, region.theorem
+        certified, condition, theorem = self.certified, self.condition, region.theorem
         by, what = self.kind.value, f"errors shrink at {region.rate:.3g} 1/s or faster"
         what = "V does not increase" if theorem is Theorem.A5 else what
-        if found is None:
+        if certified is None:
             text = f"small {what}{condition}, while the leader stays in {self.domain}"
             return f"{by}: {text} ({theorem})."
-        if not found.radius:
+        if not certified.radius:
             text = f"for as long as all agents stay in {self.domain} ({theorem}), and no start is "
-            return f"{by}: {what}{condition}, {text}certified to stay: {found.why}; {found.remedy}."
-        read = "" if found.kind is self.kind else ", if the leader moves as in a run of its own"
-        start = f"any start with sum_i delta_i'P delta_i <= {found.radius:.3g}^2"
-        start = "everywhere" if found.radius == float("inf") else start
+            text += f"certified to stay: {certified.why}; {certified.remedy}."
+            return f"{by}: {what}{condition}, {text}"
+        read = "" if certified.kind is self.kind else ", if the leader moves as in a run of its own"
+        start = f"any start with sum_i delta_i'P delta_i <= {certified.radius:.3g}^2"
+        start = "everywhere" if certified.radius == float("inf") else start
         return f"{by}: from {start}, {what}{condition}{read} ({theorem})."
 
     def why_covered(self) -> str:

@@ -1,4 +1,4 @@
-"""What a promise asks of the law's modes: near the trim, along the leader's path, in held steps."""
+"""Hypotheses on the modes of the loop: at the trim, along the leader's path, and when sampled."""
 
 from collections.abc import Iterator
 
@@ -156,15 +156,15 @@ def _along(case: Case) -> Statement:
     if frozen is None or not frozen.on_path:
         text = "the leader rests at the trim, or follows no path of its own"
         return unneeded(name, Kind.SAMPLES, text)
-    found, states = frozen.growth(), len(frozen.times)
-    number = found.rate, f"{found.rate:.3g} 1/s"
-    if not found.lost:
+    growth, states = frozen.growth(), len(frozen.times)
+    number = growth.rate, f"{growth.rate:.3g} 1/s"
+    if not growth.lost:
         text = f"small errors decay over {states} states of it, each frozen until the next"
         return holds(name, Kind.SAMPLES, text, *number)
-    grown = f"{np.exp(min(found.most, 99.0)):.2g}-fold on a part of it"
-    grown = f"at {found.rate:.3g} 1/s" if found.rate >= 0.0 else grown
-    text = f"along the leader's path the {found.whose} errors grow {grown}, fastest at "
-    text += f"{found.when:.3g} s, where {frozen.culprit} takes the law farthest from its trim"
+    grown = f"{np.exp(min(growth.most, 99.0)):.2g}-fold on a part of it"
+    grown = f"at {growth.rate:.3g} 1/s" if growth.rate >= 0.0 else grown
+    text = f"along the leader's path the {growth.whose} errors grow {grown}, fastest at "
+    text += f"{growth.when:.3g} s, where {frozen.culprit} takes the law farthest from its trim"
     remedy = f"keep {frozen.culprit.partition(' ')[0]} nearer to the trim there"
     return fails(name, Kind.SAMPLES, text, *number, remedy=remedy, reason=text)
 
@@ -185,13 +185,13 @@ def sampling_line(case: Case) -> Statement:
     if printed and goals.any():
         text = "`printed` takes f + g u as the next state, which ignores the goals"
         return _step_line(case, np.inf, text, "use `simulation.integrator: rk4`")
-    found = {f"a step, {loop.where}": radius}
+    radii = {f"a step, {loop.where}": radius}
     if case.frozen and not printed:
         places = ("a step along the leader's path", "a step where agents start")
-        found |= zip(places, case.frozen.radii(settings))
-    where = next((x for x, one in found.items() if not one < 1.0), f"a step, {loop.where}")
+        radii |= zip(places, case.frozen.radii(settings))
+    where = next((x for x, one in radii.items() if not one < 1.0), f"a step, {loop.where}")
     remedy = "use `simulation.integrator: rk4`" if printed else ""
-    return _step_line(case, found[where], f"spectral radius {found[where]:.4g} {where}", remedy)
+    return _step_line(case, radii[where], f"spectral radius {radii[where]:.4g} {where}", remedy)
 
 
 def _step_line(case: Case, radius: float, text: str, remedy: str = "") -> Statement:

@@ -28,6 +28,15 @@ from echelon.simulation.step.drive import Drive
 from echelon.simulation.step.settings import Settings
 from echelon.synthesis.certificates.certificate import RegionCertificate
 
+REQUIRED = (
+    Hypothesis.SYMMETRY,
+    Hypothesis.SMOOTH,
+    Hypothesis.MATCHED_MOTION,
+    Hypothesis.DISAGREEMENT_DECAY,
+    Hypothesis.SAMPLING,
+    Hypothesis.CLAIMS,
+)
+"""Hypotheses that every guarantee has a line on, beside those on agents and leaders."""
 _BEHIND_GROWTH = (Hypothesis.DETECTABLE, Hypothesis.COUPLING)
 
 
@@ -70,7 +79,8 @@ class Promise(abc.ABC):
 
     Attributes:
         loop: near the trim; what margins are taken of.
-        hypotheses: each with its verdict, its number and what would be needed.
+        hypotheses: each with its verdict, its number and what would be needed; those on agents and
+            leaders and the `REQUIRED` ones are always there.
         without: what acts on the agents that is left out, in words; empty without any.
         leader_mode: the leader's slowest mode by itself, 1/s; None where it follows nothing.
         region: what is guaranteed on a domain; None without one.
@@ -103,10 +113,10 @@ class Promise(abc.ABC):
             try:
                 with precision("float64"):
                     prepared.parts.drive.accept(problem)
-                    found = self.of(prepared._replace(problem=problem), each, brief)
+                    outcome = self.of(prepared._replace(problem=problem), each, brief)
             except EchelonError as error:
-                found = error
-            yield found
+                outcome = error
+            yield outcome
 
     @classmethod
     def design(cls, parts: Parts, settings: Settings) -> LawDesign | None:
@@ -167,8 +177,8 @@ class Promise(abc.ABC):
     @property
     def reasons(self) -> tuple[str, ...]:
         """What stands against any guarantee; nothing where there is one."""
-        failed = (each for each in self.hypotheses.values() if each.fails)
-        return tuple(dict.fromkeys(each.reason for each in failed if each.reason))
+        failed = (line for line in self.hypotheses.values() if line.fails)
+        return tuple(dict.fromkeys(line.reason for line in failed if line.reason))
 
     @property
     def promised(self) -> bool:
@@ -201,12 +211,12 @@ class Promise(abc.ABC):
 
         A mode that does not decay is explained by what the law cannot feel, or a weak coupling.
         """
-        failed = {name: each for name, each in self.hypotheses.items() if each.fails}
+        failed = {name: line for name, line in self.hypotheses.items() if line.fails}
         grows = Hypothesis.DISAGREEMENT_DECAY in failed
         why = tuple(failed[name].cause for name in _BEHIND_GROWTH if grows and name in failed)
-        rest = (each for name, each in failed.items() if each.reason and name not in _BEHIND_GROWTH)
+        rest = (line for name, line in failed.items() if line.reason and name not in _BEHIND_GROWTH)
         rest = (x for x in rest if not why or x.statement is not Hypothesis.DISAGREEMENT_DECAY)
-        return (*why, *(each.cause for each in rest))
+        return (*why, *(line.cause for line in rest))
 
     def sentence(self) -> str:
         """Return what is guaranteed, in sentences, and no more than that."""
@@ -218,13 +228,13 @@ class Promise(abc.ABC):
 
     def _against(self) -> str:
         """Return all that stands against a guarantee, and what would help."""
-        against = (each for each in self.hypotheses.values() if each.fails and each.reason)
+        against = (line for line in self.hypotheses.values() if line.fails and line.reason)
         remedies = "; ".join(dict.fromkeys(x.remedy for x in against))
         return f"Nothing is guaranteed: {'; '.join(self.reasons)}. What would help: {remedies}."
 
     def as_mapping(self) -> dict[str, Any]:
         """Return it ready for JSON; what does not exist is None."""
-        certificate, found = self.loop.certificate, self.certified
+        certificate, certified = self.loop.certificate, self.certified
         return {
             "promised": self.promised,
             "sentence": self.sentence(),
@@ -238,9 +248,9 @@ class Promise(abc.ABC):
             "lambda_min": certificate.lambda_min,
             "lambda_max": certificate.lambda_max,
             "domain": self.domain or None,
-            "certified_set": None if found is None else found.as_mapping(),
+            "certified_set": None if certified is None else certified.as_mapping(),
             "anywhere": self.anywhere(),
-            "hypotheses": [each.as_mapping() for each in self.hypotheses.values()],
+            "hypotheses": [line.as_mapping() for line in self.hypotheses.values()],
         }
 
 
@@ -265,8 +275,8 @@ def promise(parts: Parts, settings: Settings) -> Promise:
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
-    found = _cache.get(parts, {}).get(settings)
-    return found or _computed(prepare(parts, settings), parts, settings)
+    stored = _cache.get(parts, {}).get(settings)
+    return stored or _computed(prepare(parts, settings), parts, settings)
 
 
 def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) -> Promises:
@@ -277,8 +287,8 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
     for k, each in enumerate(settings):
         try:
             prepared, alike = prepare(parts, each), each._replace(seed=0)
-            known = (p for s, p in _cache.get(parts, {}).items() if s._replace(seed=0) == alike)
-            first = next(known, None) or _computed(prepared, parts, each, brief)
+            stored = (p for s, p in _cache.get(parts, {}).items() if s._replace(seed=0) == alike)
+            first = next(stored, None) or _computed(prepared, parts, each, brief)
         except EchelonError as error:
             # Others may start where the laws have a meaning.
             yield error
@@ -290,8 +300,8 @@ def promises(parts: Parts, settings: Sequence[Settings], brief: bool = False) ->
 def _computed(prepared: Prepared, parts: Parts, settings: Settings, brief: bool = False) -> Promise:
     """Return what is guaranteed of parts, and store it if nothing was left out."""
     with precision("float64"):
-        found = prover_of(prepared.parts.drive).of(prepared, settings, brief)
+        computed = prover_of(prepared.parts.drive).of(prepared, settings, brief)
     # A result holds the prepared parts, and asks again.
-    for each in (parts, prepared.parts) if found.complete else ():
-        _cache.setdefault(each, {})[settings] = found
-    return found
+    for key in (parts, prepared.parts) if computed.complete else ():
+        _cache.setdefault(key, {})[settings] = computed
+    return computed

@@ -1,8 +1,8 @@
-"""What the metric of a gain promises on its domain for the model, graph, coupling and law that run.
+"""Certificate of a gain's metric P on its domain, computed again for the parts that run.
 
-A region that a gain carries is a claim of when it was made. Here it is computed again: the
-Jacobians are enclosed from the model that runs, the strength 2 c lambda_min is that of its coupling
-and graph, and a proof is proved anew. All of that is kept in a process, so it is not paid twice.
+The region stored in a gain is a claim about the parts for which it was computed. Here the Jacobians
+are enclosed for the model that runs, the strength 2 c lambda_min is that of its coupling and graph,
+and a proof is repeated. The results are cached per process.
 """
 
 import dataclasses
@@ -60,20 +60,20 @@ def region_of(parts: Parts, leaders: Leaders) -> Region:
         text = "a gain by `robust-lqr` or `contraction` with a `domain` has one"
         return Region(None, None, unneeded(_NAME, Kind.PROOF, text, number_text="none"))
     try:
-        found = _computed(parts, gain, gain.certificate.region)
+        certificate = _computed(parts, gain, gain.certificate.region)
     except GainError as error:
         return Region(None, None, _lost(str(error).rstrip("."), "compute the gain again"))
-    if found is None and not _strength(parts, gain) > 0.0:
+    if certificate is None and not _strength(parts, gain) > 0.0:
         text = "on this graph no sum of squares is known that decreases for all slopes"
         return Region(None, None, _lost(text, "make the links bidirectional"))
-    if found is None:
+    if certificate is None:
         strength = f"at coupling {gain.coupling:.4g}, 2 c lambda_min = {_strength(parts, gain):.4g}"
         text = f"P does not contract on the domain {strength}"
         return Region(None, None, _lost(text, "raise `coupling`, or shrink the `domain`"))
-    text, remedy = _withheld(parts, leaders, gain, found)
+    text, remedy = _withheld(parts, leaders, gain, certificate)
     if text:
-        return Region(None, found, _lost(text, remedy))
-    return Region(found, found, _line(parts, found))
+        return Region(None, certificate, _lost(text, remedy))
+    return Region(certificate, certificate, _line(parts, certificate))
 
 
 def _region_at_bend(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
@@ -85,12 +85,16 @@ def _region_at_bend(parts: Parts, leaders: Leaders, gain: Gain) -> Region:
     none = unneeded(_NAME, Kind.VERTICES, text, number_text="none")
     try:
         pairs = _with_inner(parts, gain, pairs_on(parts.model, _near(parts.model), gain.R))
-        found = pairs and _contraction(parts, gain, pairs, exact=False)
+        certificate = pairs and _contraction(parts, gain, pairs, exact=False)
     except GainError:
-        found = None
-    if found is None or found.kind is Kind.SAMPLES or _not_the_law(parts, leaders, found)[0]:
+        certificate = None
+    if (
+        certificate is None
+        or certificate.kind is Kind.SAMPLES
+        or _not_the_law(parts, leaders, certificate)[0]
+    ):
         return Region(None, None, none)
-    return Region(found, None, _line(parts, found))
+    return Region(certificate, None, _line(parts, certificate))
 
 
 def _near(model: ControlAffine) -> Domain:
@@ -130,10 +134,10 @@ def _computed(parts: Parts, gain: Gain, claim: RegionCertificate) -> RegionCerti
     """Return what the metric promises on the claim's domain behind a relayed input."""
     model, spectrum, exact = parts.model, parts.graph.spectrum(), claim.kind is Kind.PROOF
     if claim.theorem is Theorem.A5:
-        found = jacobians(model, claim.domain)
-        if not falls(gain.P, found.matrices):
+        hull = jacobians(model, claim.domain)
+        if not falls(gain.P, hull.matrices):
             return None
-        return drift_region(model, claim.domain, found, gain.P, gain.coupling, spectrum)
+        return drift_region(model, claim.domain, hull, gain.P, gain.coupling, spectrum)
     return _contraction(parts, gain, pairs_on(model, claim.domain, gain.R), exact)
 
 
@@ -142,20 +146,22 @@ def _strength(parts: Parts, gain: Gain) -> float:
 
 
 def _withheld(
-    parts: Parts, leaders: Leaders, gain: Gain, found: RegionCertificate
+    parts: Parts, leaders: Leaders, gain: Gain, certificate: RegionCertificate
 ) -> tuple[str, str]:
     """Return why the gain in the law that runs does not keep what the metric could, and a cure."""
     if gain.inner is not None:
         return "the hull is of the drift without the gain's inner loop", "remove the inner loop"
-    return _not_the_law(parts, leaders, found)
+    return _not_the_law(parts, leaders, certificate)
 
 
-def _not_the_law(parts: Parts, leaders: Leaders, found: RegionCertificate) -> tuple[str, str]:
+def _not_the_law(parts: Parts, leaders: Leaders, certificate: RegionCertificate) -> tuple[str, str]:
     """Return why what is fed forward takes away what the metric could keep, and what would not."""
     if _turns_away(parts, leaders):
-        text = f"the law turns with the leader's heading, and {found.theorem} is of axes that do "
-        return f"{text}not", "keep the leader's heading at the trim's"
-    feedforward, theorem = parts.drive.feedforward, found.theorem
+        text = (
+            f"the law turns with the leader's heading, and {certificate.theorem} needs fixed axes"
+        )
+        return text, "keep the leader's heading at the trim's"
+    feedforward, theorem = parts.drive.feedforward, certificate.theorem
     # The parent of all is a leader where no agent is farther away, and what it sends is relayed.
     if feedforward is Feedforward.PARENT and parts.graph.depths().max() > 1:
         text = "parents' inputs are fed forward, and the modes are no longer those of a symmetric "
@@ -186,23 +192,23 @@ def _turns_away(parts: Parts, leaders: Leaders) -> bool:
 def weaken(parts: Parts, region: Region, lines: Iterable[Statement]) -> Region:
     """Return a region no stronger than what its hypotheses say of the offsets on its domain."""
     [line] = (x for x in lines if x.statement is Hypothesis.SYMMETRY)
-    found, needed = region.certificate, line.verdict is not Verdict.NOT_NEEDED
-    if found is None or not needed or line.kind.strength >= found.kind.strength:
+    certificate, needed = region.certificate, line.verdict is not Verdict.NOT_NEEDED
+    if certificate is None or not needed or line.kind.strength >= certificate.kind.strength:
         return region
     why = "the offsets are tried at samples of the domain, and not proved"
-    found = dataclasses.replace(found, kind=line.kind, why=why)
-    return region._replace(certificate=found, line=_line(parts, found))
+    certificate = dataclasses.replace(certificate, kind=line.kind, why=why)
+    return region._replace(certificate=certificate, line=_line(parts, certificate))
 
 
 def _lost(text: str, remedy: str) -> Statement:
     return fails(_NAME, Kind.PROOF, text, None, "none", remedy=remedy)
 
 
-def _line(parts: Parts, found: RegionCertificate) -> Statement:
-    theorem, kind = found.theorem, found.kind
-    text = f"{theorem}: {theorem.value} {found.domain.in_words(parts.model)}"
-    text += f"; no more than {kind}, since {found.why}" if found.why else ""
+def _line(parts: Parts, certificate: RegionCertificate) -> Statement:
+    theorem, kind = certificate.theorem, certificate.kind
+    text = f"{theorem}: {theorem.value} {certificate.domain.in_words(parts.model)}"
+    text += f"; no more than {kind}, since {certificate.why}" if certificate.why else ""
     skew = parts.graph.spectrum().skew
     if skew > 1.0:
         text += f"; their squares weighted as T7 has it, {skew:.3g} to 1 at most"
-    return holds(_NAME, kind, text, found.rate, f"{found.rate:.3g} 1/s")
+    return holds(_NAME, kind, text, certificate.rate, f"{certificate.rate:.3g} 1/s")

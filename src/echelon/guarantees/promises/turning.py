@@ -1,7 +1,7 @@
-"""What is promised of a law that turns with the leader's heading.
+"""Guarantee for a law whose gain turns with the leader's heading.
 
-Where f and g turn with the heading, what is said of errors at the trim holds at any heading that
-stays, word for word. One that turns at a steady rate w about a state of rest in the turning axes
+Where f and g turn with the heading, the guarantee for errors at the trim holds at any constant
+heading. A heading that turns at a steady rate w about a state of rest in the turning axes
 leaves delta' = (A - w G - c lambda B R^-1 B'P) delta, with A and B taken there: constant again.
 """
 
@@ -59,10 +59,10 @@ def turning(case: Case) -> Iterator[Statement]:
         text += f"; in a steady turn of {worst:.3g} rad/s modes decay at {-slowest[worst]:.3g} 1/s"
         yield holds(_NAME, kind, text, *number)
         return
-    found = f"in a steady turn of {worst:.3g} rad/s, as on the leader's path, the disagreement "
-    found += "does not decay"
+    text = f"in a steady turn of {worst:.3g} rad/s, as on the leader's path, the disagreement "
+    text += "does not decay"
     remedy = f"turn no faster than {_fastest(case, worst):.3g} rad/s"
-    yield fails(_NAME, kind, found, *number, remedy=remedy, reason=found)
+    yield fails(_NAME, kind, text, *number, remedy=remedy, reason=text)
 
 
 def turns_in_words(case: Case) -> str:
@@ -82,8 +82,8 @@ def slowest_in_turns(case: Case) -> dict[float, float]:
     if not turns_with_heading(case):
         return {}
     rates = case.frozen.turns if case.frozen else ()
-    found = {rate: slowest_in_turn(case, rate) for rate in rates}
-    return {rate: slowest for rate, slowest in found.items() if slowest is not None}
+    modes = {rate: slowest_in_turn(case, rate) for rate in rates}
+    return {rate: slowest for rate, slowest in modes.items() if slowest is not None}
 
 
 def slowest_in_turn(case: Case, rate: float) -> float | None:

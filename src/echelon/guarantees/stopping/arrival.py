@@ -1,9 +1,9 @@
-"""When the formation is there, by the closed form of T5.3.
+"""Arrival time of the formation within 1 cm, by the closed form of T5.3.
 
 With w = L_g^-1 1 the largest |zeta_i| / w_i falls as m' = -sigma(c m) / max w or faster. For
 sigma(x) = x / sqrt(1 + (x/s)^2) that is solved by F(c m / s) = F(c m(0) / s) - c t / max w with
 F(v) = sqrt(1 + v^2) - arsinh(1 / v). Behind it comes the inner loop, delta y = h * zeta and what
-the start leaves, where h is positive. Told by parents each link is e' = -sigma(c a e) by itself, so
+the start leaves, where h is positive. Fed by parents each link is e' = -sigma(c a e) by itself, so
 that m is its |e| with w = 1, and what is off the leader is at most the sum along the way. Of graphs
 that take turns each has its w, and while the leader does not reach everybody the largest |zeta_i|
 at least does not grow.
@@ -93,16 +93,16 @@ def _along_links(
     stops: Array, graph: Graph, law: StoppingPoint, c: float, speed: float, times: Array
 ) -> _Reach:
     """Return the same told by parents: each link e' = -sigma(c a e) is alone, and they add up."""
-    heard, parent = graph.exchange(leaderward=True), graph.parents()
-    strength = dict(zip(heard.receivers.tolist(), heard.weights.tolist(), strict=True))
+    links, parent = graph.exchange(leaderward=True), graph.parents()
+    strength = dict(zip(links.receivers.tolist(), links.weights.tolist(), strict=True))
     followers, depths = list(graph.followers), graph.depths()
-    found = {lead: np.zeros(len(times)) for lead in graph.leaders}
+    bounds = {lead: np.zeros(len(times)) for lead in graph.leaders}
     for i in sorted(followers, key=lambda i: depths[i]):
         off = float(abs(stops[i] - stops[parent[i]]))
         link = _falling(off, c * strength[i], 1.0, speed, times)
-        found[i] = found[parent[i]] + link
+        bounds[i] = bounds[parent[i]] + link
     count = len(followers)
-    return _Reach(np.stack([found[i] for i in followers]), np.arange(count), np.ones(count))
+    return _Reach(np.stack([bounds[i] for i in followers]), np.arange(count), np.ones(count))
 
 
 def _in_turns(

@@ -1,8 +1,9 @@
-"""How near to the borders of their flat coordinates the agents of a run may come (T5)."""
+"""Distance that agents keep from the borders of their flat coordinates (T5)."""
 
 import math
+from collections.abc import Iterable
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,7 +54,7 @@ class Border(NamedTuple):
     fastest: float
     led: bool
     turn: float
-    data: dict[str, Any]
+    data: dict[str, object]
 
     @property
     def many(self) -> bool:
@@ -131,7 +132,7 @@ class _BorderCase(NamedTuple):
     allowed: Fraction
 
 
-def _together(speeds: Any) -> Fraction | None:
+def _together(speeds: Iterable[float]) -> Fraction | None:
     """Return a bound of the length of a vector whose entries are within speeds; None for none."""
     each = list(speeds)
     if any(map(math.isinf, each)):
@@ -140,7 +141,7 @@ def _together(speeds: Any) -> Fraction | None:
     return exact[0] if len(exact) == 1 else root_bounds(sum((s**2 for s in exact), Fraction(0)))[1]
 
 
-def _data(case: _BorderCase, least: Least, left: Fraction) -> dict[str, Any]:
+def _data(case: _BorderCase, least: Least, left: Fraction) -> dict[str, object]:
     chain, p = case.chain, len(case.chain.powers)
     return {
         "outputs": list(case.bound.outputs),
@@ -155,7 +156,7 @@ def _data(case: _BorderCase, least: Least, left: Fraction) -> dict[str, Any]:
     }
 
 
-def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, Any]]:
+def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
     """Return the clearances of one output, which may go far on its other side, and the starts."""
     run, [k], chain = case.run, case.places, case.chain
     leads, p = list(run.parts.graph.leaders), len(chain.powers)
@@ -178,7 +179,7 @@ def _upward(case: _BorderCase) -> tuple[list[Clearance], dict[str, Any]]:
     return clearances, {name: flat[:, 1 : p + 1].tolist() for name, flat in starts.items()}
 
 
-def _along(case: _BorderCase) -> tuple[list[Clearance], dict[str, Any]]:
+def _along(case: _BorderCase) -> tuple[list[Clearance], dict[str, object]]:
     """Return the clearances of several outputs, and the starts against the leader's path."""
     run, p = case.run, len(case.chain.powers)
     away = (run.flat - run.ahead)[:, 1 : p + 1, case.places].swapaxes(1, 2)
@@ -219,9 +220,9 @@ def _distinct(starts: Array) -> Array:
     Raises:
         GainError: there are too many.
     """
-    found = np.unique(starts, axis=0)
-    if len(found) > _STARTS:
+    distinct = np.unique(starts, axis=0)
+    if len(distinct) > _STARTS:
         raise GainError(
-            f"{len(found)} starts differ in more than a speed, and {_STARTS} are tried."
+            f"{len(distinct)} starts differ in more than a speed, and {_STARTS} are tried."
         )
-    return found
+    return distinct

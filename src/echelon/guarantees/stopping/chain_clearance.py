@@ -1,4 +1,4 @@
-"""How far the inner states of an agent go under the law `stopping-point`, in rationals (T5).
+"""Bounds on the inner states of an agent from a known start, in rationals (T5).
 
 Each output obeys q(D) v = -k0 w for its speed v less the leader's, with |w| <= s whatever the other
 agents do. From a start that is known, v^(order) at any time is what the start leaves plus what w
@@ -125,9 +125,9 @@ def _pieces(chain: Chain, order: int) -> tuple[_Piece, ...]:
     only = [Fraction(1), *[Fraction(0)] * (len(chain.powers) - 1)]
     steep = chain.derivative(chain.free(only), order)
     spreads = spreads_on_pieces(chain.kernel(order), _HALVINGS)
-    count, found, moved = 1 << _HALVINGS, list[_Piece](), Fraction(0)
+    count, pieces, moved = 1 << _HALVINGS, list[_Piece](), Fraction(0)
     for k in range(count - 1, -1, -1):
         low, high = Fraction(k, count), Fraction(k + 1, count)
         moved += spreads[k]
-        found.append(_Piece(low, high, moved, _size(steep, low, high)))
-    return tuple(found)
+        pieces.append(_Piece(low, high, moved, _size(steep, low, high)))
+    return tuple(pieces)

@@ -1,4 +1,4 @@
-"""What a chain of integrators under q(D) v = -k0 w does at most, in rationals.
+"""Bounds on the response of a chain of integrators under q(D) v = -k0 w, in rationals.
 
 The roots of q are whole multiples of a unit, so that with x = exp(-unit t) every response is a
 polynomial in x on (0, 1], and what it is at most is found by Bernstein's coefficients, which
@@ -63,11 +63,11 @@ class Chain(NamedTuple):
 
     def impulse(self) -> Poly:
         """Return h, the response of v to an impulse of -w; it is positive with integral 1."""
-        found = Poly()
+        response = Poly()
         for n in self.powers:
             apart = ((other - n) * self.unit for other in self.powers if other != n)
-            found[n] = self.stiffness / math.prod(apart, start=Fraction(1))
-        return found
+            response[n] = self.stiffness / math.prod(apart, start=Fraction(1))
+        return response
 
     def free(self, start: Sequence[Fraction]) -> Poly:
         """Return v from (v, v', ...) at t = 0 without any w; the start is as long as the roots."""
@@ -205,12 +205,12 @@ def _moved(p: Poly, low: Fraction, high: Fraction) -> Poly:
     """Return p(low + (high - low) x)."""
     if (low, high) == (0, 1):
         return p
-    found, width = dict[int, Fraction](), high - low
+    coefficients, width = dict[int, Fraction](), high - low
     for n, c in p.items():
         for k in range(n + 1):
             more = c * math.comb(n, k) * low ** (n - k) * width**k
-            found[k] = found.get(k, Fraction(0)) + more
-    return found
+            coefficients[k] = coefficients.get(k, Fraction(0)) + more
+    return coefficients
 
 
 def _bernstein(p: Poly) -> list[Fraction]:

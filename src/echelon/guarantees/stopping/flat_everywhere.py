@@ -1,4 +1,4 @@
-"""Where flat coordinates end, for models that do not say: nowhere, if the map to them is linear."""
+"""Borders of the flat coordinates of models that do not state them: none for a linear map."""
 
 from collections.abc import Sequence
 from fractions import Fraction

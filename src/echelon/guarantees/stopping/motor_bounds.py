@@ -1,4 +1,4 @@
-"""What four motors must give at most on a path whose derivatives are bounded, in rationals (T5).
+"""Bounds on four motors' thrust along a path with bounded derivatives, in rationals (T5).
 
 With F = p'' + g e3 the thrust is m |F| along F, and the derivatives of F turn it: R'F' and R'F''
 give the body rates and, with the yaw, all three torques (theory page). Only sizes are used, so that
@@ -87,11 +87,11 @@ def motors_of(
     """
     least, largest, slope = None, Fraction(0), Fraction(0)
     for piece, demand in zip(slices, path, strict=True):
-        found = motors_for(frame, add_pushes(piece, demand, pushes))
-        if found.slope is None:
-            return found
-        least = found.least if least is None else min(least, found.least)
-        largest, slope = max(largest, found.largest), max(slope, found.slope)
+        motors = motors_for(frame, add_pushes(piece, demand, pushes))
+        if motors.slope is None:
+            return motors
+        least = motors.least if least is None else min(least, motors.least)
+        largest, slope = max(largest, motors.largest), max(slope, motors.slope)
     assert least is not None
     return Motors(least, largest, slope)
 

@@ -1,7 +1,7 @@
-"""Roots and speeds of the law `stopping-point` under which the motors are certified to suffice."""
+"""Find roots and speeds of the law for which the motors are certified to suffice."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from echelon.core.errors import EchelonError
 from echelon.core.numerics import precision
@@ -55,7 +55,7 @@ class MotorDesign(NamedTuple):
         changes = " ".join(f'--set "{change}"' for change in shown)
         return f"Certified with motors: {changes}. {self.promise.sentence()}"
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
         numbers = {"rate": self.rate, "speed": list(self.speed), "leader": list(self.leader)}
         return {**numbers, "promise": self.promise.as_mapping()}
@@ -70,8 +70,8 @@ def design_with_motors(parts: Parts, settings: Settings) -> MotorDesign | None:
         EchelonError: a part is malformed or does not fit the others.
     """
     links = int(parts.graph.depths().max()) if parts.drive.feedforward is Feedforward.PARENT else 1
-    found = [each for rate in _RATES for each in _certified(parts, settings, rate, links)]
-    return min(found, key=lambda each: each.time, default=None)
+    designs = [one for rate in _RATES for one in _certified(parts, settings, rate, links)]
+    return min(designs, key=lambda one: one.time, default=None)
 
 
 def _certified(parts: Parts, settings: Settings, rate: float, links: int) -> Iterator[MotorDesign]:

@@ -1,9 +1,9 @@
-"""Whether the motors of agents give all that the law `stopping-point` asks of them (T5)."""
+"""Whether the agents' motors suffice for the law, from the starts of a run (T5)."""
 
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class MotorLoad(NamedTuple):
     most: float
     tilt: float
     alone: Alone | None
-    data: dict[str, Any]
+    data: dict[str, object]
 
     def sentence(self) -> str:
         """Return what is promised of motors."""
@@ -97,7 +97,7 @@ class MotorLoad(NamedTuple):
         more = "" if self.alone is None else f"; they suffice from {self.alone.sentence()}"
         return f"{text}{more}."
 
-    def as_mapping(self) -> dict[str, Any]:
+    def as_mapping(self) -> dict[str, object]:
         """Return it ready for JSON."""
         alone = None if self.alone is None else self.alone._asdict()
         numbers = {"least": self.least, "largest": self.largest, "tilt": self.tilt}
@@ -157,10 +157,10 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     if frame is None or reason:
         return None, unneeded(Hypothesis.LIMITS, Kind.PROOF, reason or _UNKNOWN)
     case = _MotorCase.of(run, frame)
-    found, starts = _from(case)
+    motors, starts = _from(case)
     kind, most = case.kind, Fraction(frame.motor_thrust)
-    number = None if found.slope is None else float(found.least), _shown(found)
-    if not found.within(most):
+    number = None if motors.slope is None else float(motors.least), _thrust_text(motors)
+    if not motors.within(most):
         text = "the motors are not proved to suffice from these starts"
         text += f": {number[1]}" if number[1] else ", and the thrust is not proved to stay positive"
         remedy = "choose gentler `roots`, such as [2, 2.5, 3], or a lower `speed`, or start nearer "
@@ -170,10 +170,10 @@ def motor_load_of(run: StoppingRun) -> tuple[MotorLoad | None, Statement]:
     ahead = _ahead(frame, run.ahead)
     load = MotorLoad(
         kind,
-        float_below(found.least),
-        float_above(found.largest),
+        float_below(motors.least),
+        float_above(motors.largest),
         float(most),
-        float_above(found.tilt),
+        float_above(motors.tilt),
         _alone(frame, case.chain, case.base, ahead),
         _data(case, run.law.roots_for(3), starts, ahead),
     )
@@ -192,11 +192,11 @@ def _beyond(run: StoppingRun) -> str:
     return "a `speed` is infinite" if any(map(math.isinf, speeds)) else ""
 
 
-def _shown(found: Motors) -> str:
-    if found.slope is None:
+def _thrust_text(motors: Motors) -> str:
+    if motors.slope is None:
         return ""
-    tilt = math.degrees(float(found.tilt))
-    return f"{float(found.least):.3g} .. {float(found.largest):.3g} N, {tilt:.3g} deg"
+    tilt = math.degrees(float(motors.tilt))
+    return f"{float(motors.least):.3g} .. {float(motors.largest):.3g} N, {tilt:.3g} deg"
 
 
 # ---- the path ------------------------------------------------------------------------------------
@@ -336,7 +336,7 @@ def _alone(
 
 def _data(
     case: _MotorCase, roots: Sequence[float], starts: Sequence[Pushed], ahead: _Ahead
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return what the load was computed of, ready for JSON."""
     return {
         "airframe": case.frame._asdict(),

@@ -1,4 +1,4 @@
-"""What a leader's path asks at most of its derivatives."""
+"""Bounds on the derivatives of a leader's path, piece by piece of time."""
 
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -48,8 +48,8 @@ class Pieces(NamedTuple):
     ) -> Sequence[Sequence[Sequence[Interval]]]:
         """Return the pieces that meet a stretch of time; the last one at least."""
         spans = zip(self.times, self.times[1:], self.values, strict=False)
-        found = [v for a, b, v in spans if b >= begin and (end is None or a <= end)]
-        return found or self.values[-1:]
+        rows = [v for a, b, v in spans if b >= begin and (end is None or a <= end)]
+        return rows or self.values[-1:]
 
 
 def pieces_of(
@@ -96,11 +96,11 @@ def _enclosed(
         GainError: the path has no enclosure.
     """
     for cut in ((times[0], times[-1]), times):
-        found = tuple(tuple(map(tuple, rows)) for rows in enclose_derivatives(path, cut, order))
+        values = tuple(tuple(map(tuple, rows)) for rows in enclose_derivatives(path, cut, order))
         # What does not move is known at once.
-        if all(x.hi - x.lo < _EXACT for rows in found for x in rows[-1]):
+        if all(x.hi - x.lo < _EXACT for rows in values for x in rows[-1]):
             break
-    return Pieces(Kind.PROOF, cut, found)
+    return Pieces(Kind.PROOF, cut, values)
 
 
 def _range_of(values: np.ndarray) -> tuple[tuple[Interval, ...], ...]:
@@ -128,9 +128,9 @@ def least_on_path(
     Of several outputs it is the length of the vector of their derivatives.
     """
     names = [leader.ready.chains.outputs[k] for k in outputs]
-    found = pieces_of(leader, model, horizon, names, order)
-    low = min(_least_of(rows[order]) for rows in found.values)
-    return Least(float_below(low), found.kind)
+    pieces = pieces_of(leader, model, horizon, names, order)
+    low = min(_least_of(rows[order]) for rows in pieces.values)
+    return Least(float_below(low), pieces.kind)
 
 
 def _least_of(row: Sequence[Interval]) -> Fraction:

@@ -1,4 +1,4 @@
-"""What theorem T5 guarantees of a run in which agents agree on their stopping points."""
+"""Guarantee of theorem T5 for a run in which agents agree on their stopping points."""
 
 import dataclasses
 from types import MappingProxyType

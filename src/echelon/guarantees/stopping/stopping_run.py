@@ -1,4 +1,4 @@
-"""A run under the law `stopping-point` as its theorem sees it, and what else that rests on (T5)."""
+"""A run in flat coordinates, and the hypotheses of theorem T5 beside its tube."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -201,16 +201,16 @@ def _step_line(run: StoppingRun) -> Statement:
     assert run.law.reach is not None
     name, dt, c = Hypothesis.SAMPLING, run.settings.dt, run.coupling
     share = c * run.law.reach.heaviest * dt
-    radius, shown = _radius(run), f"c d_max dt = {share:.3g}"
+    radius, share_text = _radius(run), f"c d_max dt = {share:.3g}"
     own = float(run.leader.strength(dt)) * dt
     if own > 1.0 + 1e-12:
         # Its distance from its path would grow, on which the tube and the motors rest.
         text = f"the step `dt` = {dt:g} s is too long for the leader: c dt = {own:.3g} is above 1"
         remedy = f"lower `leader.coupling` to {1.0 / dt:.4g}"
-        return fails(name, Kind.LINEARIZATION, text, own, shown, remedy=remedy, reason=text)
+        return fails(name, Kind.LINEARIZATION, text, own, share_text, remedy=remedy, reason=text)
     if share <= 1.0 + 1e-12 and radius < 1.0:
         text = f"Euler's step of zeta does not grow; spectral radius {radius:.4g} a step"
-        return holds(name, Kind.LINEARIZATION, text, share, shown)
+        return holds(name, Kind.LINEARIZATION, text, share, share_text)
     text = f"the step `dt` = {dt:g} s is too long: c d_max dt = {share:.3g} is above 1"
     remedy = f"lower `coupling` to {1.0 / (run.law.reach.heaviest * dt):.4g}, or shorten "
     remedy += f"`simulation.dt` to {1.0 / (c * run.law.reach.heaviest):.3g} s"
@@ -218,7 +218,7 @@ def _step_line(run: StoppingRun) -> Statement:
         text = f"the step `dt` = {dt:g} s is too long for this coupling and these roots: spectral "
         text, remedy = f"{text}radius {radius:.4g}", "lower `coupling` or `roots`, or shorten "
         remedy += "`simulation.dt`"
-    return fails(name, Kind.LINEARIZATION, text, share, shown, remedy=remedy, reason=text)
+    return fails(name, Kind.LINEARIZATION, text, share, share_text, remedy=remedy, reason=text)
 
 
 def _radius(run: StoppingRun) -> float:
@@ -230,15 +230,15 @@ def _radius(run: StoppingRun) -> float:
 
 def _step_radius(run: StoppingRun, loop: FlatLoop, strengths: Array) -> float:
     """Return the same of agents that feel what is off by so much each (K,), 1/s."""
-    found = 0.0
+    radius = 0.0
     for k, degree in enumerate(loop.chains.degrees):
         A, B = np.eye(degree, k=1), np.eye(degree)[:, -1:]
         stop = loop.stiffness[k] * loop.weights[:degree, k]
         inner = np.append(0.0, stop[:-1])
         gains = inner + strengths[:, None] * stop
         dt, how = run.settings.dt, run.settings.integrator
-        found = max(found, sampled_radius(A, B, gains[:, None], dt, how))
-    return found
+        radius = max(radius, sampled_radius(A, B, gains[:, None], dt, how))
+    return radius
 
 
 def _strengths(run: StoppingRun) -> Array:
@@ -271,8 +271,8 @@ def leader_drift_line(run: StoppingRun) -> Statement | None:
     push = np.zeros(len(model.state_names))
     if world.disturbance is not None:
         push = model.per_state(world.disturbance.constant)
-    found = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
-    for k, (current, force) in enumerate(np.abs(np.stack(found)).T.tolist()):
+    pushes = _pushed(model, world.plant_for(model), loop, jnp.asarray(push))
+    for k, (current, force) in enumerate(np.abs(np.stack(pushes)).T.tolist()):
         s, inner = run.leader.speed_of(k), loop.chains.degrees[k] > 1
         # The observer watches y' as the model has it, and of what is commanded at once y itself.
         seen = run.leader.observer

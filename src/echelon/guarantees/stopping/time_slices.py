@@ -1,4 +1,4 @@
-"""How far chains of integrators go under q(D) v = -k0 w, slice by slice of time, in rationals (T5).
+"""Bounds on a chain of integrators under q(D) v = -k0 w per slice of time, in rationals (T5).
 
 What bounds them over all time adds up peaks that never meet: a start has died away when what is
 asked for has built up. On a slice of x = exp(-unit t) each is bounded by itself.
@@ -90,8 +90,8 @@ def _reaches(chain: Chain) -> list[DerivativeBounds]:
 def _grown(chain: Chain, order: int) -> list[Fraction]:
     """Return the integral of |h^(order)| until the end of each slice of x, the last one first."""
     total = chain.stiffness if order == len(chain.powers) else Fraction(0)
-    found = list[Fraction]()
+    bounds = list[Fraction]()
     for spread in reversed(spreads_on_pieces(chain.kernel(order), _HALVINGS)):
         total += spread
-        found.append(round_up(total))
-    return found[::-1]
+        bounds.append(round_up(total))
+    return bounds[::-1]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class Tube(NamedTuple):
     steepest: float
     arrival: float | None
     who: str
-    borders: tuple[dict[str, Any], ...]
+    borders: tuple[dict[str, object], ...]
     motor_load: MotorLoad | None
     graphs: tuple[str, str] = _ANY
 

@@ -1,4 +1,4 @@
-"""One agent in a process of its own: what a vehicle on a network computes in a step."""
+"""One agent in a process of its own: what a vehicle computes from its state and messages."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, final
@@ -7,17 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from echelon.core.compiled import cached_jit
 from echelon.core.errors import SimulationError, check_kind, listing
 from echelon.core.numerics import precision
-from echelon.core.types import Array, State
+from echelon.core.types import Array, Scalar, State
 from echelon.core.words import Feedforward
 from echelon.laws.law import Law, LocalView, Memory
 from echelon.simulation.engine.law_drive import Laws
 from echelon.simulation.engine.parts import Parts
 from echelon.simulation.engine.prepare import prepare
-from echelon.simulation.step.action import act
+from echelon.simulation.step.action import Action, act
 from echelon.simulation.step.loop import Loop, assemble
 from echelon.simulation.step.settings import Settings
 
@@ -26,8 +27,8 @@ class Message(NamedTuple):
     """What an agent sends.
 
     Attributes:
-        signal: what its neighbours hear: its state less its offset, unless its law says otherwise.
-        told: what is fed forward of its input, in the same step; None before it has acted.
+        signal: what its neighbours use: its state less its offset, or the signal of its law.
+        told: the feed-forward of its input, of the same step; None before it has acted.
     """
 
     signal: Array
@@ -36,14 +37,14 @@ class Message(NamedTuple):
 
 @final
 class Agent:
-    """One agent of a formation under laws, which knows its own state and what it is sent.
+    """One agent of a formation under laws, which knows its own state and what it receives.
 
-    In every step all say `hello`, and each then takes its `step` with the messages that reached it:
-    leaders first, where something is fed forward, and followers by their distance from them where
-    it is their parents'. So many of these agents do what `simulate` does, to rounding.
+    In every step each agent sends its `hello`, and then takes its `step` with the messages that it
+    received: leaders first, where their input is fed forward, and followers by their distance from
+    the leaders where it is their parents'. Together they do what `simulate` does, to rounding.
 
     Args:
-        parts: of the whole formation; of the starts nothing is read.
+        parts: of the whole formation; the starts are not used.
         agent: its number.
         dt: how long its inputs are held, s.
         limits: whether the actuators' limits act on it.
@@ -69,16 +70,16 @@ class Agent:
         self.number, graph = agent, parts.graph
         self.leads = agent in graph.leaders
         self._law = self._loop.leader if self.leads else self._loop.follower
-        heard = self._loop.exchange
-        mine = np.asarray(heard.receivers) == agent
-        self.neighbours = tuple(np.asarray(heard.senders)[mine].tolist())
-        self._weights = np.atleast_2d(np.asarray(heard.weights))[:, mine]
+        exchange = self._loop.exchange
+        edges = np.asarray(exchange.receivers) == agent
+        self.neighbours = tuple(np.asarray(exchange.senders)[edges].tolist())
+        self._weights = np.atleast_2d(np.asarray(exchange.weights))[:, edges]
         self._schedule = graph.schedule
         self._source = self._source_in(parts)
         self._memory: Memory | None = None
 
     def _source_in(self, parts: Parts) -> int | None:
-        """Return who must tell this agent something of the same step; None for nobody."""
+        """Return whose feed-forward this agent needs; None for nobody's."""
         silent = self._loop.follower.feedforward is Feedforward.NONE
         if self.leads or silent and not self._loop.follower.turning:
             return None
@@ -87,10 +88,10 @@ class Agent:
         return parts.graph.nearest_leader()[self.number]
 
     def hello(self, x: ArrayLike) -> Message:
-        """Return what neighbours hear of the agent at a state (n,), before it acts."""
+        """Return the message of the agent at a state (n,), before it acts."""
         with precision("float64"):
             state = self._state(x)
-            return Message(np.asarray(_signal(self._loop, self._law, self._given(state))))
+            return Message(np.asarray(_signal(self._loop, self._law, self._own(state))))
 
     def step(
         self, t: float, x: ArrayLike, messages: Mapping[int, Message]
@@ -101,19 +102,18 @@ class Agent:
             t: time, s.
             x: own state (n,).
             messages: of the neighbours, by their numbers; that of the leader or the parent with
-                what it tells, where something is fed forward.
+                its feed-forward, where the law uses one.
 
         Raises:
             SimulationError: one is missing, or the state has another shape.
         """
         weights = self._weights[0 if self._schedule is None else self._schedule.row(t)]
-        now = [j for j, weight in zip(self.neighbours, weights, strict=True) if weight > 0.0]
-        weights = weights[weights > 0.0]
-        missing = [j for j in now if j not in messages]
-        told = (
-            None if self._source is None else messages.get(self._source, Message(np.zeros(0))).told
-        )
-        if missing or (told is None and self._source is not None):
+        senders = [j for j, weight in zip(self.neighbours, weights, strict=True) if weight > 0.0]
+        missing = [j for j in senders if j not in messages]
+        forward = None
+        if self._source is not None:
+            forward = messages.get(self._source, Message(np.zeros(0))).told
+        if missing or (forward is None and self._source is not None):
             who = missing[0] if missing else self._source
             what = "its message" if missing else "what it tells of its input"
             raise SimulationError(
@@ -121,16 +121,20 @@ class Agent:
                 f"of {listing(map(str, messages)) or 'nobody'}."
             )
         with precision("float64"):
-            given = self._given(self._state(x))
-            heard = jnp.asarray(np.array([messages[j].signal for j in now]))
-            sent = (
-                jnp.zeros(len(self._loop.model.input_names)) if told is None else jnp.asarray(told)
+            received = jnp.asarray(np.array([messages[j].signal for j in senders]))
+            if forward is None:
+                forward = np.zeros(len(self._loop.model.input_names))
+            signal, action = _step(
+                self._loop,
+                self.leads,
+                jnp.asarray(float(t)),
+                self._own(self._state(x)),
+                received,
+                weights[weights > 0.0],
+                jnp.asarray(forward),
             )
-            u, memory, signal, tells = _step(
-                self._loop, self.leads, jnp.asarray(float(t)), given, heard, weights, sent
-            )
-        self._memory = memory
-        return np.asarray(u), Message(np.asarray(signal), np.asarray(tells))
+        self._memory = action.memory
+        return np.asarray(action.input), Message(np.asarray(signal), np.asarray(action.message))
 
     def _state(self, x: ArrayLike) -> State:
         state, n = jnp.asarray(np.asarray(x, float)), len(self._loop.model.state_names)
@@ -142,12 +146,12 @@ class Agent:
             self._memory = _begin(self._loop, self._law, state)
         return state
 
-    def _given(self, state: State) -> "_Given":
-        return _Given(state, jnp.asarray(self._loop.offsets[self.number]), self._memory)
+    def _own(self, state: State) -> "_OwnState":
+        return _OwnState(state, jnp.asarray(self._loop.offsets[self.number]), self._memory)
 
 
-class _Given(NamedTuple):
-    """What an agent has of its own: its state (n,), its offset (n,) and its memory."""
+class _OwnState(NamedTuple):
+    """What an agent knows without messages: its state (n,), its offset (n,) and its memory."""
 
     x: State
     offset: State
@@ -160,28 +164,27 @@ def _begin(loop: Loop, law: Law, x: State) -> Memory:
 
 
 @cached_jit
-def _signal(loop: Loop, law: Law, own: _Given) -> jax.Array:
-    """Return what neighbours hear."""
-    said = law.signal(loop.model, *own)
-    return own.x - own.offset if said is None else said
+def _signal(loop: Loop, law: Law, own: _OwnState) -> Float[jax.Array, " s"]:
+    """Return what the agent sends to its neighbours."""
+    signal = law.signal(loop.model, *own)
+    return own.x - own.offset if signal is None else signal
 
 
 @cached_jit
 def _step(
     loop: Loop,
     leads: bool,
-    t: jax.Array,
-    own: _Given,
-    heard: jax.Array,
-    weights: jax.Array,
-    sent: jax.Array,
-) -> tuple[jax.Array, Memory, jax.Array, jax.Array]:
-    """Return the input, the next memory, the signal, and what is told."""
+    t: Scalar,
+    own: _OwnState,
+    received: Float[jax.Array, "..."],
+    weights: Float[jax.Array, " K"],
+    forward: Float[jax.Array, " k"],
+) -> tuple[Float[jax.Array, " s"], Action]:
+    """Return the signal and what the agent does with the signals that it received."""
     law = loop.leader if leads else loop.follower
     signal = _signal(loop, law, own)
     states = law.signal(loop.model, *own) is None
     apart = loop.model.difference if states else jnp.subtract
-    gaps = jax.vmap(lambda theirs: apart(signal, theirs))(heard.reshape(-1, len(signal)))
-    view = LocalView(t, own.x, own.offset, weights @ gaps, sent, loop.motion.dt)
-    action = act(loop, law, view, own.memory, leads)
-    return action.input, action.memory, signal, action.message
+    gaps = jax.vmap(lambda theirs: apart(signal, theirs))(received.reshape(-1, len(signal)))
+    view = LocalView(t, own.x, own.offset, weights @ gaps, forward, loop.motion.dt)
+    return signal, act(loop, law, view, own.memory, leads)

@@ -1,8 +1,8 @@
-"""Many runs at once, each as `simulate` would have it.
+"""Many runs at once, each with the result that `simulate` would return.
 
-Runs that are alike but for numbers are stepped together, by native code with a formation a lane, or
-by JAX, where states may differ from those of a run alone by rounding; the others run one after the
-other.
+Runs that differ in numbers alone are stepped together, by native code with a formation in each
+lane, or by JAX, where states may differ from those of a single run by rounding. The others run one
+after the other.
 """
 
 import time
@@ -40,95 +40,94 @@ Run: TypeAlias = tuple[Parts, Settings]
 StepCount: TypeAlias = Callable[[int, int], None]
 """Called with the steps that were taken, and those of the run."""
 _SMALL = 64
-"""Agents of a formation that is stepped beside others though they do not fill a vector."""
+"""Agents of a formation that is stepped with others even if they do not fill a vector."""
 
 
 class _SharedRun(NamedTuple):
-    """What runs share that differ in the seed alone."""
+    """What runs that differ in the seed alone have in common."""
 
     prepared: Prepared
     starts: Starts
     loop: Loop | None
-    family: Hashable
+    group: Hashable
 
 
 class _BatchJob(NamedTuple):
-    """A run with all that its steps rest on."""
+    """A run of the batch, by its place, with all that its steps need."""
 
     place: int
-    case: _SharedRun
     prepared: Prepared
     loop: Loop
 
 
 @final
 class Batch:
-    """Flies many runs; what is prepared and compiled for one is there for the next.
+    """Computes many runs; what is prepared and compiled for one is used again for the next.
 
     Args:
-        threads: on which native code runs; one for each processor when left out. No number depends
-            on it.
+        threads: of native code; one for each processor when left out. No result depends on it.
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        """Begin with nothing prepared."""
+        """Start the threads."""
         self.threads = threads or processors()
         self.pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self.kinds = ProgramKeys()
-        self._cases: WeakKeyDictionary[Parts, dict[Settings, _SharedRun]] = WeakKeyDictionary()
+        self._shared: WeakKeyDictionary[Parts, dict[Settings, _SharedRun]] = WeakKeyDictionary()
 
     def fly(
         self, runs: Sequence[Run], progress: StepCount | None = None
     ) -> Iterator[Result | EchelonError]:
-        """Yield what each run comes to, in their order, as `simulate` would have it.
+        """Yield the result of each run in their order, as `simulate` would return it.
 
         Args:
             runs: parts and settings of each.
             progress: called several times a second; what it raises ends all runs.
         """
-        found: dict[int, Result | EchelonError] = {}
-        for jobs in self._families(runs):
-            found |= self._together(jobs, progress)
+        results: dict[int, Result | EchelonError] = {}
+        for jobs in self._groups(runs):
+            results |= self._together(jobs, progress)
         for place, (parts, settings) in enumerate(runs):
-            yield found.pop(place) if place in found else _run_alone(parts, settings, progress)
+            yield results.pop(place) if place in results else _run_alone(parts, settings, progress)
 
-    # ---- what belongs together ----
+    # ---- groups ----
 
-    def _families(self, runs: Sequence[Run]) -> list[list[_BatchJob]]:
-        """Return the runs that can be stepped together, family by family."""
+    def _groups(self, runs: Sequence[Run]) -> list[list[_BatchJob]]:
+        """Return the runs that can be stepped together, group by group."""
         cases: dict[int, tuple[_SharedRun, list[int]]] = {}
         for place, (parts, settings) in enumerate(runs):
             try:
-                case = self._case(parts, settings)
+                case = self._share(parts, settings)
             except EchelonError:
-                continue  # `simulate` says it again
+                continue  # `simulate` raises it again
             if case.loop is not None and settings.devices == 1:
                 cases.setdefault(id(case), (case, []))[1].append(place)
-        families: dict[Hashable, list[_BatchJob]] = {}
+        groups: dict[Hashable, list[_BatchJob]] = {}
         for case, places in cases.values():
             jobs = _jobs(case, places, [runs[place][1] for place in places])
-            families.setdefault(case.family, []).extend(jobs)
-        return [jobs for jobs in families.values() if jobs and _fit(jobs)]
+            groups.setdefault(case.group, []).extend(jobs)
+        return [jobs for jobs in groups.values() if jobs and _fit(jobs)]
 
-    def _case(self, parts: Parts, settings: Settings) -> _SharedRun:
-        known, alike = self._cases.setdefault(parts, {}), settings._replace(seed=0)
-        if alike not in known:
+    def _share(self, parts: Parts, settings: Settings) -> _SharedRun:
+        """Return what runs of these parts share, whatever their seeds."""
+        shared, alike = self._shared.setdefault(parts, {}), settings._replace(seed=0)
+        if alike not in shared:
             prepared = prepare(parts, settings, to_store=True)
             drive = prepared.parts.drive
             with precision("float64"):
-                loop = family = None
+                loop = group = None
                 if isinstance(drive, Laws):
                     loop = assemble(prepared.problem, drive.leader, drive.follower)
-                    family = self.kinds.of(loop, alike)
-                known[alike] = _SharedRun(prepared, Starts(prepared.parts), loop, family)
-        return known[alike]
+                    group = self.kinds.of(loop, alike)
+                shared[alike] = _SharedRun(prepared, Starts(prepared.parts), loop, group)
+        return shared[alike]
 
     # ---- runs ----
 
     def _together(
         self, jobs: list[_BatchJob], progress: StepCount | None
     ) -> dict[int, Result | EchelonError]:
-        """Return what a family comes to; nothing where its runs cannot go together."""
+        """Return the results of a group; none where its runs cannot be stepped together."""
         settings = jobs[0].prepared.problem.settings
         states = np.concatenate([job.prepared.problem.states for job in jobs])
         bits, pool = int(settings.precision[5:]), (self.pool, KERNELS.of)
@@ -189,17 +188,17 @@ def _run_alone(
 
 
 def _jobs(case: _SharedRun, places: Sequence[int], chosen: Sequence[Settings]) -> list[_BatchJob]:
-    """Return the runs of a case whose starts the laws take."""
+    """Return the jobs of runs whose starts the laws accept."""
     parts = case.prepared.parts
     assert isinstance(parts.drive, Laws)
     try:
         states = case.starts.of([settings.seed for settings in chosen])
     except EchelonError:
-        return []  # `simulate` says it again
+        return []  # `simulate` raises it again
     with precision("float64"):
         refused = {k for k, _, _ in parts.drive.refusals(parts.model, parts.graph, states)}
-        each = zip(places, chosen, states, strict=True)
-        return [_job(case, *its) for k, its in enumerate(each) if k not in refused]
+        runs = zip(places, chosen, states, strict=True)
+        return [_job(case, *run) for k, run in enumerate(runs) if k not in refused]
 
 
 def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _BatchJob:
@@ -210,15 +209,15 @@ def _job(case: _SharedRun, place: int, settings: Settings, states: Array) -> _Ba
         motion = Motion.of(problem.model, prepared.parts.world, settings)
         problem = problem._replace(motion=motion)
         loop = eqx.tree_at(lambda x: x.motion, loop, motion)
-    return _BatchJob(place, case, prepared._replace(problem=problem), loop)
+    return _BatchJob(place, prepared._replace(problem=problem), loop)
 
 
 def _fit(jobs: list[_BatchJob]) -> bool:
-    """Tell whether runs are worth stepping together: long enough, and filling their vectors."""
+    """Tell whether stepping runs together pays: they are long enough, and fill their vectors."""
     problem = jobs[0].prepared.problem
     agents, settings = len(problem.states), problem.settings
     if len(jobs) == 1:
-        # By itself, but by code that was made for others.
+        # A single run, but by code that was compiled for others.
         return worth_native(settings, agents)
     if agents > _SMALL and len(jobs) < 8:
         return False

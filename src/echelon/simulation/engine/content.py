@@ -1,4 +1,4 @@
-"""What a run rests on: told by its bits, and apart from what a caller may write to."""
+"""What decides a run: a key of its bits, and copies that no caller can write to."""
 
 from collections.abc import Hashable
 from typing import Any
@@ -15,7 +15,7 @@ from echelon.simulation.step.settings import Settings
 
 
 def content_of(parts: Parts, settings: Settings, wrt: tuple[str, ...]) -> Hashable | None:
-    """Return what is equal for the same run but for the followers' gain.
+    """Return a key that is equal for runs that differ in the followers' gain alone.
 
     By its bits: what somebody changes in place is another run. None where the same content may be
     another run, since nobody can tell what a user's classes read.
@@ -37,7 +37,7 @@ def _acting(parts: Parts) -> Any:
 
 
 def copied(tree: Any) -> Any:
-    """Return a tree with arrays of its own, since somebody may write to those that were given."""
+    """Return a copy of a tree and its arrays, since the caller may write to the original."""
 
     def alone(leaf: Any) -> Any:
         if isinstance(leaf, Formation):

@@ -1,7 +1,7 @@
-"""Agents spread over the devices that JAX has, of one host or of several.
+"""Spreads the agents over the devices of JAX, of one host or of several.
 
-A chunk begins and ends with the same numbers on every device, so that all else of a run is as on
-one; within it each device moves its own agents, and JAX brings it what they hear of others.
+A chunk begins and ends with the same numbers on every device, so that the rest of a run is as on
+one. Within a chunk each device steps its own agents, and JAX transfers what they receive.
 """
 
 from typing import Any
@@ -19,20 +19,20 @@ from echelon.simulation.step.sequence import advance
 
 
 def mesh_of(devices: int, agents: int) -> Mesh:
-    """Return so many devices in a row, among which the agents are parted.
+    """Return a row of devices, over which the agents are spread.
 
     Raises:
-        SimulationError: there are fewer, or the agents are no multiple of them.
+        SimulationError: JAX has fewer, or the number of agents is no multiple of them.
     """
-    there = jax.devices()
-    if devices > len(there):
+    available = jax.devices()
+    if devices > len(available):
         raise SimulationError(
-            f"`devices` is {devices}, and JAX has {len(there)} ({there[0].platform}); of processors"
-            " it has as many as `JAX_NUM_CPU_DEVICES` says."
+            f"`devices` is {devices}, and JAX has {len(available)} ({available[0].platform}); of "
+            "processors it has as many as `JAX_NUM_CPU_DEVICES` says."
         )
-    if devices < len(there) and jax.process_count() > 1:
+    if devices < len(available) and jax.process_count() > 1:
         raise SimulationError(
-            f"`devices` is {devices}, and must be {len(there)}, all of those of the"
+            f"`devices` is {devices}, and must be {len(available)}, all of those of the"
             f" {jax.process_count()} processes."
         )
     if agents % devices:
@@ -40,7 +40,7 @@ def mesh_of(devices: int, agents: int) -> Mesh:
             f"`devices` is {devices}, and {agents} agents cannot be parted among them: their number"
             " must be a multiple."
         )
-    return Mesh(np.array(there[:devices]), ("agents",))
+    return Mesh(np.array(available[:devices]), ("agents",))
 
 
 @cached_jit
@@ -52,12 +52,11 @@ def advance_parted(
     reference: Array | None,
     first: jax.Array,
 ) -> tuple[Moment, tuple[Any, Any], Sums]:
-    """Do what `advance` does, the agents parted among the devices of a mesh."""
+    """Do what `advance` does, with the agents spread over the devices of a mesh."""
     agents = len(loop.offsets)
 
     def part(leaf: jax.Array) -> jax.Array:
-        # What is not of every agent, such as the followers' memories, is on all devices until it
-        # meets something that is.
+        # What has no row for each agent, such as the followers' memories, starts on all devices.
         mine = leaf.ndim > 0 and len(leaf) == agents
         return _place(leaf, mesh, PartitionSpec("agents") if mine else PartitionSpec())
 

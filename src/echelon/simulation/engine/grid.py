@@ -15,8 +15,8 @@ _CHUNKS = 100
 class ChunkGrid:
     """How a run is cut into chunks, each of some points with steps after them.
 
-    By its settings alone and never by the clock: sums are made chunk by chunk, and another cut
-    would round them otherwise. So a run that goes on ends with the bits of one that never ended.
+    The cut depends on the settings alone and never on the clock: sums are made chunk by chunk, and
+    another cut would round them otherwise. So a resumed run has the bits of an uninterrupted one.
 
     Args:
         settings: of the run.
@@ -52,6 +52,6 @@ class ChunkGrid:
         return np.maximum(np.minimum(ends, self.steps) - starts, 0).astype(np.int32)
 
     def stored(self, points: Array) -> Array:
-        """Return which of the steps, which never fall, are those of a frame."""
-        again = np.concatenate([[False], points[1:] == points[:-1]])[: len(points)]
-        return ((points % self.every == 0) | (points == self.steps)) & ~again
+        """Return which of some steps in ascending order are those of a frame, each once."""
+        repeated = np.concatenate([[False], points[1:] == points[:-1]])[: len(points)]
+        return ((points % self.every == 0) | (points == self.steps)) & ~repeated

@@ -27,28 +27,28 @@ def initial_states(parts: Parts, seed: int) -> np.ndarray:
 
 @final
 class Starts:
-    """The states at time zero, for one seed after the other.
+    """The states at time zero, for any seed.
 
     Args:
-        parts: what starts.
+        parts: of the run.
 
     Raises:
         EchelonError: as in `initial_states`.
     """
 
     def __init__(self, parts: Parts) -> None:
-        """Compute what no seed changes."""
+        """Compute what does not depend on the seed."""
         model, graph, initial = parts.model, parts.graph, parts.initial
         self.graph, self.shape = graph, (graph.agents, len(model.state_names))
         self.error = _per_state(model, parts.start_error, "start error")
-        self.given: np.ndarray | None = None
+        self.states: np.ndarray | None = None
         self.named: dict[Any, Any] = {}
         if initial is not None and not isinstance(initial, Mapping):
-            self.given = _read_states(
+            self.states = _read_states(
                 initial, self.shape, "initial states have", "(agents, states)"
             )
-            # Given states are where leaders belong; the error is what they are off from there.
-            self.given[list(graph.leaders)] += self.error
+            # The caller's states are where leaders belong; the error is added to them.
+            self.states[list(graph.leaders)] += self.error
             return
         named = dict(initial or {})
         spreads = {key: value for key, value in named.items() if isinstance(key, str)}
@@ -66,8 +66,8 @@ class Starts:
 
     def of(self, seeds: Sequence[int]) -> np.ndarray:
         """Return the states (K, N, n) for some seeds."""
-        if self.given is not None:
-            return np.repeat(self.given[None], len(seeds), axis=0)
+        if self.states is not None:
+            return np.repeat(self.states[None], len(seeds), axis=0)
         leaders = list(self.graph.leaders)
         # Drawn for all agents and scaled afterwards, so that another spread keeps the directions,
         # and another choice of leaders the followers' draws.
@@ -80,9 +80,9 @@ class Starts:
         return states
 
 
-def _place(states: np.ndarray, given: Mapping[Any, Any], graph: Graph) -> None:
-    """Put the given agents into their given states, in all of some starts (K, N, n)."""
-    for agent, state in given.items():
+def _place(states: np.ndarray, named: Mapping[Any, Any], graph: Graph) -> None:
+    """Put agents into the states that are given for them, in all starts (K, N, n)."""
+    for agent, state in named.items():
         _check_agent(agent, graph)
         states[:, agent] = _read_states(
             state, states.shape[2:], f"the initial state of agent {agent} has", "(states,)"
@@ -108,7 +108,7 @@ def _read_states(values: object, shape: tuple[int, ...], what: str, meaning: str
 
 
 def _per_state(model: ControlAffine, named: Mapping[str, Any], what: str) -> np.ndarray:
-    """Return one finite number a state, (n,), from numbers by state or group."""
+    """Return one finite number for each state, (n,), from numbers by state or group."""
     for name, value in named.items():
         if not np.isfinite(value):
             raise SimulationError(f"the {what} of `{name}` is {value}, and must be finite.")

@@ -1,4 +1,4 @@
-"""The closed loop stepped by JAX: what a law and a model mean, on whatever device there is."""
+"""The closed loop stepped by JAX, which defines what laws and models mean, on any device."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -30,38 +30,38 @@ def _longest(agents: int) -> int:
     return max(_FEWEST, _AGENT_STEPS // agents)
 
 
-def _told(instead: str) -> tuple[str, ...]:
-    return (f"JAX steps the agents, since {instead}.",) * bool(instead)
+def _warnings(reason: str) -> tuple[str, ...]:
+    return (f"JAX steps the agents, since {reason}.",) * bool(reason)
 
 
 @final
 class JaxStepper(Stepper):
-    """Moves agents under laws.
+    """Steps agents under laws.
 
     Args:
         loop: of the run.
         states: (N, n) at its beginning.
-        instead: why it stands where native code was wanted; empty where it was not.
-        devices: among how many the agents are parted.
+        reason: why it replaces native code that was requested; empty otherwise.
+        devices: over how many the agents are spread.
 
     Raises:
-        SimulationError: so many are not there, or the agents are no multiple of them.
+        SimulationError: JAX has fewer, or the number of agents is no multiple of them.
     """
 
-    def __init__(self, loop: Loop, states: Array, instead: str = "", devices: int = 1) -> None:
-        """Keep what the steps need."""
-        self.loop, self.states, self.instead = loop, states, instead
+    def __init__(self, loop: Loop, states: Array, reason: str = "", devices: int = 1) -> None:
+        """Store what the steps need."""
+        self.loop, self.states, self.reason = loop, states, reason
         self.mesh = mesh_of(devices, len(states)) if devices > 1 else None
 
     @property
     def devices(self) -> int:
-        """Among how many devices the agents are parted."""
+        """How many devices the agents are spread over."""
         return 1 if self.mesh is None else self.mesh.size
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the run takes longer than it might."""
-        return _told(self.instead)
+        """Why the run takes longer than by native code."""
+        return _warnings(self.reason)
 
     @property
     def longest(self) -> int:
@@ -82,7 +82,7 @@ class JaxStepper(Stepper):
         return begin(self.loop, self.states)
 
     def advance(self, now: Moment, counts: Array, reference: Array | None) -> Chunk:
-        """Store frames and take steps; what happens on the way is seen afterwards."""
+        """Store frames and take steps; a divergence is noticed afterwards."""
         step = advance if self.mesh is None else partial(advance_parted, self.mesh)
         now, (states, inputs), sums = step(self.loop, now, counts, reference, now.step)
         states, inputs, sums = on_host((states, inputs, sums))
@@ -94,23 +94,23 @@ class JaxStepper(Stepper):
 
 @final
 class JaxFormations(Stepper):
-    """Moves the agents of many formations that are alike, each as if it were alone.
+    """Steps many formations whose loops differ in numbers alone, each as if it were alone.
 
     Args:
-        loops: of each formation; alike in their trees and in all that is no number.
+        loops: of each formation.
         states: (N, n) at the beginning, formation by formation.
-        instead: as in `JaxStepper`.
+        reason: as in `JaxStepper`.
     """
 
-    def __init__(self, loops: Sequence[Loop], states: Array, instead: str = "") -> None:
-        """Put side by side what differs."""
-        self.count, self.states, self.instead = len(loops), states, instead
-        self.loop, self.axes = _side_by_side(loops)
+    def __init__(self, loops: Sequence[Loop], states: Array, reason: str = "") -> None:
+        """Stack what differs."""
+        self.count, self.states, self.reason = len(loops), states, reason
+        self.loop, self.axes = _stack(loops)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the runs take longer than they might."""
-        return _told(self.instead)
+        """Why the runs take longer than by native code."""
+        return _warnings(self.reason)
 
     @property
     def longest(self) -> int:
@@ -139,15 +139,15 @@ def _begin_all(loop: Loop, axes: Any, states: jax.Array) -> Moment:
 
 
 @cached_jit
-def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, wanted: Any) -> Any:
-    each = (axes, _ALL, None, None, None)
-    return eqx.filter_vmap(advance, in_axes=each, out_axes=(_ALL, 1, 0))(
-        loop, now, counts, wanted, now.step
+def _advance_all(loop: Loop, axes: Any, now: Moment, counts: jax.Array, reference: Any) -> Any:
+    in_axes = (axes, _ALL, None, None, None)
+    return eqx.filter_vmap(advance, in_axes=in_axes, out_axes=(_ALL, 1, 0))(
+        loop, now, counts, reference, now.step
     )
 
 
-def _side_by_side(loops: Sequence[Loop]) -> tuple[Loop, Any]:
-    """Return loops as one whose leaves are rows where they differ, and along which axis."""
+def _stack(loops: Sequence[Loop]) -> tuple[Loop, Any]:
+    """Return one loop whose leaves are stacked where they differ, and the axes of its leaves."""
     if all(loop is loops[0] for loop in loops):
         return loops[0], None
     flat, tree = [jax.tree.leaves(loop) for loop in loops], jax.tree.structure(loops[0])

@@ -1,4 +1,4 @@
-"""Agents that are driven by laws: what each does is a function of what it knows."""
+"""The drive by control laws: what an agent does is a function of what it knows."""
 
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeVar, final
@@ -26,7 +26,7 @@ from echelon.simulation.step.drive import Drive, Information, Problem, Stepper
 from echelon.simulation.step.loop import assemble
 from echelon.simulation.step.settings import Settings
 
-if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+if TYPE_CHECKING:  # a gain is passed on to callers, and never read here
     from echelon.synthesis.gains.gain import Gain
 
 
@@ -49,7 +49,7 @@ class Laws(Drive):
 
     @property
     def information(self) -> Information:
-        """What the two laws must be sent by others."""
+        """What the two laws must receive from others."""
         return Information(self.leader.information, self.follower.information)
 
     @property
@@ -64,14 +64,14 @@ class Laws(Drive):
 
     @property
     def frame(self) -> Frame:
-        """The axes of the followers' gain, as they are asked for."""
-        # Of another law one for the gain alone is made, which turns where it can.
+        """The axes of the followers' gain, as chosen by the user."""
+        # A law without the choice has a gain that turns with the heading where it can.
         return getattr(self.follower, "frame", Frame.HEADING)
 
     @property
     def reacts(self) -> bool:
         """Whether the leaders' law is given a reaction."""
-        # Not every law has one, and a user's own need not know of this question.
+        # By name, since a user's own law need not have one.
         return getattr(self.leader, "reaction", None) is not None
 
     @property
@@ -80,7 +80,7 @@ class Laws(Drive):
         return getattr(self.follower, "trim", True)
 
     def prepare(self, model: ControlAffine, graph: Graph) -> "Laws":
-        """Return both laws completed; the same where they are.
+        """Return both laws completed; the same object where they already are.
 
         Raises:
             LawError: one does not fit the model or the graph.
@@ -103,16 +103,16 @@ class Laws(Drive):
     def refusals(
         self, model: ControlAffine, graph: Graph, states: Array
     ) -> Iterator[tuple[int, int, str]]:
-        """Yield which of many starts (K, N, n) a law cannot take: which, the agent, and why."""
+        """Yield the starts (K, N, n) that a law cannot take: their numbers, the agent, and why."""
         for law, agents in ((self.leader, graph.leaders), (self.follower, graph.followers)):
             starts = states[:, list(agents)].reshape(-1, states.shape[2])
             for place, text in law.refusals(model, starts):
                 yield place // len(agents), agents[place % len(agents)], text
 
     def warnings(self, model: ControlAffine, graph: Graph, settings: Settings) -> tuple[str, ...]:
-        """Return the warnings of both laws, and what of the reference the leaders cannot do."""
-        told = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
-        return told + leader_warnings(self.leader, model, settings.horizon, settings.limits)
+        """Return the warnings of both laws, and about references that leaders cannot follow."""
+        warnings = self.leader.warnings(model, graph) + self.follower.warnings(model, graph)
+        return warnings + leader_warnings(self.leader, model, settings.horizon, settings.limits)
 
     def start(self, model: ControlAffine) -> State:
         """Return where the leaders' law begins."""
@@ -131,7 +131,7 @@ class Laws(Drive):
         return self.follower.metric(model)
 
     def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
-        """Return the heading that a leader at x tells."""
+        """Return the heading that a leader at x sends."""
         return self.leader.heading(model, t, x) if self.follower.turning else None
 
     def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:
@@ -140,10 +140,10 @@ class Laws(Drive):
         return law.drift(model, x)
 
     def stepper(self, problem: Problem) -> Stepper:
-        """Return what steps the closed loop, by JAX or by native code.
+        """Return the stepper of the closed loop, by JAX or by native code.
 
         Raises:
-            SimulationError: native code is asked for, and cannot be made.
+            SimulationError: native code is requested, and there is none.
         """
         loop, settings = assemble(problem, self.leader, self.follower), problem.settings
         states, devices = problem.states, settings.devices
@@ -158,28 +158,28 @@ class Laws(Drive):
 
 
 _WORTH = 100_000
-"""Steps of one agent from which on native code saves more than the second that it takes to make."""
-_Made = TypeVar("_Made")
+"""Steps of one agent from which on native code saves more than the second of its compilation."""
+_R = TypeVar("_R")
 
 
 def choose_engine(
     settings: Settings,
     agents: int,
-    native: Callable[[], _Made],
-    by_jax: Callable[[str], _Made],
+    native: Callable[[], _R],
+    by_jax: Callable[[str], _R],
     least: int = _WORTH,
-) -> _Made:
-    """Return what one of the engines makes for so many agents.
+) -> _R:
+    """Return what one of the two engines computes for so many agents.
 
     Args:
         settings: of the run.
         agents: how many.
-        native: makes it by native code.
-        by_jax: takes why there is none, in words; empty where none is wanted.
+        native: computes it by native code.
+        by_jax: computes it by JAX; takes why there is no native code, empty where none is needed.
         least: from how many steps of one agent on native code pays.
 
     Raises:
-        SimulationError: native code is asked for, and cannot be made.
+        SimulationError: native code is requested, and there is none.
     """
     if not worth_native(settings, agents, least):
         return by_jax("")
@@ -192,7 +192,7 @@ def choose_engine(
 
 
 def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
-    """Tell whether agents are to be stepped by native code: it is asked for, or pays.
+    """Tell whether native code is to step the agents: it is requested, or pays.
 
     It computes on processors alone, and `least` is from how many steps of one agent on it pays.
     """
@@ -204,7 +204,7 @@ def worth_native(settings: Settings, agents: int, least: int = _WORTH) -> bool:
 
 
 def is_long(settings: Settings, agents: int, least: int = _WORTH) -> bool:
-    """Tell whether it pays to compile something else than the steps of a run alone."""
+    """Tell whether a run is long enough for more compilation than that of its JAX steps."""
     return settings.engine == "native" or settings.steps * agents >= least
 
 

@@ -1,4 +1,4 @@
-"""What a run is made of."""
+"""The parts of a run: agents, graph, formation, what drives the agents, starts and world."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,11 @@ Initial: TypeAlias = Mapping[str, float] | Mapping[int, Sequence[float]] | np.nd
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Parts:
-    """Agents, who hears whom, where each belongs, what drives them, how they start, their world.
+    """The agents, their graph and formation, what drives them, how they start, and their world.
 
     Args:
         model: the agents, all alike.
-        graph: who hears whom, and who leads.
+        graph: who receives messages of whom, and who leads.
         formation: the goal offsets, (N, n).
         drive: what drives the agents, such as `Laws(leader, follower)`.
         initial: spread of the followers' starts about their goals, per state or group (uniform
@@ -48,10 +48,10 @@ class Parts:
     def __post_init__(self) -> None:
         """Check that each part is of the kind of its place."""
         # The model is left out: `check_model` says more of what is wrong with one.
-        wanted = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
-        for place, kind in wanted.items():
+        kinds = {"graph": Graph, "formation": Formation, "drive": Drive, "world": World}
+        for place, kind in kinds.items():
             check_kind(place, getattr(self, place), kind)
 
     def replace(self, **changes: object) -> "Parts":
-        """Return the same with some parts changed."""
+        """Return a copy with some parts changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]

@@ -1,12 +1,17 @@
-"""What is checked and made ready before a run, whatever drives it."""
+"""Checks and completes the parts of a run before it starts, whatever drives the agents."""
 
 from typing import NamedTuple
+
+import jax
+import numpy as np
 
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.models.model_check import check_model
 from echelon.agents.network.formation import Formation
 from echelon.core.errors import SimulationError, check_kind
+from echelon.core.identity import digest
 from echelon.core.limits import excess_frames
+from echelon.core.memoize import BoundedCache
 from echelon.core.numerics import precision
 from echelon.simulation.engine.initial import initial_states
 from echelon.simulation.engine.parts import Parts
@@ -24,20 +29,45 @@ class Prepared(NamedTuple):
     warnings: tuple[str, ...]
 
 
+def _size(prepared: Prepared) -> int:
+    """Return the bytes of what is held with prepared parts."""
+    arrays = jax.tree.leaves((prepared.problem.meter, prepared.problem.states))
+    return sum(np.asarray(array).nbytes for array in arrays)
+
+
+_CACHE = BoundedCache[Prepared](4, _size, 256 * 2**20)
+"""Parts that were prepared last: a run, its guarantee and its gradient ask for the same."""
+
+
 def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepared:
     """Check all parts and complete those that depend on others, in float64.
+
+    The same parts are prepared once, unless a user's class takes part, which may change.
 
     Args:
         parts: agents, graph, formation, what drives them, starts and world.
         settings: of the run.
-        to_store: whether a whole run will be stored, which must then have room.
+        to_store: whether a whole run will be stored, for which there must be memory.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others.
     """
     check_given(parts, settings)
+    # By their bits too, since somebody may write to an array in them; a graph never changes.
+    mutable = parts.model, parts.drive, parts.initial, parts.start_error, parts.world
+    bits = digest((mutable, parts.formation.offsets, settings))
+    key = None if bits is None else (parts, bits)
+    prepared = _CACHE.get_or_make(key, lambda: _prepare(parts, settings, to_store))
+    if to_store:
+        # Again for parts that were prepared when nothing was to be stored.
+        check_memory(parts.model, parts.graph.agents, settings)
+    return prepared
+
+
+def _prepare(parts: Parts, settings: Settings, to_store: bool) -> Prepared:
+    """Prepare parts that were not prepared before."""
     model, graph, formation = parts.model, parts.graph, parts.formation
-    # Gains, plans and starts are the same in a float32 run, and so is what is promised of them.
+    # Gains, plans and starts are the same in a float32 run, and so is what is guaranteed of them.
     with precision("float64"):
         warnings = check_model(model) + parts.world.check(model)
         _check_offsets(model, parts)
@@ -45,7 +75,7 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
             # Before gains and plans, which may take long.
             check_memory(model, graph.agents, settings)
         drive = parts.drive.prepare(model, graph)
-        # What is complete stays the same object, so that what is known of it is found again.
+        # A complete drive stays the same object, so that what was computed of it is found again.
         parts = parts if drive is parts.drive else parts.replace(drive=drive)
         problem = Problem(
             model,
@@ -65,10 +95,10 @@ def prepare(parts: Parts, settings: Settings, to_store: bool = False) -> Prepare
 
 
 def check_given(parts: Parts, settings: Settings) -> None:
-    """Check what a run is asked for.
+    """Check the arguments of a run.
 
     Raises:
-        EchelonError: it is something else, or a number of the settings is out of range.
+        EchelonError: they are of another kind, or a number of the settings is out of range.
     """
     check_kind("parts", parts, Parts)
     check_kind("settings", settings, Settings)
@@ -76,10 +106,10 @@ def check_given(parts: Parts, settings: Settings) -> None:
 
 
 def check_memory(model: ControlAffine, agents: int, settings: Settings) -> None:
-    """Check that what a run of so many agents stores has room, before anything is made for it.
+    """Check that memory suffices for what a run of so many agents stores.
 
     Raises:
-        SimulationError: it has not, and what would.
+        SimulationError: it does not; the text says how many frames would fit.
     """
     n, m = len(model.state_names), len(model.input_names)
     every = settings.store_every
@@ -100,7 +130,7 @@ def _check_offsets(model: ControlAffine, parts: Parts) -> None:
 
 
 def formation_warnings(model: ControlAffine, formation: Formation) -> tuple[str, ...]:
-    """Tell of offsets that the dynamics do not respect, and of goals that coincide."""
+    """Return warnings of offsets that break a symmetry of the model, and of equal goals."""
     broken = formation.broken_symmetries(model)
     sentences = [
         f"the offset of agent {agent} is no symmetry of `{type(model).__name__}`: {reason}, "

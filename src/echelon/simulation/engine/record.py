@@ -1,4 +1,4 @@
-"""What is kept of a run while it goes on, and how it ended."""
+"""What is stored of a run while it is computed, and how it ended."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, final
@@ -16,7 +16,7 @@ _VERBS = {Outcome.INTERRUPTED: "interrupted", Outcome.STOPPED: "ended from outsi
 
 
 class Stretch(NamedTuple):
-    """A part of a run, all in NumPy; the last one is all that going on from there needs.
+    """A part of a run, all in NumPy; the last one is all that is needed to continue the run.
 
     Attributes:
         first: the step at which it begins.
@@ -101,10 +101,10 @@ class Recorder:
         """Begin after the stretches that were computed before."""
         self.problems, self.grid, self.stretches = problems, grid, list(before)
         nothing = on_host(problems[0].meter.nothing(np))
-        sums = [each.sums for each in before[-1:]] or [nothing] * len(problems)
+        sums = [stretch.sums for stretch in before[-1:]] or [nothing] * len(problems)
         self.sums = Sums(*map(np.stack, zip(*sums, strict=True)))
-        self.frames = sum(len(each.times) for each in before)
-        self._finite = np.full(len(problems), all(each.finite for each in before))
+        self.frames = sum(len(stretch.times) for stretch in before)
+        self._finite = np.full(len(problems), all(stretch.finite for stretch in before))
 
     @property
     def done(self) -> int:
@@ -139,7 +139,7 @@ class Recorder:
         self.frames += int(frames.sum())
         alone = len(self.problems) == 1
         if self.stretches:
-            # Only the last one's are ever asked for, and many would fill the memory.
+            # Only the last one's are ever read, and many would fill the memory.
             self.stretches[-1] = self.stretches[-1]._replace(moment=(), sums=self.sums)
         self.stretches.append(
             Stretch(
@@ -227,8 +227,8 @@ class Recorder:
         # One that stopped did so between two frames; the steps themselves were counted.
         if whole.stopped:
             reached = whole.done * problem.settings.dt
-        said = whole.stopped or f"The run was {_VERBS[unfinished]}"
-        return unfinished, f"{said} at t = {reached:.6g} s; what was computed is kept."
+        what = whole.stopped or f"The run was {_VERBS[unfinished]}"
+        return unfinished, f"{what} at t = {reached:.6g} s; what was computed is kept."
 
     def _completed(self, problem: Problem, whole: Stretch) -> tuple[Outcome, str]:
         """Return how a run ended that reached its horizon: whether all stayed in their chart."""
@@ -270,11 +270,11 @@ def join(stretches: Sequence[Stretch]) -> Stretch | None:
     if len(stretches) < 2:
         return stretches[0] if stretches else None
     times, states, inputs = (
-        np.concatenate([getattr(each, name) for each in stretches])
+        np.concatenate([getattr(stretch, name) for stretch in stretches])
         for name in ("times", "states", "inputs")
     )
-    followed = [each.reference for each in stretches if each.reference is not None]
-    reference = np.concatenate(followed) if followed else None
+    references = [part.reference for part in stretches if part.reference is not None]
+    reference = np.concatenate(references) if references else None
     return stretches[-1]._replace(
         first=stretches[0].first, times=times, states=states, inputs=inputs, reference=reference
     )

@@ -1,4 +1,4 @@
-"""What a run leaves behind: everything that metrics, figures and files read, in float64 NumPy."""
+"""The result of a run: everything that metrics, figures and files read, in float64 NumPy."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -30,13 +30,13 @@ class Result:
         states: (T, N, n).
         inputs: (T, N, m), physical, as delivered by the actuators from each frame on.
         reference: (T, n), the leader's reference state, or None where it follows nothing.
-        sums: over all steps, of which means are made.
+        sums: over all steps, of which means are computed.
         outcome: how the run ended; `message` says it with time and agent.
         warnings: what is allowed but probably not meant, one sentence each.
         parts: what ran, with its drive completed.
         settings: how it was computed.
         wall_time: seconds of computing, compilation included.
-        work: what solving took; None where laws gave the inputs.
+        work: of the solvers; None where laws gave the inputs.
         engine: what computed the steps, `jax` or `native`.
         provenance: scenario text, versions and the like, as text.
     """
@@ -63,12 +63,12 @@ class Result:
 
     @property
     def graph(self) -> Graph:
-        """Who hears whom."""
+        """The graph: who receives messages of whom, and who leads."""
         return self.parts.graph
 
     @property
     def formation(self) -> Formation:
-        """Where each belongs."""
+        """The goal offsets."""
         return self.parts.formation
 
     @property
@@ -78,7 +78,7 @@ class Result:
 
     @property
     def world(self) -> World:
-        """What the laws did not know."""
+        """What the laws did not know: plant, disturbance and network."""
         return self.parts.world
 
     @property
@@ -88,7 +88,7 @@ class Result:
 
     @property
     def chatter(self) -> Array:
-        """How many times (N,) an input went from beyond one limit to beyond the other in a step."""
+        """How many times (N,) an input jumped from one limit to the opposite one in a step."""
         return self.sums.chatter
 
     @property
@@ -112,17 +112,17 @@ class Result:
         return "m" if self.model.position else "state"
 
     def __repr__(self) -> str:
-        """Return who ran, for how long, and how it ended."""
-        # Arrays would fill the screen, and have names to ask for.
+        """Return the agents, the number of frames, and how the run ended."""
+        # Arrays would fill the screen.
         who = f"{self.graph.agents} x {type(self.model).__name__}"
         return f"Result({who}, {len(self.times)} frames, {self.message!r})"
 
     def _repr_html_(self) -> str:
-        """Return the run as a notebook shows it: a table, with its picture."""
+        """Return the run as a notebook displays it: a table with its picture."""
         return notebook_page("result", self)
 
     def with_provenance(self, **texts: str) -> "Result":
-        """Return the same run with more provenance."""
+        """Return a copy with more provenance."""
         return dataclasses.replace(self, provenance={**self.provenance, **texts})
 
 

@@ -1,4 +1,4 @@
-"""The closed loop in time: parts in, one `Result` out, whatever drives the agents."""
+"""A run of the closed loop: parts in, one `Result` out, whatever drives the agents."""
 
 import contextlib
 import dataclasses
@@ -24,21 +24,21 @@ from echelon.simulation.step.solver_stats import SolverStats
 
 @final
 class RunSoFar:
-    """A run on its way, as it is when it tells of itself.
+    """A run that is being computed, as progress callbacks see it.
 
     Attributes:
-        done: steps that were taken.
-        steps: in all.
+        done: how many steps were taken.
+        steps: of the whole run.
     """
 
     def __init__(self, prepared: Prepared, recorder: Recorder, stepper: Stepper) -> None:
-        """Note how far it has come."""
+        """Note how many steps were taken."""
         self._prepared, self._recorder, self._stepper = prepared, recorder, stepper
         self.done, self.steps = recorder.done, recorder.grid.steps
 
     @property
     def time(self) -> float:
-        """How far it has come, s."""
+        """The simulated time so far, s."""
         return self.done * self._prepared.problem.settings.dt
 
     @property
@@ -47,25 +47,26 @@ class RunSoFar:
         return next(x.states[-1] for x in reversed(self._recorder.stretches) if len(x.states))
 
     def result(self) -> Result:
-        """Return all that was computed so far, of which `metrics` takes its numbers."""
-        found = _result(self._prepared, self._recorder, self._stepper, Outcome.INTERRUPTED)
-        told = f"The run goes on, and this is all of it until t = {self.time:.6g} s."
-        under = found.outcome is Outcome.INTERRUPTED
-        return dataclasses.replace(found, message=told) if under else found
+        """Return all that was computed so far, as `metrics` takes it."""
+        result = _result(self._prepared, self._recorder, self._stepper, Outcome.INTERRUPTED)
+        if result.outcome is not Outcome.INTERRUPTED:
+            return result
+        message = f"The run goes on, and this is all of it until t = {self.time:.6g} s."
+        return dataclasses.replace(result, message=message)
 
 
 Progress: TypeAlias = Callable[[RunSoFar], None]
-"""Called between chunks with the run on its way."""
+"""Called between chunks with the run so far."""
 Keep: TypeAlias = Callable[[Stretch], None]
-"""Called with every stretch of a run while it lasts, each following the one before.
+"""Called with every stretch of a run as it is computed, in their order.
 
-Where it raises `Stopped`, with the reason in words, the run ends there.
+Raising `Stopped`, with the reason in words, ends the run there.
 """
 
 _ROWS = 512
 """Steps of a reference that cost as much as one."""
 _SECONDS = 2.0
-"""Of wall time that a stretch takes: what is lost at most where a run is killed."""
+"""Wall time of a stretch: what is lost at most when a run is killed."""
 
 
 def simulate(
@@ -80,11 +81,11 @@ def simulate(
     Args:
         parts: agents, graph, formation, what drives them, starts and world.
         settings: horizon, step and the like.
-        progress: called a hundred times or more with the run on its way: steps, states, and on
-            asking all that is known of it so far.
+        progress: called a hundred times or more with the run so far: steps, states, and the result
+            so far on request.
         keep: called with what was computed, every two seconds and at the end.
-        before: all that an earlier run of the same parts and settings gave to `keep`; the run goes
-            on from there, to the same bits.
+        before: all that an earlier run of the same parts and settings gave to `keep`; the run
+            continues from there, to the same bits.
 
     Raises:
         EchelonError: a part is malformed or does not fit the others. A run that diverges or is
@@ -93,12 +94,12 @@ def simulate(
     began = time.perf_counter()
     prepared = prepare(parts, settings, to_store=True)
     with precision("float64"):
-        # Plans and solvers are made in float64, in whatever precision the run then is.
+        # Plans and solvers are made in float64, whatever the precision of the run.
         stepper = prepared.parts.drive.stepper(prepared.problem)
     _check_devices(settings, stepper)
     with precision(settings.precision):
         recorder = _recorder(prepared, stepper, before)
-        _Flight(stepper, prepared, recorder, began).fly(progress, keep)
+        _ChunkLoop(stepper, prepared, recorder, began).run(progress, keep)
     return _result(prepared, recorder, stepper, Outcome.INTERRUPTED)
 
 
@@ -110,7 +111,7 @@ def _check_devices(settings: Settings, stepper: Stepper) -> None:
 
 
 def reassemble(parts: Parts, settings: Settings, stretches: Sequence[Stretch]) -> Result:
-    """Return what a run had computed when it was ended from outside.
+    """Return the result of a run that was ended from outside.
 
     Args:
         parts: those of the run.
@@ -145,11 +146,11 @@ def result_of(
     warnings: tuple[str, ...] = (),
     work: SolverStats | None = None,
 ) -> Result:
-    """Return a run as its result, from what was kept of it."""
-    told = record._asdict()
+    """Return a run as its result, from its record."""
+    fields = record._asdict()
     return Result(
-        wall_time=told.pop("seconds"),
-        **told,
+        wall_time=fields.pop("seconds"),
+        **fields,
         warnings=prepared.warnings + warnings,
         engine=engine,
         parts=prepared.parts,
@@ -159,32 +160,32 @@ def result_of(
 
 
 @final
-class _Flight:
-    """A run on its way, chunk by chunk, so that Ctrl-C or a divergence keeps what was computed."""
+class _ChunkLoop:
+    """Computes a run chunk by chunk, so that Ctrl-C or a divergence loses one chunk at most."""
 
     def __init__(
         self, stepper: Stepper, prepared: Prepared, recorder: Recorder, began: float
     ) -> None:
         self.stepper, self.prepared, self.recorder = stepper, prepared, recorder
-        self.followed = _Followed(prepared)
+        self.reference = _ReferenceRows(prepared)
         last = recorder.stretches[-1] if recorder.stretches else None
         self.now = stepper.start() if last is None else stepper.recall(last.moment)
         # As if it had begun so much earlier: what was computed before counts too.
         self.began = began - (0.0 if last is None else last.seconds)
-        self.given, self.gave = len(recorder.stretches), time.perf_counter()
+        self.handed_over, self.last_time = len(recorder.stretches), time.perf_counter()
 
-    def fly(self, progress: Progress | None, keep: Keep | None) -> None:
-        """Take all steps that are left, or those that can be taken."""
+    def run(self, progress: Progress | None, keep: Keep | None) -> None:
+        """Take all remaining steps, as far as they can be taken."""
         try:
             # Between chunks, or within one of JAX's: that chunk is lost, the others are kept.
             with contextlib.suppress(KeyboardInterrupt):
                 while not self.recorder.ended:
                     self._advance()
-                    if time.perf_counter() - self.gave > _SECONDS:
-                        self._give(keep)
+                    if time.perf_counter() - self.last_time > _SECONDS:
+                        self._hand_over(keep)
                     if progress is not None:
                         progress(RunSoFar(self.prepared, self.recorder, self.stepper))
-            self._give(keep)
+            self._hand_over(keep)
         except Stopped as reason:
             self.recorder.stop(f"The run was stopped, since {reason}")
 
@@ -192,34 +193,34 @@ class _Flight:
         first, grid = self.recorder.done, self.recorder.grid
         # One more row, for a frame at a chunk's end, which no step follows. As many rows for the
         # last chunks, which have fewer steps, keep them from compiling anew.
-        reference = self.followed.rows(first, grid.longest + 1)
-        made = self.stepper.advance(self.now, grid.counts(first), reference)
-        self.recorder.keep(made, reference, time.perf_counter() - self.began)
-        self.now = made.now
+        reference = self.reference.rows(first, grid.longest + 1)
+        chunk = self.stepper.advance(self.now, grid.counts(first), reference)
+        self.recorder.keep(chunk, reference, time.perf_counter() - self.began)
+        self.now = chunk.now
 
-    def _give(self, keep: Keep | None) -> None:
+    def _hand_over(self, keep: Keep | None) -> None:
         """Hand over what was computed since the last time."""
-        new = join(self.recorder.stretches[self.given :])
+        new = join(self.recorder.stretches[self.handed_over :])
         if keep is not None and new is not None:
             keep(new)
-        self.given, self.gave = len(self.recorder.stretches), time.perf_counter()
+        self.handed_over, self.last_time = len(self.recorder.stretches), time.perf_counter()
 
 
 @final
-class _Followed:
-    """What the leaders follow, of more steps at once than a short chunk has."""
+class _ReferenceRows:
+    """The leaders' reference states, sampled for more steps at once than a short chunk has."""
 
     def __init__(self, prepared: Prepared) -> None:
         self.prepared, self.first = prepared, 0
-        self.kept: Array | None = None
+        self.states: Array | None = None
 
     def rows(self, first: int, count: int) -> Array | None:
-        """Return what they follow at so many steps from one on; None where they follow nothing."""
-        if self.kept is None or first + count > self.first + len(self.kept):
+        """Return those of `count` steps from one on; None where the leaders follow nothing."""
+        if self.states is None or first + count > self.first + len(self.states):
             self.first = first
-            self.kept = sample_reference(self.prepared, first, max(count, _ROWS))
-        at = first - self.first
-        return None if self.kept is None else self.kept[at : at + count]
+            self.states = sample_reference(self.prepared, first, max(count, _ROWS))
+        start = first - self.first
+        return None if self.states is None else self.states[start : start + count]
 
 
 def sample_reference(prepared: Prepared, first: int, steps: int) -> Array | None:

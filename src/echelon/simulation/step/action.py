@@ -1,4 +1,4 @@
-"""What one agent does in a step: the same alone, as a row of many, and lowered to machine code."""
+"""What one agent does in a step: alone, as a row of many, or lowered to machine code."""
 
 from typing import NamedTuple
 

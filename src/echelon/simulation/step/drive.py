@@ -1,7 +1,6 @@
-"""What drives the agents, and the small interface behind which a run is stepped.
+"""The interfaces of a drive, which gives the agents their inputs, and of a stepper, which runs it.
 
-`simulate` knows nothing else of laws, plans or horizons. A compiled stepper takes the place of
-another one here.
+`simulate` knows nothing else of laws, plans or horizons.
 """
 
 import abc
@@ -26,19 +25,19 @@ from echelon.simulation.step.motion import Motion
 from echelon.simulation.step.settings import Settings
 from echelon.simulation.step.solver_stats import SolverStats
 
-if TYPE_CHECKING:  # a gain is handed on to those who ask, and never looked into
+if TYPE_CHECKING:  # a gain is passed on to callers, and never read here
     from echelon.synthesis.gains.gain import Gain
 
 Moment: TypeAlias = Any
-"""All that changes during a run; each stepper has its own."""
+"""All that changes during a run, as `loop.Moment`."""
 
 
 class Problem(NamedTuple):
-    """What a stepper is made from: agents, their graph and goals, how they move, how they start.
+    """What a stepper needs: agents, their graph and goals, how they move, how they start.
 
     Attributes:
         model: what laws and solvers know of an agent.
-        graph: who hears whom.
+        graph: who receives messages of whom.
         formation: the goal offsets.
         motion: the plant in its world, with the integrator.
         meter: what is measured at each step.
@@ -82,7 +81,7 @@ def numbers(now: Moment) -> tuple[Array, ...]:
 
 
 def _leaf(stored: Array, like: Any) -> Any:
-    """Return one of the numbers as the leaf that it was."""
+    """Return one of the numbers as the leaf that it was in the moment."""
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
     return jnp.asarray(stored, like.dtype)
@@ -94,7 +93,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 class Stopped(Exception):
-    """Raised by what a run asks on its way, where the run is to end there; the reason in words."""
+    """Raised by a callback or a pilot to end the run; its text is the reason."""
 
 
 class Stepper(abc.ABC):
@@ -122,22 +121,22 @@ class Stepper(abc.ABC):
         """Return the moment of which these are the numbers, in the order of its tree.
 
         Raises:
-            SimulationError: a moment is not all that decides what comes next, or another run's.
+            SimulationError: the moment is of another run, or not all that decides what comes next.
         """
         # The moment at the start says of what kind and shape each of the numbers is.
-        wanted, tree = jax.tree.flatten(self.start())
-        if [np.shape(each) for each in numbers(wanted)] != [np.shape(each) for each in leaves]:
-            raise SimulationError("the kept moment has another shape than this run's.")
-        return tree.unflatten(map(_leaf, leaves, wanted))
+        like, tree = jax.tree.flatten(self.start())
+        if [np.shape(leaf) for leaf in numbers(like)] != [np.shape(leaf) for leaf in leaves]:
+            raise SimulationError("the stored moment has another shape than this run's.")
+        return tree.unflatten(map(_leaf, leaves, like))
 
     @property
     def work(self) -> SolverStats | None:
-        """What solving took so far; None where nothing is solved."""
+        """The work of the solvers so far; None where nothing is solved."""
         return None
 
     @property
     def devices(self) -> int:
-        """Among how many devices the agents are parted."""
+        """How many devices the agents are spread over."""
         return 1
 
     @property
@@ -152,7 +151,7 @@ class Stepper(abc.ABC):
 
 
 class Information(NamedTuple):
-    """What leaders and followers must be sent by others, in words."""
+    """What leaders and followers must receive from others, in words."""
 
     leader: tuple[str, ...]
     follower: tuple[str, ...]
@@ -164,29 +163,29 @@ class Drive(eqx.Module):
     @property
     @abc.abstractmethod
     def information(self) -> Information:
-        """What the agents must be sent by others."""
+        """What the agents must receive from others."""
 
     @abc.abstractmethod
     def stepper(self, problem: Problem) -> Stepper:
-        """Return what moves the agents under a drive that is prepared.
+        """Return the stepper of agents under a prepared drive.
 
         Raises:
-            EchelonError: there is none, such as a plan that misses a constraint.
+            EchelonError: there is none, such as for a plan that violates a constraint.
         """
 
     @property
     def gain(self) -> "Gain | None":
-        """The gain that the followers run with; None where they have none."""
+        """The followers' gain; None where they have none."""
         return None
 
     @property
     def feedforward(self) -> Feedforward:
-        """What the followers are sent of others' inputs."""
+        """What the followers receive of others' inputs."""
         return Feedforward.NONE
 
     @property
     def frame(self) -> Frame:
-        """The axes of the followers' gain, as they are asked for."""
+        """The axes of the followers' gain, as chosen by the user."""
         return Frame.WORLD
 
     @property
@@ -228,7 +227,7 @@ class Drive(eqx.Module):
         return None
 
     def with_follower(self, law: Law) -> "Drive":
-        """Return a drive under which leaders do the same, and followers obey a law.
+        """Return a drive with the same leaders, and followers under another law.
 
         Raises:
             SimulationError: the leaders have no law of their own.
@@ -242,10 +241,7 @@ class Drive(eqx.Module):
         return None
 
     def heading(self, model: ControlAffine, t: Scalar, x: State) -> Scalar | None:
-        """Return the heading (rad) in whose axes the metric stands, with a leader at x.
-
-        None where it stands in those of the world.
-        """
+        """Return the heading (rad) of the metric's axes; None for the world's."""
         return None
 
     def drift(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> State:

@@ -146,7 +146,7 @@ def _switches(problem: Problem) -> Switches | None:
 def _levels(graph: Graph) -> Array:
     """Return the places of followers among the followers, (D, W), a row for each depth.
 
-    A row that is too short repeats its first.
+    A row that is too short repeats its first entry.
     """
     depth = graph.depths()[list(graph.followers)]
     rows = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
@@ -156,7 +156,7 @@ def _levels(graph: Graph) -> Array:
 
 
 def begin_forgetful(loop: Loop, states: Any) -> Moment:
-    """Return that moment for laws that remember nothing, without JAX: its calls cost many steps."""
+    """Return it for laws without memory, without JAX: one of its calls costs many steps."""
     cut: Any = np.zeros((len(states), len(loop.model.input_names)), np.int8)
     step: Any = np.zeros((), np.int32)
     return Moment(step, states, loop.leader.init(), loop.follower.init(), cut)

@@ -1,4 +1,4 @@
-"""What the means of a run are made of: sums over all its steps, whatever frames are stored.
+"""The sums over all steps of a run, of which its means are computed.
 
 A mean over stored frames would depend on how many are stored, and its first frame would weigh as
 much as all the steps after it.
@@ -15,14 +15,14 @@ from jaxtyping import Bool
 from echelon.agents.models.model import ControlAffine
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph
-from echelon.core.types import Array, Inputs, States
+from echelon.core.types import Array, Inputs, Output, State, States
 from echelon.simulation.step.settings import Settings
 
 Total: TypeAlias = Any
 """JAX within a chunk, float64 NumPy on the host: chunks of a float32 run are added without loss."""
 
 ALWAYS = 2**31 - 1
-"""The first step at which a state left its chart, where it never did."""
+"""Stands for the first step at which a state left its chart, where it never did."""
 
 SETTLED = 0.01
 """A follower has settled when its error stays below this: 1 cm for a position."""
@@ -201,31 +201,31 @@ class Meter(eqx.Module):
         def one(x: jax.Array, offset: jax.Array, leader: jax.Array, u: jax.Array) -> OfAgent:
             return self.of_agent(step, steady, x, offset, leader, u)
 
-        each = jax.vmap(one)(states, offsets, y[self.nearest], inputs)
+        rows = jax.vmap(one)(states, offsets, y[self.nearest], inputs)
         tracking, outputs = self._tracking(steady, states[self.leaders], reference)
         return Sums(
             steps=jnp.stack([jnp.asarray(True), steady]).astype(jnp.int32),
-            errors=each.errors.T,
+            errors=rows.errors.T,
             tracking=tracking,
             outputs=outputs,
-            effort=each.effort,
+            effort=rows.effort,
             spacing=self.spacing(states),
             limited=limited.astype(jnp.int32),
-            unsettled=each.unsettled.astype(jnp.int32),
-            inside=each.inside.astype(jnp.int32),
+            unsettled=rows.unsettled.astype(jnp.int32),
+            inside=rows.inside.astype(jnp.int32),
             chatter=chatter.astype(jnp.int32),
         )
 
     def of_agent(self, step: Any, steady: Any, x: Any, offset: Any, leader: Any, u: Any) -> OfAgent:
-        """Return what one agent adds at a step.
+        """Return what one agent adds to the sums at a step.
 
         Args:
             step: its number.
-            steady: whether it begins in the steady window.
+            steady: whether the step begins in the steady window.
             x: the agent's state (n,).
-            offset: its goal's (n,).
+            offset: of its goal (n,).
             leader: the state (n,) of its leader less the leader's offset.
-            u: what is delivered to it (m,).
+            u: its delivered input (m,).
         """
         # y_i = x_i - xi_i, and y_i - y_0 is the deviation from the goal (theory page).
         square = self._length(x - offset - leader)
@@ -240,18 +240,18 @@ class Meter(eqx.Module):
             inside=jnp.where(out, step, ALWAYS),
         )
 
-    def of_leader(self, steady: Any, x: Any, offset: Any, wanted: Any) -> tuple[Any, Any]:
+    def of_leader(self, steady: Any, x: Any, offset: Any, reference: Any) -> tuple[Any, Any]:
         """Return the squared deviations of a leader at x from a reference, (2,), and its outputs'.
 
         Args:
             steady: whether the step begins in the steady window.
             x: its state (n,).
-            offset: its goal's (n,).
-            wanted: what it follows (n,), without that offset.
+            offset: of its goal (n,).
+            reference: what it follows (n,), without that offset.
         """
         # The offset back in: outputs are nonlinear in the state, so each is taken where it holds.
-        away = output_error(self.model, x, wanted + offset)
-        return _twice(steady, self._length(x - offset - wanted)), away * away
+        away = output_error(self.model, x, reference + offset)
+        return _twice(steady, self._length(x - offset - reference)), away * away
 
     def _length(self, deviation: jax.Array) -> jax.Array:
         """Return the squared length of the measured part of a deviation (n,)."""
@@ -278,20 +278,20 @@ class Meter(eqx.Module):
         return spacing_error(square, jnp.asarray(self.spacings, states.dtype))
 
 
-def spacing_error(square: jax.Array, wanted: jax.Array) -> jax.Array:
-    """Return how far distances, given by their squares, are from those that are wanted, squared."""
-    return (distance_of(square) - wanted) ** 2
+def spacing_error(square: jax.Array, desired: jax.Array) -> jax.Array:
+    """Return the squared errors of distances, whose squares are given, to the desired ones."""
+    return (distance_of(square) - desired) ** 2
 
 
 def distance_of(square: jax.Array) -> jax.Array:
     """Return the root of a square, with a slope of 1 where two agents meet."""
-    # A root has no slope at 0, and one choice alone would still ask it.
+    # A root has no slope at 0, and a single `where` would still differentiate it there.
     apart = square > 0.0
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), square)
 
 
 def outside(bounded: Any, low: Any, high: Any) -> Any:
-    """Return which states are beyond what a chart allows; what is no number is another outcome."""
+    """Return which states are beyond their chart; NaN is not, since it is another outcome."""
     return (bounded <= low) | (bounded >= high)
 
 
@@ -305,9 +305,9 @@ def measured_states(model: ControlAffine) -> tuple[int, ...]:
     return model.position_indices() or tuple(range(len(model.state_names)))
 
 
-def output_error(model: ControlAffine, x: jax.Array, wanted: jax.Array) -> jax.Array:
-    """Return h(x) - h(wanted), (q,), of two states (n,).
+def output_error(model: ControlAffine, x: State, reference: State) -> Output:
+    """Return h(x) - h(reference), (q,), of two states (n,).
 
-    The state's own difference, which may wind angles, decides how far apart the two outputs are.
+    The model's difference of states, which may wind angles, decides how far apart they are.
     """
-    return model.output(wanted + model.difference(x, wanted)) - model.output(wanted)
+    return model.output(reference + model.difference(x, reference)) - model.output(reference)

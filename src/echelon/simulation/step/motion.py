@@ -1,4 +1,4 @@
-"""How agents move: the plant under held inputs, its actuators, and what disturbs it."""
+"""How agents move: the plant under held inputs, its actuators and its disturbances."""
 
 from typing import Self, final
 
@@ -20,7 +20,7 @@ class Motion(eqx.Module):
 
     Attributes:
         plant: what moves.
-        wind: what disturbs it, ready to be drawn; None where nothing does.
+        wind: its disturbance, ready to be drawn; None without one.
         dt: step, s.
         integrator: its name.
         limits: whether the actuators' limits act.
@@ -35,7 +35,7 @@ class Motion(eqx.Module):
     @classmethod
     def of(cls, model: ControlAffine, world: World, settings: Settings) -> Self:
         """Return the motion of agents in a world."""
-        # Limits and disturbance are the plant's: a world may give other motors than the laws know.
+        # Limits and disturbance are the plant's: its motors may differ from those that laws know.
         plant, disturbance = world.plant_for(model), world.disturbance
         wind = disturbance and disturbance.prepared(plant, settings.dt, settings.seed)
         return cls(plant, wind, settings.dt, settings.integrator, settings.limits)
@@ -64,7 +64,7 @@ class Motion(eqx.Module):
         Args:
             x: its state (n,).
             u: its delivered input (m,).
-            push: what is added to its rate (n,), or None.
+            push: what wind adds to its rate (n,), or None.
             noise: what is added to its input (m,), or None.
         """
         field = disturbed(self.plant, push, noise)

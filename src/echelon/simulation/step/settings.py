@@ -23,8 +23,8 @@ class Settings(NamedTuple):
         seed: of the random starts, and of the disturbance unless it has its own.
         precision: `float64` or `float32`, whatever the flags of JAX are.
         engine: what steps agents under laws. `jax`; `native`, code for this machine's vectors; or
-            `auto`, which takes that for long runs where it can.
-        devices: among how many of JAX's devices the agents are parted; more than one where JAX
+            `auto`, native code for long runs where possible.
+        devices: over how many of JAX's devices the agents are spread; more than one where JAX
             steps them.
         steady_window: the last part of the run that counts as steady, s; a fifth when left out.
     """

@@ -1,4 +1,4 @@
-"""What solving took in a run whose inputs an optimization gave."""
+"""The work of the solvers in a run whose inputs an optimization gives."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,14 +12,14 @@ class SolverStats(NamedTuple):
     Attributes:
         method: what was solved: `optimization`, planned once, or `mpc`, over a receding horizon.
         solver: by CasADi's name.
-        solves: how many plans were wanted.
+        solves: how many plans were requested.
         failures: how often a solver ended without a solution; the run went on with another attempt
             or with the last plan.
         seconds: of all solving.
         median_ms, p99_ms, worst_ms: of the plans, each of one agent at one time.
         iterations_median, iterations_worst: the solver's (`optimization`) or the quadratic programs
             (`mpc`) of a plan.
-        setup_seconds: of making the solvers ready, once.
+        setup_seconds: of building the solvers, once.
     """
 
     method: str
