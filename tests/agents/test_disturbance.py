@@ -1,4 +1,4 @@
-"""What laws do not know: wind, noise, and a plant that differs from their model."""
+"""Disturbances that laws do not know: wind, noise, and a plant that differs from the model."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""Several leaders: each has its row, its line and its name, and it is said who follows whom."""
+"""Several leaders: each has its row, line and name, and reports say who follows whom."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""The loop that runs live: it is the loop of a run, its knobs are keys, and the page shows it."""
+"""The live loop: it equals the loop of a run, its controls are scenario keys, the page shows it."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""The page of a run, in a real browser: it shows what the data says, and asks for nothing else."""
+"""The page of a run in a real browser: it shows the data and requests nothing from the network."""
 
 import dataclasses
 import itertools

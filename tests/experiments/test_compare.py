@@ -1,4 +1,4 @@
-"""The comparison of methods: alike in all but the law, and told truly."""
+"""Comparisons of methods: equal conditions except for the law, and correct reports."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What followers are told of others' inputs: the parent's on a tree, the leader's as a velocity."""
+"""Feed-forward: the parent's input on a tree, the leader's input, the leader's velocity."""
 
 import equinox as eqx
 import jax.numpy as jnp

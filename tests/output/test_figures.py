@@ -1,4 +1,4 @@
-"""Figures that a recording is drawn as again: limits, promises, distances, and sizes of a page."""
+"""Figures drawn from recordings: limits, guarantees, distances, and sizes for a page."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The figures: they show the run's own numbers, with units, on any run, and leave no state."""
+"""Figures of runs: they show the run's numbers with units and change no global state."""
 
 import dataclasses
 import functools
