@@ -56,10 +56,23 @@ def is_long(item):
     return bool(item.get_closest_marker("slow") or item.get_closest_marker("study"))
 
 
+OWN = {
+    "here",
+    "echelon",
+    "tmp_path",
+    "tmp_path_factory",
+    "monkeypatch",
+    "capsys",
+    "recwarn",
+    "request",
+}
+"""Fixtures that every test makes for itself."""
+
+
 def shares_fixtures(item):
-    """Whether a test uses a fixture of its file that other tests use too."""
-    fixtures = item._fixtureinfo.name2fixturedefs.values()
-    return any(each[-1].scope == "module" for each in fixtures)
+    """Whether a test uses a fixture of its file, which other tests may use too."""
+    parameters = getattr(item, "callspec", None)
+    return bool(set(item.fixturenames) - OWN - set(parameters.params if parameters else ()))
 
 
 def processor_time():

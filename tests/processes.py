@@ -1,4 +1,4 @@
-"""The command line in a process of its own, to be ended by signals."""
+"""Helper that runs the command line in a process of its own, to be ended by signals."""
 
 import contextlib
 import subprocess

@@ -1,4 +1,4 @@
-"""Runs that nobody simulated: recordings of chosen numbers, for tests of what draws them."""
+"""Constructed recordings with chosen numbers, for tests of figures and pages."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The closed loop from keywords, for tests that vary one part of a run at a time."""
+"""Helper that builds and runs a closed loop from keywords, for tests that vary one part of it."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""An import hook that checks, wherever echelon declares a shape, that what comes has it.
+"""An import hook that checks at run time the shapes that echelon declares.
 
 jaxtyping's own hook wraps every function, and most declare no shape: it made the tests take half as
 long again.

@@ -1,4 +1,4 @@
-"""The pages: what they show runs and prints what stands there, what they name and quote is so."""
+"""The documentation: its code prints what the page shows; names, links and numbers are right."""
 
 import contextlib
 import io

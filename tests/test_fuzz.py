@@ -1,4 +1,4 @@
-"""Nonsense is refused in whole sentences: a drawn part of what `python3 dev.py fuzz` tries."""
+"""Random input is refused in whole sentences: a part of what `python3 dev.py fuzz` tries."""
 
 import importlib.util
 import random

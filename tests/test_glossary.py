@@ -1,4 +1,4 @@
-"""Every word that a table prints has an entry in the glossary, and every key one on its page."""
+"""Every term that a table prints is in the glossary, and every scenario key is on its page."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The paper's statements one by one: what holds is shown to hold, what does not by an example."""
+"""The paper's statements one by one: those that hold, and counterexamples to the others."""
 
 import jax.numpy as jnp
 import numpy as np

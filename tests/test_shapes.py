@@ -1,4 +1,4 @@
-"""The tests see shapes that are not those declared."""
+"""The import hook of tests/shapes.py finds values whose shapes are not the declared ones."""
 
 import jax.numpy as jnp
 import pytest

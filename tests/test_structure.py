@@ -1,4 +1,4 @@
-"""The house itself: floors, sizes, kinds of classes, and what an import brings along."""
+"""Structure of the code: imports between packages, sizes, kinds of classes, loaded modules."""
 
 import ast
 import graphlib
@@ -78,7 +78,7 @@ def targets(module: str, node: ast.Import | ast.ImportFrom) -> list[str]:
 
 
 def inside(name: str) -> str | None:
-    """The module of echelon that an absolute name stands for or lies in, if any."""
+    """The module of echelon that an absolute name is or belongs to, if any."""
     if name.split(".")[0] != "echelon":
         return None
     relative = name.removeprefix("echelon").removeprefix(".")
@@ -161,14 +161,14 @@ def loaded_after(code: str) -> set[str]:
     return set(HEAVY) & set(names)
 
 
-def test_the_rooms_keep_their_contracts():
-    """Who may import whom stands in pyproject.toml; `lint-imports` reads every import."""
+def test_packages_keep_their_import_contracts():
+    """The contracts are in pyproject.toml; `lint-imports` reads every import."""
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as c; c()"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120)
     assert done.returncode == 0, done.stdout
 
 
-def test_nothing_stands_at_the_top_but_the_door():
+def test_the_top_folder_holds_the_entry_points_alone():
     named = {path.name for path in PACKAGE.iterdir() if not path.name.startswith("__pycache__")}
     files = {name for name in named if not (PACKAGE / name).is_dir()}
     assert files == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
@@ -310,7 +310,7 @@ def test_every_dependency_is_imported_or_has_its_reason():
 
 
 def test_every_advice_to_install_names_this_distribution():
-    """The import is `echelon`, but on the index that name is somebody else's."""
+    """The import is `echelon`, but on the index that name belongs to another project."""
     files = [*FILES, ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
     advice = re.compile(r"pip install (?:-\S+ )*['\"]?([\w.-]+)(?:\[([\w,-]+)\])?")
     named = {found for path in files for found in advice.findall(path.read_text("utf-8"))}
@@ -322,20 +322,38 @@ def test_every_advice_to_install_names_this_distribution():
     assert everything in project()["optional-dependencies"]["all"]
 
 
-def test_the_version_is_the_same_wherever_it_stands():
+def test_the_version_is_the_same_everywhere():
     version, citation = project()["version"], (ROOT / "CITATION.cff").read_text("utf-8")
     assert importlib.import_module("echelon").__version__ == version
     assert f"\nversion: {version}\n" in citation
 
 
 def project() -> dict[str, Any]:
-    """What pyproject.toml says of the distribution."""
+    """The table `project` of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
 
 def plain(requirement: str) -> str:
     """The name of a requirement as installers compare it."""
     return re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", requirement)[0]).lower()
+
+
+def test_the_table_of_mutate_names_packages_and_tests_that_exist():
+    code = ast.parse((ROOT / "benchmarks" / "mutate.py").read_text("utf-8"))
+    named = {node.targets[0].id: node.value for node in code.body if isinstance(node, ast.Assign)}
+    tests = {path.stem.removeprefix("test_") for path in (ROOT / "tests").rglob("test_*.py")}
+    for place, names in ast.literal_eval(named["TESTS"]).items():
+        assert (PACKAGE / place).exists(), place
+        assert set(names) <= tests, place
+
+
+def test_set_up_names_no_host():
+    """Packages come from where the user's own pip, npm and apt are set to look."""
+    files = [*ROOT.glob("*.*"), *(ROOT / ".ci").iterdir(), *(ROOT / "web").glob("*.*")]
+    files += (ROOT / ".github").rglob("*.*")
+    texts = {path.name: path.read_text("utf-8") for path in files if path.is_file()}
+    texts.pop("CHANGELOG.md")  # links to conventions
+    assert [name for name, text in texts.items() if "://" in text] == []
 
 
 def test_dev_needs_the_standard_library_alone():

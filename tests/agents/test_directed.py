@@ -1,4 +1,4 @@
-"""Directed and switching graphs: spectra, what falls on them, flights by a second way, promises."""
+"""Directed and switching graphs: spectra, decreasing norms, guarantees, second computations."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Gains that turn with the leader's heading: the law at any heading is that at the trim's."""
+"""Gains in axes that turn with the leader's heading: the law is the same at any heading."""
 
 import dataclasses
 

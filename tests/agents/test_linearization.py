@@ -1,4 +1,4 @@
-"""The linearization at the trim: computed once for a model, and never that of another."""
+"""The linearization at the trim: computed once for each model and never confused between models."""
 
 import equinox as eqx
 import jax

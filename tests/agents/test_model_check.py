@@ -1,4 +1,4 @@
-"""What is said of a malformed agent, once, when it enters `synthesize` or `simulate`."""
+"""Errors for malformed models, raised once, when a model enters `synthesize` or `simulate`."""
 
 import time
 

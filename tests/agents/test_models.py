@@ -1,4 +1,4 @@
-"""Every bundled agent against equations written a second time, and the laws that they share."""
+"""Bundled models against equations written a second time, and properties that all of them share."""
 
 import importlib
 
@@ -179,6 +179,7 @@ def test_the_trim_is_an_equilibrium_within_the_limits(model):
     assert numpy(model.limit, u).tobytes() == u.tobytes()
 
 
+@pytest.mark.slow
 @given(
     matrix=hnp.arrays(float, (2, 2), elements=st.floats(-2.0, 2.0)),
     wanted=hnp.arrays(float, (2,), elements=st.floats(-9.0, 9.0)),

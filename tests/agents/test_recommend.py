@@ -1,4 +1,4 @@
-"""Leaders and edges that shorten a formation's slowest disagreement."""
+"""Recommended leaders and edges: they shorten the slowest disagreement of a formation the most."""
 
 import itertools
 
@@ -52,6 +52,7 @@ def test_one_more_leader_or_edge_is_the_best_of_all(drawn):
         assert slowest([*edges, (*pair, 1.0)], {0}, agents) == pytest.approx(best, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_the_best_edge_is_among_those_that_are_tried_of_many(seed):
     random, agents = np.random.default_rng(seed), 40
@@ -77,6 +78,7 @@ def test_each_further_leader_raises_lambda_min_and_keeps_the_earlier_ones(drawn,
         assert chosen[:-1] == ech.network.recommend_leaders(graph, count - 1)
 
 
+@pytest.mark.slow
 def test_on_a_line_the_second_leader_stands_at_two_thirds():
     # Between two leaders a chain of k is as slow as an open one of k / 2: k = 2 (N - k).
     assert ech.network.recommend_leaders(ech.Graph.path(31))[0] in (20, 21)

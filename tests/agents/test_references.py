@@ -1,4 +1,4 @@
-"""References: closed forms, derivatives by differences, and the spline by a system of its own."""
+"""References: closed forms, derivatives by differences, splines by a second linear system."""
 
 import jax
 import jax.numpy as jnp

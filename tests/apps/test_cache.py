@@ -1,4 +1,4 @@
-"""Compiled code between runs of the command line: where it is kept, and how that is ended."""
+"""Compiled code kept between runs of the command line: where, and how to switch it off."""
 
 import os
 import subprocess
@@ -35,6 +35,7 @@ def run(folder, where, **environment):
     return done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_a_second_run_uses_what_the_first_compiled_and_says_the_same(tmp_path):
     told = run(tmp_path, "c")
     entries = list((tmp_path / "c" / "compiled").glob("*-cache"))

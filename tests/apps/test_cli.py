@@ -170,6 +170,7 @@ def test_several_faults_of_parts_come_at_once(here, echelon):
     assert "`P` is not positive definite: its smallest eigenvalue is -1." in err
 
 
+@pytest.mark.slow
 def test_the_tables_inertia_is_refused_with_its_reason(here, echelon):
     code, _, err = echelon("run", "paper", "--set", "model.parameters=paper")
     assert code == 2 and "no rigid body has that: Izz = 2.95435e-05 exceeds" in err
@@ -205,6 +206,7 @@ def test_two_runs_of_one_second_do_not_collide(here, echelon, monkeypatch):
     assert names == ["mine-20260101-000000", "mine-20260101-000000-2"]
 
 
+@pytest.mark.slow
 def test_a_diverging_run_is_a_result(here, echelon):
     (here / "mine.yaml").write_text(
         "name: blowup\n"
@@ -233,6 +235,7 @@ def test_list_names_everything_in_one_line_each(echelon):
     assert set(json.loads(out)) >= {"scenarios", "models", "follower laws"}
 
 
+@pytest.mark.slow
 def test_doctor_passes_on_this_machine(echelon):
     code, out, _ = echelon("doctor", "--json")
     told = json.loads(out)

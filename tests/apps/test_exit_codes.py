@@ -1,4 +1,4 @@
-"""How a command ends: one exit code for each way, one sentence, and never a bare traceback."""
+"""Exit codes of commands: one for each ending, with one sentence, never a bare traceback."""
 
 import json
 import re

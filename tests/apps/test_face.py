@@ -1,4 +1,4 @@
-"""What the command line makes of a run for people and other programs; a folder to begin with."""
+"""Output of the command line for people and for programs, and the folder that `init` writes."""
 
 import dataclasses
 import json

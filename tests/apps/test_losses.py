@@ -1,4 +1,4 @@
-"""Nothing computed is lost, nothing of the user's is overwritten, and runs go on."""
+"""Interrupted runs: nothing computed is lost, nothing of the user's is overwritten, runs resume."""
 
 import json
 import os

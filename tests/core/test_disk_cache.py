@@ -1,4 +1,4 @@
-"""What is kept between processes: found by all that it was made from, and by nothing else."""
+"""Results stored between processes: found again by their inputs, and by nothing else."""
 
 import dataclasses
 import inspect

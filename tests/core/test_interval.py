@@ -1,4 +1,4 @@
-"""Intervals and arcs: what holds of every enclosure, at the places where it is decided."""
+"""Intervals and arcs: every enclosure contains the exact values, also at the hardest places."""
 
 import math
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""The walk through a trace, in a small algebra: exact fractions."""
+"""The interpreter of JAX traces, tested with exact fractions."""
 
 from fractions import Fraction
 

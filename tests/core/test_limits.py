@@ -1,4 +1,4 @@
-"""What is too large is refused before anything is allocated, with what would fit."""
+"""Inputs too large for the memory are refused before allocation; errors name what would fit."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`design`: the table of methods, what it recommends, and pictures that claim no more than seen."""
+"""`design`: the table of methods, the recommendation, and pictures that claim no more than it."""
 
 import json
 
@@ -136,7 +136,7 @@ def test_the_step_that_is_told_is_the_longest(echelon):
 def test_the_table_and_its_sentence_are_whole(echelon):
     code, out, _ = echelon("design", "mine.yaml")
     assert code == 0 and "dt up to" in out and "certified" in out and "delay" in out
-    assert "- inner-loop: `Pendulum` has no state that its dynamics ignore" in out
+    assert "- inner-loop: `Pendulum` has no symmetric state" in out
     sentence = out.splitlines()[-1]
     assert sentence.startswith("Recommended: ") and sentence.endswith("is short enough for it.")
 

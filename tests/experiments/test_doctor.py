@@ -1,4 +1,4 @@
-"""Each self-check can fail: where its claim is broken, `doctor` says so."""
+"""The self-checks of `doctor`: each one fails where its claim is broken."""
 
 import contextlib
 import subprocess

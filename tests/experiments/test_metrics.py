@@ -1,4 +1,4 @@
-"""The numbers of a run, against closed forms on made-up runs."""
+"""The numbers of a run, against closed forms on constructed runs."""
 
 import dataclasses
 

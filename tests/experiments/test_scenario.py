@@ -1,4 +1,4 @@
-"""The scenario file: what is accepted, what every default is, and the sentence of every fault."""
+"""The scenario file: accepted input, defaults, and errors with their lines."""
 
 import dataclasses
 import json
@@ -241,7 +241,7 @@ def test_a_method_takes_the_keys_that_its_class_takes(name):
     arguments = [field.name for field in dataclasses.fields(method)]
     assert sorted(key for key, mark in marks.items() if name in mark.choices) == sorted(arguments)
     assert {key for key, mark in marks.items() if name in mark.needed_by} == {*method.needs}
-    assert method.name == name and {*method.usual} <= {*method.needs}
+    assert method.name == name and {*method.defaults} <= {*method.needs}
 
 
 @pytest.mark.parametrize("role", ["leader", "follower"])

@@ -1,4 +1,4 @@
-"""Many runs at once: each is the run that it would be alone, and nothing of a sweep is lost."""
+"""Sweeps: each run has the bits that it has alone, and interrupted sweeps lose nothing."""
 
 import contextlib
 import json

@@ -1,4 +1,4 @@
-"""Weights tuned along the slope of a cost: the slopes, what is lowered, and what is refused."""
+"""Tuned weights: gradients of the cost, lower costs, and refused input."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Laws, references and gain methods of one's own in a scenario, and what is said of bad ones."""
+"""Users' own laws, references and gain methods in a scenario, and errors for bad ones."""
 
 import numpy as np
 import pytest

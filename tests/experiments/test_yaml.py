@@ -1,4 +1,4 @@
-"""YAML 1.2 in, plain data and places out; overrides laid over it."""
+"""Reading YAML 1.2 with the place of every value, and overrides."""
 
 import itertools
 import math

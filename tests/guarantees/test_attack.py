@@ -1,4 +1,4 @@
-"""Promises for random agents, attacked by code that shares nothing with echelon."""
+"""Guarantees for random agents, attacked by code that shares nothing with echelon."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Where flat coordinates end: a length that must not be 0, and models that do not say (T5)."""
+"""Limits of flat coordinates in theorem T5: lengths that must not be 0, models without limits."""
 
 import json
 from fractions import Fraction

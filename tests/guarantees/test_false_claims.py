@@ -1,4 +1,4 @@
-"""Gain files that promise what is not true: each is refused, and by the claims that are false."""
+"""Gain files with false claims: each is refused because of the false claim."""
 
 import copy
 import importlib.util

@@ -1,4 +1,4 @@
-"""The laws along the leader's path: what a gain of the trim does where the reference takes it."""
+"""Laws linearized along the leader's path: whether a gain of the trim works away from it."""
 
 import jax
 import jax.numpy as jnp

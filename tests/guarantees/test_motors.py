@@ -1,4 +1,4 @@
-"""The certificate of motors under `stopping-point`: enclosures by second ways, and attacks."""
+"""The motor certificate of `stopping-point`: enclosures by a second computation, and attacks."""
 
 import json
 from fractions import Fraction

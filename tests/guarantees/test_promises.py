@@ -1,4 +1,4 @@
-"""One place says what is promised: all who tell of it say the same, and what they say is true."""
+"""Guarantees: all reports of one agree, and what they state is true."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The law `stopping-point` and theorem T5: numbers by a second way, and attacks on the proof."""
+"""The law `stopping-point` and theorem T5: second computations, and attacks on the proof."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""Control laws: one agent's form is the paper's block form, and Theorem 1 does what it says."""
+"""Control laws: the form for one agent equals the paper's block form; Theorem 1 in simulation."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Leaders along any feasible path: the time-varying gain, and paths of states and inputs."""
+"""Time-varying LQR for leaders along feasible paths of states and inputs."""
 
 import json
 import textwrap

@@ -1,4 +1,4 @@
-"""The pictures and notebooks of the pages: their scripts make them, and they stay small."""
+"""Pictures and notebooks of the documentation: their scripts produce them, and they stay small."""
 
 import importlib.util
 import re

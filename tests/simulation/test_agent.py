@@ -1,4 +1,4 @@
-"""One agent by itself does what it does in `simulate`, knowing what it is sent and no more."""
+"""A single `Agent` computes what it computes in `simulate`, from the messages it receives alone."""
 
 import numpy as np
 import pytest

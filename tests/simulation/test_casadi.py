@@ -1,4 +1,4 @@
-"""One model for simulation and solvers: CasADi's expressions against JAX's own numbers."""
+"""CasADi expressions of models against the numbers of JAX."""
 
 import casadi
 import jax

@@ -1,4 +1,4 @@
-"""Where the equations of a model hold, and inputs that alternate between their limits."""
+"""States that leave the chart of a model's equations, and inputs that chatter between limits."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Agents parted among devices: the bits of one device, of one process or of several."""
+"""Agents distributed over devices and processes: the same bits as on one device."""
 
 import os
 import socket

@@ -1,4 +1,4 @@
-"""How costs of runs change with gains and starts, against closed forms and differences."""
+"""Gradients of the cost of runs by gains and starts, against closed forms and differences."""
 
 import numpy as np
 import pytest

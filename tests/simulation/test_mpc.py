@@ -1,4 +1,4 @@
-"""The receding horizon against linear theory, its order, and how it survives failures."""
+"""Model predictive control against linear theory, its order of planning, recovery from failures."""
 
 import json
 import sys

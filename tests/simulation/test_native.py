@@ -1,4 +1,4 @@
-"""Native steps against JAX's: states, inputs, sums and moments, for all that a run may have."""
+"""Native steps against JAX: states, inputs, sums and moments, for every feature of a run."""
 
 import threading
 import time

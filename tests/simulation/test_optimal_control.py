@@ -1,4 +1,4 @@
-"""Plans against closed forms, other solvers, and the simulation that flies them."""
+"""Optimal plans against closed forms, other solvers, and simulation."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""The leader that follows a plan of its own."""
+"""A leader that follows an optimal plan of its own."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""The optimization baseline: pinned numbers, a second solver, and what its defects do."""
+"""The optimization baseline: pinned numbers, a second solver, effects of its defects."""
 
 import re
 

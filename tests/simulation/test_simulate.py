@@ -1,4 +1,4 @@
-"""The closed loop: oracles that share no code, orders of convergence, and the laws of a run."""
+"""The closed loop: independent implementations, orders of convergence, invariances of a run."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Proofs in exact arithmetic: they agree with floats that are sure, and decide where none is."""
+"""Proofs in exact arithmetic: they agree with clear float results and decide unclear ones."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""Gains and what their certificates say, against closed forms and eigenvalues."""
+"""Gains and their certificates, against closed forms and eigenvalues."""
 
 import dataclasses
 import json
@@ -399,13 +399,13 @@ def test_a_file_with_two_equal_keys_is_refused_where_it_is_flown_and_where_it_is
     text = file.read_text()
     file.write_text(text.replace('"coupling":', '"coupling": 0.001, "coupling":', 1))
     for read in (lambda: ech.load_gain(file, model, graph), lambda: ech.verify(file)):
-        with pytest.raises(ech.errors.GainError, match="`coupling` stands there twice"):
+        with pytest.raises(ech.errors.GainError, match="`coupling` (stands there )?twice"):
             read()
 
 
 def test_a_coupling_beyond_all_numbers_is_one_sentence_and_no_warning(recwarn):
     model, graph = ech.models.DoubleIntegrator(1), ech.Graph.path(3)
-    with pytest.raises(ech.errors.GainError, match="eigenvalue is beyond all numbers"):
+    with pytest.raises(ech.errors.GainError, match="of the graph is beyond all numbers"):
         ech.synthesize(model, graph, ech.gains.Riccati(coupling=1e308))
     assert not [each for each in recwarn if issubclass(each.category, RuntimeWarning)]
 
@@ -415,7 +415,7 @@ def test_a_file_whose_coupling_was_raised_by_hand_is_refused_where_it_is_read(tm
     ech.save_gain(ech.synthesize(model, graph, ech.gains.Riccati()), model, graph, file)
     stored = json.loads(file.read_text())
     file.write_text(json.dumps(stored | {"coupling": 1e200}))
-    with pytest.raises(ech.errors.GainError, match="the feedback is too strong to compute with"):
+    with pytest.raises(ech.errors.GainError, match="the feedback is too large for floats"):
         ech.load_gain(file, model, graph)
 
 

@@ -1,4 +1,4 @@
-"""The inner loop that makes the paper's Assumption 5 hold."""
+"""The inner loop with which the paper's Assumption 5 holds."""
 
 import numpy as np
 import pytest
@@ -126,7 +126,7 @@ def test_weights_replace_the_damping_that_the_model_brings():
 
 def test_an_agent_without_symmetric_states_is_refused():
     graph = ech.Graph.path(3)
-    with pytest.raises(ech.EchelonError, match="`Pendulum` has no state that its dynamics ignore"):
+    with pytest.raises(ech.EchelonError, match="`Pendulum` has no symmetric state"):
         ech.synthesize(ech.models.Pendulum(), graph, ech.gains.InnerLoop())
     with pytest.raises(ech.EchelonError, match="`symmetry_weight` is -1.0, and must be one"):
         ech.synthesize(

@@ -1,4 +1,4 @@
-"""One metric for many Jacobians: closed forms, Riccati equations, and solvers that lie."""
+"""One metric for many Jacobians: closed forms, Riccati equations, solvers with wrong results."""
 
 import itertools
 import sys

@@ -1,4 +1,4 @@
-"""Margins of linear loops: closed forms, and for each a second argument that shares no code."""
+"""Margins of linear loops: closed forms, and a second independent computation for each."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Gains with a promise on a domain, gain files, `check` and `design`."""
+"""Gains with a guarantee on a domain, gain files, `check` and `design`."""
 
 import json
 import sys
@@ -230,7 +230,7 @@ DOMAINS = {
     ),
     "without the trim": (
         {"roll": (0.1, 0.2)},
-        "the domain of `roll` is [0.1, 0.2], and must hold the trim, 0.",
+        "the domain of `roll` is [0.1, 0.2], and must contain the trim, 0.",
     ),
 }
 
@@ -575,7 +575,7 @@ def test_a_gain_file_whose_numbers_are_none_is_refused(tmp_path, name, wrong):
     told = json.loads(file.read_text())
     told["certificate"][name] = wrong
     file.write_text(json.dumps(told))
-    assert "is no gain that echelon wrote" in sentence(lambda: ech.load_gain(file, model, LINE))
+    assert "is no gain file of echelon" in sentence(lambda: ech.load_gain(file, model, LINE))
 
 
 @pytest.mark.parametrize("name", ["rate", "radius", "strength"])

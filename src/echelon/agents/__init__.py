@@ -1,4 +1,4 @@
-"""What there is: vehicles, who hears whom, the paths that leaders follow, and disturbances."""
+"""Agents: models of vehicles, their network, the references of leaders, and disturbances."""
 
 import lazy_loader
 

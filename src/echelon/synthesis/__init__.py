@@ -1,4 +1,4 @@
-"""How a gain is found, and what its certificate proves."""
+"""Synthesis: methods that compute gains, and the certificates of their guarantees."""
 
 import lazy_loader
 

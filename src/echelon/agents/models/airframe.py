@@ -1,4 +1,4 @@
-"""A rigid body in space that four motors move: what certificates of its motors need to know."""
+"""The rigid body of a quadrotor and its motors, as proofs about motor thrusts need it."""
 
 from typing import NamedTuple
 
@@ -11,8 +11,8 @@ class Airframe(NamedTuple):
         inertia: principal moments, kg m^2.
         gravity: m/s^2.
         arm: of each motor along both horizontal body axes, m.
-        torque_per_thrust: N m of yaw torque a newton.
-        motor_thrust: the most of one motor, N; the least is none.
+        torque_per_thrust: yaw torque per thrust, N m / N.
+        motor_thrust: largest thrust of one motor, N; the smallest is 0.
     """
 
     mass: float

@@ -1,4 +1,4 @@
-"""The quadrotor exactly as the paper prints it (literal), kept to show what follows from it."""
+"""The quadrotor exactly as the paper prints it (literal), to show the consequences."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""The unicycle seen at its axle, and the same vehicle seen at a point ahead of it."""
+"""The unicycle described by its axle, and the same vehicle described by a point ahead of it."""
 
 import jax
 import jax.numpy as jnp

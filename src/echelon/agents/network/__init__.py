@@ -1,4 +1,4 @@
-"""Who receives from whom, and where each belongs: graphs and formations."""
+"""The network: communication graphs and formations."""
 
 from echelon.agents.network.formation import Formation
 from echelon.agents.network.graph import Graph

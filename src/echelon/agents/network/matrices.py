@@ -1,4 +1,4 @@
-"""The matrices of a graph, and who receives from whom: what every other property follows from."""
+"""The matrices of a graph and its directed links, from which all other properties follow."""
 
 import abc
 
@@ -16,14 +16,7 @@ from echelon.core.types import Array, States
 class GraphMatrices(abc.ABC):
     """Weighted edges between agents 0 .. N-1, and the matrices that they make; abstract.
 
-    Attributes:
-        edges: (E, 2) integers, each edge once.
-        weights: (E,) positive weights A_ij; of one that switches, the largest.
-        agents: the number N of agents, leaders included.
-        leaders: sorted agent numbers.
-        followers: all other agents, sorted.
-        directed: whether edges carry information one way.
-        schedule: when which weights hold; None where they never change.
+    Its attributes are those of `Graph`.
     """
 
     edges: Array

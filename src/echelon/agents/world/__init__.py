@@ -1,1 +1,1 @@
-"""What the laws do not know: wind, noise, a plant that differs from the model."""
+"""The world of a run: wind, noise and a plant that differs from the model."""

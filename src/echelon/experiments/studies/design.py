@@ -168,7 +168,7 @@ def _is_domain(model: ControlAffine, bounds: Mapping[str, Any]) -> bool:
 
 def _chooses(method: type[Method]) -> bool:
     """Whether a method finds a gain by itself: one that wants a P, say, is no choice of design."""
-    return {*method.needs} <= {"domain", *method.usual}
+    return {*method.needs} <= {"domain", *method.defaults}
 
 
 def recommended(tried: tuple[Design, ...], dt: float) -> Design | None:
@@ -289,10 +289,10 @@ def _arguments(method: type[Method], spec: GainSpec | None, parts: Parts) -> dic
     """Return what the scenario says of this method, and its domain for those that need one."""
     made = spec is not None and spec.file is None and spec.python is None
     if spec is not None and made and spec.method == method.name:
-        return {**method.usual, **spec.arguments}
+        return {**method.defaults, **spec.arguments}
     gain = parts.drive.gain
     claim = None if gain is None else gain.certificate.region
     domain = claim.domain if spec is None and claim is not None else None
     domain = spec.domain if spec is not None else domain
     given = {} if domain is None or "domain" not in method.needs else {"domain": domain}
-    return {**method.usual, **given}
+    return {**method.defaults, **given}

@@ -119,7 +119,7 @@ def _with_inner(parts: Parts, gain: Gain, pairs: DomainPairs) -> DomainPairs | N
     linear = linearize(parts.model)
     # g is constant, so the loop adds the same matrix to every slope.
     closed = pairs.A + (linear.with_inner(gain.inner).A - linear.A)
-    return pairs._replace(A=closed, found=pairs.found._replace(matrices=closed))
+    return pairs._replace(A=closed, jacobians=pairs.jacobians._replace(matrices=closed))
 
 
 def _contraction(

@@ -94,7 +94,7 @@ class Plans(_Optimized):
         """
         settings = problem.settings
         times = grid(settings.horizon, settings.dt, self.options.interval)
-        made = plan_formation(
+        formation_plan = plan_formation(
             problem.model,
             problem.graph,
             problem.formation,
@@ -105,8 +105,9 @@ class Plans(_Optimized):
             limits=settings.limits,
         )
         # One input a hold: the last interval may go beyond the run, and its end is not flown.
-        inputs = np.stack([plan.inputs for plan in made.plans], axis=1)
-        work = made.seconds, made.iterations, made.failures, made.setup_seconds
+        inputs = np.stack([plan.inputs for plan in formation_plan.plans], axis=1)
+        plan = formation_plan
+        work = plan.seconds, plan.iterations, plan.failures, plan.setup_seconds
         stats = solver_stats("optimization", self.options.solver, *work)
         return HostStepper(
             problem, lambda step, _: inputs[step // times.hold], times.hold, lambda: stats

@@ -1,4 +1,4 @@
-"""Plans for a whole formation, made in the order of the graph: each knows those before it."""
+"""Plans for a whole formation: agents plan in the order of the graph, after their neighbours."""
 
 import time
 from collections.abc import Callable
@@ -92,16 +92,16 @@ def plan_formation(
     plans: dict[int, Trajectory] = {}
     for agent, earlier in graph.outward():
         if not earlier:
-            own = shifted_targets(model, targets, formation.offsets[agent])
-            plans[agent] = desk.follow(agent, states[agent], own)
+            goals = shifted_targets(model, targets, formation.offsets[agent])
+            plans[agent] = desk.follow(agent, states[agent], goals)
             continue
-        own = _neighbour_targets(model, graph, formation, agent, {j: plans[j] for j in earlier})
+        goals = _neighbour_targets(model, graph, formation, agent, {j: plans[j] for j in earlier})
         if planning.specification == "offset":
-            plans[agent] = desk.follow(agent, states[agent], own)
+            plans[agent] = desk.follow(agent, states[agent], goals)
         else:
-            places = [plans[j].states for j in earlier]
-            wanted = [formation.displacement(j, agent) for j in earlier]
-            plans[agent] = desk.keep_apart(agent, states[agent], own, places, wanted)
+            neighbours = [plans[j].states for j in earlier]
+            displacements = [formation.displacement(j, agent) for j in earlier]
+            plans[agent] = desk.keep_apart(agent, states[agent], goals, neighbours, displacements)
     order = range(graph.agents)
     return FormationPlan(
         grid,
@@ -171,8 +171,8 @@ class _Desk:
         agent: int,
         start: Array,
         targets: Targets,
-        places: list[Array],
-        wanted: list[Array],
+        neighbours: list[Array],
+        displacements: list[Array],
     ) -> Trajectory:
         """Return the plan of an agent that keeps its distances from neighbours.
 
@@ -180,18 +180,18 @@ class _Desk:
             agent: its number.
             start: its state, (n,).
             targets: where the solver begins.
-            places: the neighbours' states, (T, n) each.
-            wanted: displacements (n,) whose lengths are the distances.
+            neighbours: the neighbours' states, (T, n) each.
+            displacements: displacements (n,) whose lengths are the distances.
         """
         axes = list(self.model.position_indices())
-        distances = np.array([np.linalg.norm(d[axes]) for d in wanted])
+        distances = np.array([np.linalg.norm(d[axes]) for d in displacements])
         # In the key, since the distances are constants of the problem; all else is its data.
         key = ("distances", *distances.tolist())
         self._prepare(
             key, lambda fine: spacing(self.model, self.grid, self.limits, fine, distances)
         )
-        known = np.hstack([p[:, axes] for p in places])
-        return self._plan(agent, key, start, known, targets)
+        positions = np.hstack([p[:, axes] for p in neighbours])
+        return self._plan(agent, key, start, positions, targets)
 
     def _prepare(self, key: tuple[object, ...], pose: Callable[[bool], OptimalControl]) -> None:
         if key in self._ready:
@@ -209,30 +209,30 @@ class _Desk:
         agent: int,
         key: tuple[object, ...],
         start: Array,
-        known: Array,
+        parameters: Array,
         targets: Targets,
     ) -> Trajectory:
-        """Solve on coarse steps, which take most iterations, and go on from there on fine ones."""
+        """Solve on coarse steps, which take most iterations, and then on fine ones."""
         coarsely, finely = self._ready[key]
         self.seconds[agent], self.iterations[agent] = 0.0, 0
-        # Standing where the targets are, but for the start, is near the solution.
+        # The targets, after the start, are near the solution.
         near = (
             np.vstack([start, targets.states[1:]]),
             self.model.physical(targets.inputs[:-1]),
         )
-        plan = self._attempt(agent, coarsely, start, known, targets, near, 1.0)
+        plan = self._attempt(agent, coarsely, start, parameters, targets, near, 1.0)
         # Costly inputs keep the plan by the targets' own, where the problem is nearly quadratic;
         # its solution is then a better place to begin.
         for factor in () if plan.solved else _EASIER:
-            easier = self._attempt(agent, coarsely, start, known, targets, near, factor)
+            easier = self._attempt(agent, coarsely, start, parameters, targets, near, factor)
             near = (easier.states, easier.inputs)
-            plan = self._attempt(agent, coarsely, start, known, targets, near, 1.0)
+            plan = self._attempt(agent, coarsely, start, parameters, targets, near, 1.0)
             if plan.solved:
                 break
         if finely is not None:
-            plan = self._attempt(agent, finely, start, known, targets, plan, 1.0)
-        # By what is missed, not by the solver's word: one that stopped short of its tolerance may
-        # well have found a plan.
+            plan = self._attempt(agent, finely, start, parameters, targets, plan, 1.0)
+        # Judged by the constraints, not by the status of the solver: it may have stopped short of
+        # its tolerance with a valid plan.
         if plan.violations:
             raise PlanError(f"there is no plan for agent {agent}: {plan.message}")
         return plan
@@ -242,14 +242,14 @@ class _Desk:
         agent: int,
         planner: Solver,
         start: Array,
-        known: Array,
+        parameters: Array,
         targets: Targets,
         guess: Trajectory | tuple[Array, Array],
         factor: float,
     ) -> Trajectory:
         # The factor is data, so that the easier problems need no solvers of their own.
-        weight = np.full((len(known), 1), factor * self.planning.input_weight)
-        plan = planner.solve(start, np.hstack([known, targets.inputs, weight]), guess)
+        weight = np.full((len(parameters), 1), factor * self.planning.input_weight)
+        plan = planner.solve(start, np.hstack([parameters, targets.inputs, weight]), guess)
         self.seconds[agent] += plan.seconds
         self.iterations[agent] += plan.iterations
         self.failures += not plan.solved

@@ -91,13 +91,12 @@ class MPC:
         Raises:
             PlanError: they do not fit the model.
         """
-        own_Q, own_R = (np.asarray(own, float) for own in model.weights)
-        own_Q = own_Q * np.where(_output_states(model), 1.0, 1.0 / 25.0)
-        given_Q, given_R = self.state_weight, self.input_weight
-        given_Q = own_Q if given_Q is None else given_Q
-        given_R = own_R / 100.0 if given_R is None else given_R
-        Q = read_weights("state_weight", given_Q, model.state_names)
-        R = read_weights("input_weight", given_R, model.input_names)
+        Q, R = (np.asarray(weights, float) for weights in model.weights)
+        Q = Q * np.where(_output_states(model), 1.0, 1.0 / 25.0)
+        Q = Q if self.state_weight is None else self.state_weight
+        R = R / 100.0 if self.input_weight is None else self.input_weight
+        Q = read_weights("state_weight", Q, model.state_names)
+        R = read_weights("input_weight", R, model.input_names)
         # An input that costs nothing leaves the quadratic program without a unique solution.
         if not (R > 0.0).all():
             raise PlanError(f"`input_weight` is {R.tolist()}, and must be positive.")
@@ -162,28 +161,28 @@ class Horizon:
     def solve(self, start: Array, targets: Course, near: Course) -> Answer:
         """Return the plan from a start (n,), linearized along a course near it."""
         n, m, N = self.n, self.m, self.steps
-        # At the measured start: what is linearized about it is exact in x_0, which is no variable.
+        # About the measured start, so that the equations are exact in x_0, which is no variable.
         states = np.vstack([start, near.states[1:]])
-        matrix, known = self._matrix(states[:N].T, near.inputs.T)
-        wanted = _interleave(targets.inputs, targets.states[1:])
-        equal = np.array(known).T
+        matrix, constants = self._matrix(states[:N].T, near.inputs.T)
+        desired = _interleave(targets.inputs, targets.states[1:])
+        equal = np.array(constants).T
         # Both bounds of an equation are alike; the rows of a step are its motion, then its limits.
         low = np.hstack([equal, np.tile(self._low, (N, 1))]).ravel()
         high = np.hstack([equal, np.tile(self._high, (N, 1))]).ravel()
-        # Said here, since each solver ends in its own way on such data.
-        if not (np.isfinite(equal).all() and np.isfinite(wanted).all()):
+        # Checked here, since solvers fail in different ways on such data.
+        if not (np.isfinite(equal).all() and np.isfinite(desired).all()):
             return Answer(None, "its data is not finite")
-        found = self._solve(
+        solution = self._solve(
             h=self._hessian,
             # 1/2 (w - w*)'H (w - w*) = 1/2 w'H w - (H w*)'w + a constant.
-            g=-(self._weight @ wanted),
+            g=-(self._weight @ desired),
             a=matrix,
             lba=low,
             uba=high,
             x0=_interleave(near.inputs, near.states[1:]),
         )
         stats = self._solve.stats()
-        w = np.array(found["x"]).reshape(N, m + n)
+        w = np.array(solution["x"]).reshape(N, m + n)
         if not stats["success"] or not np.isfinite(w).all():
             return Answer(None, str(stats["return_status"]))
         return Answer(Course(np.vstack([start, w[:, m:]]), w[:, :m]), "")
@@ -191,7 +190,7 @@ class Horizon:
     def shift(self, course: Course, last: Array) -> Course:
         """Return a course one step later, its new last input (m,) given."""
         end = np.array(self._flow(course.states[-1], last)).ravel()
-        # A guess must be finite, however far the model was driven; the next solution mends it.
+        # A guess must be finite; the next solution corrects it.
         end = end if np.isfinite(end).all() else course.states[-1]
         return Course(np.vstack([course.states[1:], end]), np.vstack([course.inputs[1:], last]))
 
@@ -225,10 +224,10 @@ def _limit_rows(model: ControlAffine, limits: bool) -> tuple[Array, Array, Array
         return np.zeros((0, len(model.input_names))), np.zeros(0), np.zeros(0)
     G, low, high = (np.asarray(part, float) for part in model.input_limits)
     # low <= G (u* + S v) <= high, each row by its size: solvers forgive all rows alike.
-    held = G @ np.asarray(model.trim[1], float)
+    at_trim = G @ np.asarray(model.trim[1], float)
     rows = G @ np.asarray(model.input_scale, float)
     size = np.abs(rows).max(axis=1)
-    return rows / size[:, None], (low - held) / size, (high - held) / size
+    return rows / size[:, None], (low - at_trim) / size, (high - at_trim) / size
 
 
 def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple[Any, Any]:
@@ -250,7 +249,7 @@ def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple
     ends, by_state, by_input = slopes.map(steps)(X, V)
     As, Bs = ca.horzsplit(by_state, n), ca.horzsplit(by_input, m)
     width, limit = steps * (n + m), ca.MX(ca.DM(rows))
-    blocks, known = [], []
+    blocks, constants = [], []
     for k in range(steps):
         # x_k stands in the n columns before v_k, and x_0 in none.
         before = max(0, k * (n + m) - n)
@@ -261,8 +260,8 @@ def _assembly(model: ControlAffine, steps: int, dt: float, rows: Array) -> tuple
         # A x + B v - x_next = A x' + B v' - flow(x', v') about the last plan (x', v'); without the
         # terms in x_0, which is x'_0.
         moved = Bs[k] @ V[:, k] - ends[:, k]
-        known += [moved + As[k] @ X[:, k] if k else moved]
-    return flow, ca.Function("equations", [X, V], [ca.vertcat(*blocks), ca.horzcat(*known)])
+        constants += [moved + As[k] @ X[:, k] if k else moved]
+    return flow, ca.Function("equations", [X, V], [ca.vertcat(*blocks), ca.horzcat(*constants)])
 
 
 def _program(ca: Any, mpc: MPC, hessian: Any, matrix: Any) -> Any:

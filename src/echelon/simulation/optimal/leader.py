@@ -118,11 +118,11 @@ class OptimalTracking(Law):
         span = grid(self.horizon, _STEP, self.planning.interval).interval
         # A time that rounding has left just before an interval belongs to it.
         k = jnp.floor(t / span + 1e-4).astype(jnp.int32)
-        held = jnp.clip(k, 0, count - 1)
-        u = jnp.asarray(self.inputs, dtype)[held]
+        interval = jnp.clip(k, 0, count - 1)
+        u = jnp.asarray(self.inputs, dtype)[interval]
         # The plan has states at the ends of intervals. Between them its held input is integrated,
         # since interpolation would lose the order of the method.
-        x, step = jnp.asarray(self.states, dtype)[held], jnp.maximum(t - held * span, 0.0)
+        x, step = jnp.asarray(self.states, dtype)[interval], jnp.maximum(t - interval * span, 0.0)
         x = jax.lax.fori_loop(
             0, _BETWEEN, lambda _, x: rk4(model.velocity, x, u, step / _BETWEEN), x
         )

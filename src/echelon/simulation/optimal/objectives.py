@@ -1,6 +1,6 @@
-"""How the optimization method poses an agent's problem: follow targets, spend little input.
+"""Objectives of the optimization method: follow targets or keep distances, with little input.
 
-A leader's targets are its reference; a follower's are what the plans of its neighbours leave it.
+The targets of a leader are its reference; those of a follower follow from its neighbours' plans.
 """
 
 import dataclasses
@@ -67,8 +67,9 @@ class TrackingOptions:
         Raises:
             PlanError: they do not fit the model.
         """
-        given, names = self.output_weight, model.output_names
-        return read_weights("output_weight", np.ones(len(names)) if given is None else given, names)
+        weights, names = self.output_weight, model.output_names
+        weights = np.ones(len(names)) if weights is None else weights
+        return read_weights("output_weight", weights, names)
 
 
 class PlanTimes(NamedTuple):

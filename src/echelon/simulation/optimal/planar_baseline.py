@@ -120,8 +120,8 @@ class PlanarBaseline:
 
         # Squares, which have derivatives everywhere; a distance has none at zero.
         d = self.distance**2
-        kept = (Constraint("squared distance", apart, d, d),)
-        constraints = kept if self.separation == "constraint" else ()
+        exact = (Constraint("squared distance", apart, d, d),)
+        constraints = exact if self.separation == "constraint" else ()
         return self._problem(stage, terminal, constraints, 6 * neighbours)
 
     def _problem(
@@ -163,11 +163,13 @@ class PlanarBaseline:
                 plans[agent] = solve(self.leader(), starts[agent], self.reference)
                 continue
             first = plans[earlier[0]]
-            known = np.hstack([plans[j].states for j in earlier])
+            parameters = np.hstack([plans[j].states for j in earlier])
             # Flying along with the first neighbour is the guess: it meets all constraints but the
             # distances from others.
             guess = first.states + starts[agent] - starts[earlier[0]], first.inputs
-            plans[agent] = solve(self.follower(len(earlier)), starts[agent], known, guess=guess)
+            plans[agent] = solve(
+                self.follower(len(earlier)), starts[agent], parameters, guess=guess
+            )
         return tuple(plans[agent] for agent in range(graph.agents))
 
     def tracking_rmse(self, states: Array) -> float:

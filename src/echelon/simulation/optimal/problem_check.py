@@ -1,9 +1,8 @@
-"""The numbers and names that problems and solvers are given, checked alike."""
+"""Checks of the numbers and names in the arguments of problems and solvers."""
 
 import math
 import numbers
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -43,19 +42,19 @@ def check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
         raise PlanError(f"`{name}` is `{value}`, allowed are {listing(allowed)}.")
 
 
-def read_weights(name: str, given: Any, owners: Sequence[str]) -> Array:
+def read_weights(name: str, values: object, owners: Sequence[str]) -> Array:
     """Return a weight for each of the owners, float64.
 
     Raises:
         PlanError: they are not as many finite numbers, or one is negative.
     """
     try:
-        weights = np.asarray(given, np.float64)
+        weights = np.asarray(values, np.float64)  # pyright: ignore
     except (TypeError, ValueError):
         weights = np.full(1, np.nan)  # refused below, where the message is
     if weights.shape != (len(owners),) or not (np.isfinite(weights) & (weights >= 0.0)).all():
         raise PlanError(
-            f"`{name}` is {given}, and must be {len(owners)} finite numbers that are not negative, "
-            f"one for each of {listing(owners)}."
+            f"`{name}` is {values}, and must be {len(owners)} finite numbers that are not "
+            f"negative, one for each of {listing(owners)}."
         )
     return weights

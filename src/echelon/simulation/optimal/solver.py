@@ -1,4 +1,4 @@
-"""Plans: what an optimal control problem's solver returns, and how it ended in words."""
+"""The solver of an optimal control problem: the plan, and its status in words."""
 
 import dataclasses
 import time
@@ -53,11 +53,11 @@ def least_violations(program: NonlinearProgram, w: Array, p: Array) -> tuple[Vio
         p: the program's data.
     """
     ca = casadi()
-    own = np.flatnonzero([row.own for row in program.rows])
-    if not len(own):
+    relaxed = np.flatnonzero([row.of_problem for row in program.rows])
+    if not len(relaxed):
         return ()
-    above, below = ca.MX.sym("a", len(own)), ca.MX.sym("b", len(own))
-    place = ca.DM(np.eye(len(program.rows))[:, own])
+    above, below = ca.MX.sym("a", len(relaxed)), ca.MX.sym("b", len(relaxed))
+    place = ca.DM(np.eye(len(program.rows))[:, relaxed])
     elastic = {
         "x": ca.vertcat(program.problem["x"], above, below),
         # The sum of misses and not of squares: it leaves most at zero and so names the few that
@@ -69,7 +69,7 @@ def least_violations(program: NonlinearProgram, w: Array, p: Array) -> tuple[Vio
     quiet = {"print_time": False, "error_on_fail": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     solver = ca.nlpsol("elastic", "ipopt", elastic, quiet)
     # Slacks begin at 1: an interior solver starts off its bounds.
-    free, slack = np.full(len(w), np.inf), np.ones(2 * len(own))
+    free, slack = np.full(len(w), np.inf), np.ones(2 * len(relaxed))
     solution: dict[str, Any] = solver(
         x0=np.concatenate([w, slack]),
         lbx=np.concatenate([-free, 0.0 * slack]),
@@ -82,7 +82,7 @@ def least_violations(program: NonlinearProgram, w: Array, p: Array) -> tuple[Vio
     slacks = np.array(solution["x"]).ravel()[len(w) :]
     g = np.array(solution["g"]).ravel()
     # The elastic row is g - above + below; this is g again.
-    g[own] -= slacks[len(own) :] - slacks[: len(own)]
+    g[relaxed] -= slacks[len(relaxed) :] - slacks[: len(relaxed)]
     return violations(program, g)
 
 
@@ -145,8 +145,8 @@ class Solver:
         self.problem, self.solver = problem, solver
         ca = casadi()
         if not ca.has_nlpsol(solver):
-            known = ("ipopt", "fatrop", "sqpmethod")
-            raise PlanError(f"`solver` is `{solver}`, which CasADi lacks; try {listing(known)}.")
+            common = ("ipopt", "fatrop", "sqpmethod")
+            raise PlanError(f"`solver` is `{solver}`, which CasADi lacks; try {listing(common)}.")
         with precision("float64"):
             check_model(problem.model)
             self.program: NonlinearProgram = transcribe(problem)
@@ -319,8 +319,8 @@ _CONTRADICTION = ("Infeasible_Problem_Detected", "Restoration_Failed")
 def _message(
     solver: str, status: str, solved: bool, missed: tuple[Violation, ...], least: bool
 ) -> str:
-    usual = "Solve_Succeeded" if solved else status
-    words = _WORDS.get(status, _WORDS.get(usual, f"it ended with the status `{status}`"))
+    known_status = "Solve_Succeeded" if solved else status
+    words = _WORDS.get(status, _WORDS.get(known_status, f"it ended with the status `{status}`"))
     ending = f"{solver} {'solved' if solved else 'failed to solve'} the problem: {words}"
     if solved or not missed:
         return f"{ending}."

@@ -17,20 +17,20 @@ from echelon.simulation.optimal.problem import Constraint, OptimalControl
 
 
 class ConstraintRow(NamedTuple):
-    """What one row of the program's constraints says.
+    """One row of the program's constraints.
 
     Attributes:
         name: of the constraint.
         time: at which it holds, s.
         size: by which it is divided. Solvers forgive the same small number in every row, which
             would be much of a torque in N m.
-        own: whether it is one of the problem's constraints, not of the agent.
+        of_problem: whether it is a constraint of the problem, not of the agent.
     """
 
     name: str
     time: float = 0.0
     size: float = 1.0
-    own: bool = False
+    of_problem: bool = False
 
 
 class NonlinearProgram(NamedTuple):
@@ -84,12 +84,12 @@ def transcribe(problem: OptimalControl) -> NonlinearProgram:
     cost += parts.terminal(x[:, -1], p[:, -1])
     gaps = parts.move.map(N)(*ends)
     limits = parts.limit.map(problem.nodes)(v)
-    kept = parts.keep.map(N)(x[:, 1:], p[:, 1:])
+    path = parts.keep.map(N)(x[:, 1:], p[:, 1:])
     # The first state is given, so that no constraint of the problem is put on it.
     first = ca.vertcat(gaps[:, 0], x[:, 0] - start, limits[:, 0])
-    middle = ca.vec(ca.vertcat(gaps[:, 1:], limits[:, 1:N], kept[:, :-1]))
+    middle = ca.vec(ca.vertcat(gaps[:, 1:], limits[:, 1:N], path[:, :-1]))
     closing = [limits[:, -1]] if problem.nodes > N else []
-    last = ca.vertcat(*closing, kept[:, -1], parts.end(x[:, -1], p[:, -1]))
+    last = ca.vertcat(*closing, path[:, -1], parts.end(x[:, -1], p[:, -1]))
     low, high, rows = _rows(problem)
     return NonlinearProgram(
         {
@@ -174,9 +174,9 @@ def _rows(problem: OptimalControl) -> tuple[Array, Array, tuple[ConstraintRow, .
         (low / size, high / size, ConstraintRow(f"actuator limit {j + 1}", size=size))
         for j, (low, high, size) in enumerate(_limits(problem))
     ]
-    kept, ending = (
+    path_rows, ending = (
         [
-            (low, high, ConstraintRow(one.name, own=True))
+            (low, high, ConstraintRow(one.name, of_problem=True))
             for one, f in _constraints(problem)
             if one.end is end
             for low, high in _bounds(one, f.numel_out())
@@ -184,8 +184,8 @@ def _rows(problem: OptimalControl) -> tuple[Array, Array, tuple[ConstraintRow, .
         for end in (False, True)
     )
     steps = [motion + begin + limits]
-    steps += [motion + limits + kept for _ in range(problem.steps - 1)]
-    steps += [(limits if problem.nodes > problem.steps else []) + kept + ending]
+    steps += [motion + limits + path_rows for _ in range(problem.steps - 1)]
+    steps += [(limits if problem.nodes > problem.steps else []) + path_rows + ending]
     table = [
         (low, high, row._replace(time=step * problem.dt))
         for step, rows in enumerate(steps)

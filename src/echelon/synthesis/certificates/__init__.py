@@ -1,4 +1,4 @@
-"""What can be proved of a feedback on a graph and on a domain."""
+"""Certificates: the guarantees of a feedback on a graph and on a domain."""
 
 from echelon.core.words import Kind, Theorem
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate

@@ -1,4 +1,4 @@
-"""What a disturbance can do to a stable linear loop: bounds on each state, mode by mode.
+"""Bounds on the states of a stable linear loop under a disturbance, mode by mode.
 
 Kept apart from the other margins for its own numerics: an ellipsoid that cannot be left, and the
 exact peak gain by quadrature of the impulse response.
@@ -31,12 +31,12 @@ def invariant_ellipsoid(loop: ClosedLoop, E: Array, bound: float = 1.0) -> Array
     limit = -2.0 * float(np.linalg.eigvals(closed).real.max())
 
     def squares(alpha: float) -> Array:
-        found = np.zeros(n)
+        largest = np.zeros(n)
         for T, Q in forms:
             S, F = T + 0.5 * alpha * np.eye(n), Q.T @ E
             Y, scale, _ = solve(S, S, -(F @ F.T) / alpha, tranb="T")
-            found = np.maximum(found, np.einsum("ij,jk,ik->i", Q, Y / scale, Q))
-        return found
+            largest = np.maximum(largest, np.einsum("ij,jk,ik->i", Q, Y / scale, Q))
+        return largest
 
     ends = (1e-9 * limit, (1.0 - 1e-9) * limit)
     return bound * np.sqrt([lowest(lambda a, j=j: squares(a)[j], *ends).fun for j in range(n)])

@@ -1,4 +1,4 @@
-"""A domain: the box of states and inputs on which a certificate is wanted."""
+"""A domain: the box of states and inputs on which a certificate holds."""
 
 import numbers
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ class Domain:
     """
 
     def __init__(self, lower: Array, upper: Array, input_lower: Array, input_upper: Array) -> None:
-        """Keep the bounds, read-only."""
+        """Store the bounds, read-only."""
         self.lower, self.upper = np.array(lower, float), np.array(upper, float)
         self.input_lower, self.input_upper = (
             np.array(input_lower, float),
@@ -38,12 +38,12 @@ class Domain:
 
     @classmethod
     def about(cls, model: ControlAffine, bounds: Mapping[str, Bound]) -> "Domain":
-        """Return the box with the given bounds, by state, group or input name.
+        """Return the box with bounds by state, group or input name.
 
         Args:
-            model: gives the names, the trim and the chart.
+            model: defines the names, the trim and the chart.
             bounds: a half-width, or (lower, upper), in the state's unit or that of the normalized
-                input. A state not named is unbounded, an input not named is held at the trim.
+                input. Other states are unbounded, other inputs are those of the trim.
 
         Raises:
             GainError: a name is unknown, a bound is empty, inverted or leaves the model's chart.
@@ -63,7 +63,7 @@ class Domain:
 
     def sample(self, count: int, seed: int = 0, free: float = 1.0) -> tuple[Array, Array]:
         """Return random deviations (count, n) and inputs (count, m); unbounded states in +-free."""
-        # Seeded, so that a promise by samples can be checked again.
+        # Seeded, so that a guarantee by samples can be checked again.
         random = np.random.default_rng(seed)
         low = np.where(np.isfinite(self.lower), self.lower, -free)
         high = np.where(np.isfinite(self.upper), self.upper, free)
@@ -102,7 +102,7 @@ class Domain:
         return self.lower, self.upper
 
     def margins(self) -> Array:
-        """Return (n,) how far each state may deviate from the trim to both sides."""
+        """Return (n,) the deviation from the trim that each state may have to both sides."""
         # The certified set is symmetric about the trim, so the nearer bound counts.
         return np.minimum(self.upper, -self.lower)
 
@@ -123,7 +123,7 @@ def _interval(name: str, bound: Bound) -> tuple[float, float]:
         )
     if not low <= 0.0 <= high:
         raise GainError(
-            f"the domain of `{name}` is [{low:g}, {high:g}], and must hold the trim, 0."
+            f"the domain of `{name}` is [{low:g}, {high:g}], and must contain the trim, 0."
         )
     return float(low), float(high)
 

@@ -1,4 +1,4 @@
-"""What the methods that promise something on a domain have in common."""
+"""Metrics on a domain: what the methods with a guarantee on a domain share."""
 
 from collections.abc import Mapping
 from fractions import Fraction
@@ -22,22 +22,22 @@ from echelon.synthesis.certificates.jacobians import (
 )
 from echelon.synthesis.certificates.lmi import rate_of
 
-# The exact proof is of a rate a little below the one that eigenvalues show, for their rounding.
+# The exact proof uses a rate slightly below that of the eigenvalues, because of their rounding.
 _SAFE = 1.0 - 1e-6
 
 
 class DomainPairs(NamedTuple):
-    """What a gain must contract on a domain.
+    """The matrices that a gain must contract on a domain.
 
     Attributes:
-        domain: where.
-        found: the Jacobians there, with their W to the right where g varies.
+        domain: of the states and inputs.
+        jacobians: the Jacobians there, with their W to the right where g varies.
         A: (K, n, n), the Jacobians alone.
         W: (K, n, n), W_k = g S R^-1 (g S)' enclosed with A_k; None where g is constant.
     """
 
     domain: Domain
-    found: Jacobians
+    jacobians: Jacobians
     A: Array
     W: Array | None
 
@@ -59,7 +59,7 @@ def the_domain(model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None
 def pairs_on(
     model: ControlAffine, bounds: Mapping[str, Bound] | Domain | None, R: Array
 ) -> DomainPairs:
-    """Return what a gain must contract on a method's domain, with R (m, m).
+    """Return the matrices that a gain must contract on a method's domain, with R (m, m).
 
     Raises:
         GainError: there is no domain, it does not fit the model, or it leaves unbounded a state
@@ -67,11 +67,11 @@ def pairs_on(
     """
     domain = the_domain(model, bounds)
     if has_constant_input_map(model, domain):
-        found = jacobians(model, domain)
-        return DomainPairs(domain, found, found.matrices, None)
-    found = weighted_jacobians(model, domain, R)
-    A, W = np.split(found.matrices, 2, axis=2)
-    return DomainPairs(domain, found, A, W)
+        hull = jacobians(model, domain)
+        return DomainPairs(domain, hull, hull.matrices, None)
+    hull = weighted_jacobians(model, domain, R)
+    A, W = np.split(hull.matrices, 2, axis=2)
+    return DomainPairs(domain, hull, A, W)
 
 
 def contracting_region(
@@ -83,19 +83,19 @@ def contracting_region(
     coupling: float,
     spectrum: Spectrum,
 ) -> RegionCertificate | None:
-    """Return what a metric promises on a domain; None where it contracts at no rate there.
+    """Return the guarantee of a metric on a domain; None where it contracts at no rate there.
 
     Args:
-        pairs: what it contracts.
+        pairs: the matrices that it contracts.
         P: metric (n, n).
         B: input matrix at the trim (n, m).
         R: weight of the normalized input (m, m).
         exact: whether to prove it in rational arithmetic (seconds), where a hull is at hand and g
             is constant.
         coupling: c.
-        spectrum: whose smallest eigenvalue makes the strength 2 c lambda_min.
+        spectrum: its smallest eigenvalue enters the strength 2 c lambda_min.
     """
-    domain, found, A, W = pairs
+    domain, hull, A, W = pairs
     strength, constant = 2.0 * coupling * spectrum.proved, W is None
     if not strength > 0.0:
         return None
@@ -104,24 +104,24 @@ def contracting_region(
     rate = rate_of(P, A, B, R, strength) if W is None else rate_of(P, A - 0.5 * strength * W @ P)
     if rate <= 0.0:
         return None
-    kind, why = found.kind, found.why
+    kind, why = hull.kind, hull.why
     if exact and constant and kind is Kind.VERTICES:
-        shown = float(Fraction(rate * _SAFE).limit_denominator(10**6))
+        proved_rate = float(Fraction(rate * _SAFE).limit_denominator(10**6))
         # B R^-1 B' as a product of a matrix with its own transpose, the form that the proof takes.
         weighted = B @ np.linalg.cholesky(np.linalg.inv(R))
-        proof = prove_contraction(A, found.error, weighted, P, strength, shown)
-        kind, rate = (Kind.PROOF, shown) if proof.holds else (kind, rate)
+        proof = prove_contraction(A, hull.error, weighted, P, strength, proved_rate)
+        kind, rate = (Kind.PROOF, proved_rate) if proof.holds else (kind, rate)
         why = "" if proof.holds else f"exact arithmetic does not confirm corner {proof.failed}"
     return RegionCertificate(
         kind=kind,
         rate=rate,
         theorem=Theorem.T1 if constant else Theorem.T2,
         domain=domain,
-        # Where g varies the promise is of small errors, and none of a set.
+        # Where g varies the guarantee holds for small errors only, not on a set.
         radius=radius(domain, P, spectrum.skew) if constant else None,
         strength=strength,
-        hull=found.matrices,
-        error=found.error,
+        hull=hull.matrices,
+        error=hull.error,
         why=why,
     )
 
@@ -129,14 +129,14 @@ def contracting_region(
 def drift_region(
     model: ControlAffine,
     domain: Domain,
-    found: Jacobians,
+    hull: Jacobians,
     P: Array,
     coupling: float,
     spectrum: Spectrum,
 ) -> RegionCertificate | None:
-    """Return what a metric (n, n) promises that the drift expands at none of its Jacobians.
+    """Return the guarantee of a metric (n, n) that the drift expands at none of its Jacobians.
 
-    It is the same for every coupling; None where the graph lets no sum of squares stay.
+    It is the same for every coupling; None where no sum of squares is nonincreasing on the graph.
     """
     varies = not has_constant_input_map(model, domain)
     if not spectrum.proved > 0.0 or (varies and not spectrum.symmetric):
@@ -147,23 +147,23 @@ def drift_region(
         # lambda_min S <= V <= lambda_max S.
         reach *= float(np.sqrt(spectrum.proved / spectrum.high))
     return RegionCertificate(
-        kind=found.kind,
+        kind=hull.kind,
         rate=0.0,
         theorem=Theorem.A5,
         domain=domain,
         radius=reach,
         strength=0.0,
-        hull=found.matrices,
-        error=found.error,
-        why=found.why,
+        hull=hull.matrices,
+        error=hull.error,
+        why=hull.why,
     )
 
 
 def radius(domain: Domain, P: Array, skew: float = 1.0) -> float | None:
     """Return r with {delta'P delta <= r^2} inside the domain: r^2 = min_j margin_j^2 / W_jj.
 
-    What falls on a directed graph is a sum with weights, which one agent's share may exceed by
-    their skew.
+    On a directed graph a weighted sum decreases, and the share of one agent may exceed it by the
+    ratio of the weights.
     """
     # delta_j reaches r sqrt(W_jj) on {delta'P delta <= r^2}, by Cauchy and Schwarz in the metric P.
     margins, W = domain.margins(), np.linalg.inv(P)

@@ -164,15 +164,15 @@ def prove_contraction(
     weight, speed = _scale(rho, "rho"), _scale(rate, "rate")
     if weight.integers[()] < 0 or (slack.integers < 0).any():
         raise GainError("`rho` and `error` must not be negative.")
-    found = _definiteness(metric)
-    smallest, proved, failed = found.pivot, int(found.holds), None if found.holds else -1
+    definite = _definiteness(metric)
+    smallest, proved, failed = definite.pivot, int(definite.holds), None if definite.holds else -1
     # The same for all vertices, so that each costs one product and one elimination.
     constant = _constant_part(metric, slack, _scale(B, "B"), weight, speed)
-    for number, vertex in enumerate(vertices) if found.holds else ():
+    for number, vertex in enumerate(vertices) if definite.holds else ():
         drift = metric.times(_scale(vertex, "vertices"))
-        found = _definiteness(constant.minus(drift.plus(drift.transpose())))
-        smallest = min(smallest, found.pivot)
-        if not found.holds:
+        definite = _definiteness(constant.minus(drift.plus(drift.transpose())))
+        smallest = min(smallest, definite.pivot)
+        if not definite.holds:
             failed = number
             break
         proved += 1
@@ -185,10 +185,10 @@ def _constant_part(
     """Return rho P B B'P - 2 rate P minus the diagonal that errors of A may add."""
     gain = metric.times(B)
     feedback = gain.times(gain.transpose()).times(weight)
-    wanted = metric.times(speed)
+    decay = metric.times(speed)
     spread = metric.absolute().times(slack)
     lost = spread.plus(spread.transpose()).row_sums()
-    return feedback.minus(wanted.plus(wanted)).minus(lost)
+    return feedback.minus(decay.plus(decay)).minus(lost)
 
 
 def _check_shapes(vertices: Array, error: Array, B: Array, P: Array) -> None:
@@ -200,8 +200,8 @@ def _check_shapes(vertices: Array, error: Array, B: Array, P: Array) -> None:
         "B": (np.shape(B), (n, *np.shape(B)[1:2])),
         "P": (np.shape(P), (n, n)),
     }
-    for name, (got, wanted) in shapes.items():
-        if got != wanted or name == "B" and len(got) != 2:
+    for name, (got, expected) in shapes.items():
+        if got != expected or name == "B" and len(got) != 2:
             raise GainError(f"`{name}` has shape {got}, and must fit the {n} states of `P`.")
     if not len(vertices):
-        raise GainError("`vertices` is empty, and nothing can be proved of no matrix.")
+        raise GainError("`vertices` is empty, and must hold at least one matrix.")

@@ -1,4 +1,4 @@
-"""The Jacobians of a model on a domain: a hull that holds them all, or else samples of them."""
+"""The Jacobians of a model on a domain: a hull that contains all, or else samples of them."""
 
 from collections.abc import Callable
 from fractions import Fraction
@@ -26,9 +26,9 @@ _OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 class Jacobians(NamedTuple):
     """Matrices A with xdot = A x near each state of a domain.
 
-    `kind` says what they stand for: vertices of a polytope that holds every Jacobian, up to
-    `error` (n, n) entry by entry, or samples taken at random in the domain and at its corners.
-    `why` says what kept samples from being vertices.
+    `kind` is either vertices of a polytope that contains every Jacobian, up to `error` (n, n) entry
+    by entry, or samples, at random in the domain and at its corners. `why` is the reason for
+    samples instead of vertices.
     """
 
     matrices: Array
@@ -93,17 +93,17 @@ def _enclose(
             # Samples would hardly meet the jump, and JAX's derivative there is 0.
             raise
         except GainError as error:
-            found, why = sample_jacobians(model, domain, velocity, weight), str(error).rstrip(".")
-            return _freeze(Jacobians(found, np.zeros(found.shape[1:]), Kind.SAMPLES, why))
+            samples, why = sample_jacobians(model, domain, velocity, weight), str(error).rstrip(".")
+            return _freeze(Jacobians(samples, np.zeros(samples.shape[1:]), Kind.SAMPLES, why))
         check_secants(model, domain, velocity, hull)
     return _freeze(Jacobians(hull.vertices, hull.error, Kind.VERTICES))
 
 
-def _freeze(found: Jacobians) -> Jacobians:
-    """Return Jacobians that nobody can write to, since many callers share them."""
-    for array in (found.matrices, found.error):
+def _freeze(result: Jacobians) -> Jacobians:
+    """Return the Jacobians with read-only arrays, which many callers share."""
+    for array in (result.matrices, result.error):
         array.setflags(write=False)
-    return found
+    return result
 
 
 @memoize
@@ -113,12 +113,12 @@ def has_constant_input_map(model: ControlAffine, domain: Domain) -> bool:
     def entries(x: jax.Array, v: jax.Array) -> jax.Array:
         return model.normalized_input_map(x).reshape(-1)
 
-    found = _constant_columns(entries, *_boxes(model, domain))
-    return found is not None and bool(found.all())
+    constant = _constant_columns(entries, *_boxes(model, domain))
+    return constant is not None and bool(constant.all())
 
 
 def offsets_are_symmetries(model: ControlAffine, domain: Domain, offsets: Array) -> bool:
-    """Tell whether f and g are proved not to notice the offsets (N, n) of a formation on a domain.
+    """Tell whether f and g are proved invariant under offsets (N, n) of a formation on a domain.
 
     f(x + d) = f(x), and g likewise, wherever x lies in the domain: f and g have the slope 0 in
     every state that d moves, from x to x + d.
@@ -126,26 +126,26 @@ def offsets_are_symmetries(model: ControlAffine, domain: Domain, offsets: Array)
     moved = (offsets != offsets[0]).any(axis=0)
     away = offsets - offsets[0]
     low, high = np.minimum(away.min(axis=0), 0.0), np.maximum(away.max(axis=0), 0.0)
-    # Agents stand in the domain, and their goals' places without offsets within reach of them.
+    # Agents are in the domain; the states without offsets are in the domain shifted by offsets.
     wider = Domain(domain.lower - high, domain.upper - low, domain.input_lower, domain.input_upper)
 
     def entries(x: jax.Array, v: jax.Array) -> jax.Array:
         return jnp.concatenate([model.drift(x), model.input_map(x).reshape(-1)])
 
-    found = _constant_columns(entries, *_boxes(model, wider))
-    return found is not None and bool(found[moved].all())
+    constant = _constant_columns(entries, *_boxes(model, wider))
+    return constant is not None and bool(constant[moved].all())
 
 
 def _constant_columns(function: _OfState, states: Box, inputs: Box) -> Array | None:
-    """Return (n,) in which states a function is proved to have no slope; None for no enclosure."""
-    found = np.zeros(len(states.lower), bool)
+    """Return (n,) the states in which a function is proved constant; None without an enclosure."""
+    constant = np.zeros(len(states.lower), bool)
     try:
         with precision("float64"):
             zero = slope_columns(function, states, inputs)
     except GainError:
         return None
-    found[list(zero)] = True
-    return found
+    constant[list(zero)] = True
+    return constant
 
 
 def _boxes(model: ControlAffine, domain: Domain) -> tuple[Box, Box]:

@@ -84,12 +84,12 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
         GainError: a mode forbids it, and is named, or no such P was found.
         MissingExtraError: cvxpy or clarabel is not installed.
     """
-    As, found = vertices_of(As), obstacle(As)
-    if found is not None:
-        along = listing(names[i] if names else f"x{i + 1}" for i in found.states)
-        kind = "a Jordan block on the imaginary axis" if found.defective else "an unstable mode"
-        mode = f"{eigenvalue_text(found.eigenvalue)} 1/s along {along}"
-        what = f"matrix {found.vertex} has {kind}, at {mode}"
+    As, forbidden = vertices_of(As), obstacle(As)
+    if forbidden is not None:
+        along = listing(names[i] if names else f"x{i + 1}" for i in forbidden.states)
+        kind = "a Jordan block on the imaginary axis" if forbidden.defective else "an unstable mode"
+        mode = f"{eigenvalue_text(forbidden.eigenvalue)} 1/s along {along}"
+        what = f"matrix {forbidden.vertex} has {kind}, at {mode}"
         raise GainError(
             f"no P > 0 keeps this drift from expanding: {what}; damp it by an inner loop, shrink "
             "the domain, or take a method with feedback."
@@ -110,9 +110,9 @@ def monotone(As: Array, condition_max: float = 1e4, names: Sequence[str] | None 
             f"vertex of {len(As)} expands, though none alone forbids it; shrink the domain, add "
             "damping by an inner loop, or take a method with feedback."
         )
-    found = _measure(P / np.linalg.eigvalsh(P)[0], As, None, 0.0)
-    # A drift that only must not grow is promised no rate; what is below 0 is rounding.
-    return found._replace(rate=max(0.0, found.rate))
+    metric = _measure(P / np.linalg.eigvalsh(P)[0], As, None, 0.0)
+    # The inequality guarantees no rate; a rate below 0 is rounding.
+    return metric._replace(rate=max(0.0, metric.rate))
 
 
 def robust_lqr(As: Array, B: Array, Q: Array, R: Array, W: Array | None = None) -> Metric:

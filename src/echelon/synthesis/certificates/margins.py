@@ -1,4 +1,4 @@
-"""How far a stable linear loop is from losing what it promises.
+"""Robustness margins of a stable linear loop: gain, delay, input scaling, string stability.
 
 The law u = -c R^-1 B'P z splits over the eigenvectors of the grounded Laplacian into the modes
 A - c lambda B K, K = R^-1 B'P, one for each of its eigenvalues lambda; those of a directed graph
@@ -100,9 +100,9 @@ def modes(loop: ClosedLoop) -> Array:
 
 def stiffness(loop: ClosedLoop) -> float:
     """Return how many times as fast as the slowest mode decays the fastest moves; inf if none."""
-    found = np.linalg.eigvals(loop.A - loop.strengths[:, None, None] * (loop.B @ loop.K))
-    slowest = -float(found.real.max())
-    return float(np.abs(found).max()) / slowest if slowest > 0.0 else np.inf
+    eigenvalues = np.linalg.eigvals(loop.A - loop.strengths[:, None, None] * (loop.B @ loop.K))
+    slowest = -float(eigenvalues.real.max())
+    return float(np.abs(eigenvalues).max()) / slowest if slowest > 0.0 else np.inf
 
 
 def gain_margin(loop: ClosedLoop) -> GainMargin:
@@ -120,10 +120,10 @@ def gain_margin(loop: ClosedLoop) -> GainMargin:
     G, strengths = loop.B @ loop.K, loop.strengths
     real = np.real(strengths[np.imag(strengths) == 0.0])
     edges = _crossings(loop.A, G, _FAR * real[-1]) if len(real) else real
-    found = [_ends(loop.A, G, float(k), edges) for k in real]
+    ranges = [_ends(loop.A, G, float(k), edges) for k in real]
     for k in strengths[np.imag(strengths) != 0.0]:
-        found.append(_ends(loop.A, k * G, 1.0, _crossings(loop.A, k * G, _FAR)))
-    low, high = max(each[0] for each in found), min(each[1] for each in found)
+        ranges.append(_ends(loop.A, k * G, 1.0, _crossings(loop.A, k * G, _FAR)))
+    low, high = max(ends[0] for ends in ranges), min(ends[1] for ends in ranges)
     return GainMargin(low if low > 1.0 / _FAR else 0.0, high if high < 0.999 * _FAR else np.inf)
 
 
@@ -172,8 +172,8 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
     def loci(w: Array) -> Array:
         # Times i w all are of one size, and real where A is nothing: LAPACK's sweeps do not end on
         # some multiples of i that are almost one of the identity.
-        turned = 1j * w[:, None, None]
-        mu = np.linalg.eigvals(turned * (K @ _resolvent(loop.A, w, loop.B))) / turned[:, 0]
+        rotated = 1j * w[:, None, None]
+        mu = np.linalg.eigvals(rotated * (K @ _resolvent(loop.A, w, loop.B))) / rotated[:, 0]
         return np.take_along_axis(mu, np.abs(mu).argsort(-1), -1)
 
     def size(w: float, i: int, at: float = 0.0) -> float:
@@ -195,8 +195,8 @@ def delay_margin(loop: ClosedLoop) -> DelayMargin:
             # Loci that cross together share the size and differ in phase: the first one counts.
             mu = mu[np.abs(np.abs(mu * k) - 1.0) < 1e-6]
             phases = np.angle(-np.outer([k, np.conj(k)], mu)) % (2.0 * np.pi)
-            found = DelayMargin(float(phases.min() / w), float(w), k / loop.coupling)
-            best = min(best, found, key=lambda each: each.delay)
+            margin = DelayMargin(float(phases.min() / w), float(w), k / loop.coupling)
+            best = min(best, margin, key=lambda m: m.delay)
     return best
 
 
@@ -224,8 +224,8 @@ def input_scaling(
         closed = plant - loop.coupling * values[:, None, None] * (B * np.array(scales) @ K)
         abscissas = np.linalg.eigvals(closed).real.max(1)
         at = int(abscissas.argmax())
-        found = InputScaling(float(abscissas[at]), scales, values[at])
-        worst = max(worst, found, key=lambda each: each.abscissa)
+        margin = InputScaling(float(abscissas[at]), scales, values[at])
+        worst = max(worst, margin, key=lambda m: m.abscissa)
     return worst
 
 
@@ -259,15 +259,15 @@ def detectability(A: Array, C: Array) -> list[HiddenMode]:
     """
     hidden, size = _unobservable(A, C), float(np.linalg.norm(A, 2)) or 1.0
     inner, tiny = hidden.T @ A @ hidden, _HIDDEN * size
-    values, found = np.linalg.eigvals(inner), list[HiddenMode]()
+    values, modes = np.linalg.eigvals(inner), list[HiddenMode]()
     for value in values:
         # Rounding scatters the eigenvalues of a Jordan block around their mean, which stays put.
         centre = values[np.abs(values - value) <= 1e-3 * size].mean()
         nulls = [(s, _null_space(inner - s * np.eye(len(inner)), tiny)) for s in (centre, value)]
         s, null = nulls[0] if nulls[0][1].size else nulls[1]
-        if s.real >= -tiny and all(abs(s - m.eigenvalue) > 1e-6 * size for m in found):
-            found += [HiddenMode(complex(s), v) for v in _sparse(hidden @ null).T]
-    return found
+        if s.real >= -tiny and all(abs(s - m.eigenvalue) > 1e-6 * size for m in modes):
+            modes += [HiddenMode(complex(s), v) for v in _sparse(hidden @ null).T]
+    return modes
 
 
 def _edge(decays: Callable[[float], bool], k: float, edges: Array, end: float) -> float:
@@ -349,12 +349,12 @@ def _unobservable(A: Array, C: Array) -> Array:
     rows = np.linalg.norm(C, axis=1, keepdims=True)
     basis = _null_space(C / np.where(rows > 0.0, rows, 1.0), _HIDDEN)
     while basis.shape[1]:
-        # What A leads out of the subspace; the directions without it are kept, until all are.
+        # The part of A that leaves the subspace; directions without one remain, until all do.
         leak = A @ basis - basis @ (basis.T @ A @ basis)
-        kept = _null_space(leak, _HIDDEN * float(np.linalg.norm(A, 2)))
-        if kept.shape[1] == basis.shape[1]:
+        inside = _null_space(leak, _HIDDEN * float(np.linalg.norm(A, 2)))
+        if inside.shape[1] == basis.shape[1]:
             break
-        basis = basis @ kept
+        basis = basis @ inside
     return basis
 
 

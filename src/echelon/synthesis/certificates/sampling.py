@@ -1,4 +1,4 @@
-"""What samples of a model on a domain say: its Jacobians, and whether a hull holds its secants."""
+"""Samples of a model on a domain: its Jacobians, and a check of a hull by secants."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -17,14 +17,14 @@ from echelon.synthesis.certificates.domain import Domain
 _SAMPLES = 400
 _SEGMENTS = 64
 _FEW = 7
-"""Up to so many bounded states and inputs, every corner of a domain is among the samples."""
+"""Largest number of bounded states and inputs for which every corner is sampled."""
 _FAR = (3.0, -3.0, 40.0, -40.0, 1e3, -1e3)
-"""How far an open state is moved: no multiple of pi, so that no sine hides its state."""
+"""Changes of an unbounded state; no multiples of pi, at which a sine would not change."""
 _OfState: TypeAlias = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 def unbounded_error(model: ControlAffine, name: str) -> GainError:
-    """Return what is said of a domain that leaves open a state on which the slopes depend."""
+    """Return the error of a domain that leaves a state unbounded on which the slopes depend."""
     return GainError(
         f"the domain leaves `{name}` unbounded, and the Jacobian of "
         f"`{type(model).__name__}` depends on it; give it a bound."
@@ -52,20 +52,23 @@ def sample_jacobians(
         return jnp.concatenate([jacobian, weight(z[:n], z[n:])], axis=1)
 
     at = jax.jit(jax.vmap(matrix))
-    found = np.asarray(at(jnp.asarray(base + both)))
-    _check_finite(model, base + both, found)
+    samples = np.asarray(at(jnp.asarray(base + both)))
+    _check_finite(model, base + both, samples)
     for k in np.flatnonzero(~np.isfinite(domain.lower) | ~np.isfinite(domain.upper)):
         for far in _FAR:
             moved = base + both + np.where(np.arange(len(base)) == k, far, 0.0)
-            if np.abs(np.asarray(at(jnp.asarray(moved))) - found).max() > 1e-12 * abs(found).max():
+            if (
+                np.abs(np.asarray(at(jnp.asarray(moved))) - samples).max()
+                > 1e-12 * abs(samples).max()
+            ):
                 raise unbounded_error(model, model.state_names[k])
     _check_samples(model, base + inside, velocity)
-    return found
+    return samples
 
 
-def _check_finite(model: ControlAffine, points: Array, found: Array) -> None:
+def _check_finite(model: ControlAffine, points: Array, matrices: Array) -> None:
     """Refuse matrices (K, n, n) that are not numbers, at points (K, n + m)."""
-    bad = np.flatnonzero(~np.isfinite(found).all(axis=(1, 2)))
+    bad = np.flatnonzero(~np.isfinite(matrices).all(axis=(1, 2)))
     if len(bad):
         names = (*model.state_names, *model.input_names)
         pairs = zip(names, points[bad[0]].tolist(), strict=True)

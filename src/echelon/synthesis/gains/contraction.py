@@ -1,4 +1,4 @@
-"""The weakest feedback that contracts at a wanted rate on a domain, with one constant metric."""
+"""The weakest feedback that contracts at a required rate on a domain, with a constant metric."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -21,17 +21,17 @@ class Contraction(Method):
     Args:
         domain: half-widths, or (lower, upper), by state, group or normalized input.
         rate: alpha, 1/s.
-        coupling: c > 0; what the inequality needs when left out, 1 where it needs none.
+        coupling: c > 0; by default what the inequality needs, 1 where it needs none.
         exact: whether to prove the rate in exact arithmetic where g is constant (seconds).
     """
 
     name = "contraction"
     needs = ("domain", "rate")
-    usual = {"rate": 0.1}
-    headroom = 1.0  # the least rho is what it is for
+    defaults = {"rate": 0.1}
+    headroom = 1.0  # the method minimizes rho
 
     domain: Mapping[str, Bound] | Domain | None = None
-    rate: float = usual["rate"]
+    rate: float = defaults["rate"]
     exact: bool = True
 
     def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
@@ -41,9 +41,9 @@ class Contraction(Method):
             GainError: there is no such metric, or the domain does not fit.
             MissingExtraError: the solver is not installed.
         """
-        # The inequality weighs no input against a state, and normalized inputs are of like size.
+        # The inequality does not weigh inputs against states; normalized inputs have similar size.
         R, B = np.eye(len(model.input_names)), linear.B
         pairs = pairs_on(model, self.domain, R)
-        # The rate at rho itself is left: the region measures it at the strength chosen.
+        # The region measures the rate at the strength chosen, so the rate at rho is not needed.
         P, rho, *_ = contraction(pairs.A, B, self.rate, W=pairs.W)
         return Feedback(P, R, rho, partial(contracting_region, pairs, P, B, R, self.exact))

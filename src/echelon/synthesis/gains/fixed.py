@@ -1,4 +1,4 @@
-"""A gain of one's own; with P = I and c = 1 it is the paper's (literal)."""
+"""A gain from the user's matrices; with P = I and c = 1 it is the paper's (literal)."""
 
 from typing import Literal
 
@@ -12,12 +12,12 @@ from echelon.synthesis.gains.gain import Feedback, Method
 
 
 class FixedGain(Method):
-    """The user's own P, with no promise beyond what its linearization shows.
+    """The user's P, with no guarantee beyond that of its linearization.
 
     Args:
         P: n numbers (a diagonal), (n, n), or "identity".
-        R: weight of the normalized input, m numbers or (m, m); the identity when left out.
-        coupling: c > 0; 1 when left out.
+        R: weight of the normalized input, m numbers or (m, m); the identity by default.
+        coupling: c > 0; 1 by default.
     """
 
     name = "given"
@@ -27,14 +27,14 @@ class FixedGain(Method):
     R: Weight | None = None
 
     def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
-        """Return P and R as they were given.
+        """Return the user's P and R.
 
         Raises:
             GainError: P or R has another size, or P is a word other than `identity`.
         """
         m = len(model.input_names)
         R = np.eye(m) if self.R is None else as_matrix("R", self.R, m)
-        # No inequality stands behind this P, so that no coupling is known to be enough.
+        # No inequality holds for this P in general, so no coupling is known to suffice.
         return Feedback(self._matrix(len(model.state_names)), R, rho=None)
 
     def _matrix(self, n: int) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""What a synthesis returns, the gain that the law runs with, and the interface of its methods.
+"""The gain of the consensus law, the interface of synthesis methods, and `synthesize`.
 
-A method knows one agent and finds P and R; the graph has a say in the coupling alone, by the
-smallest eigenvalue of its spectrum.
+A method computes P and R from one agent; the graph enters only the coupling, by the smallest
+eigenvalue of its spectrum.
 """
 
 import abc
@@ -31,18 +31,18 @@ from echelon.core.types import Array, Input, Scalar, State
 from echelon.synthesis.certificates.certificate import Certificate, RegionCertificate, certify
 
 Region: TypeAlias = Callable[[float, Spectrum], RegionCertificate | None]
-"""From the coupling and the spectrum to what is promised on a domain."""
+"""From the coupling and the spectrum to the guarantee on a domain."""
 
 
 class Gain(eqx.Module):
-    """Everything that the consensus law u = u_ff - c R^-1 g'P z needs; float64 NumPy.
+    """The parameters of the consensus law u = u_ff - c R^-1 g'P z; float64 NumPy.
 
     Attributes:
         P: (n, n) symmetric positive definite, acting on states.
         R: (m, m) symmetric positive definite, acting on normalized inputs.
         coupling: c > 0.
         method: the name of the synthesis.
-        certificate: what is promised.
+        certificate: what is guaranteed.
         inner: (m, n) feedback K of an inner loop, v = -K (x - x*) + the law above; None without.
 
     Raises:
@@ -54,7 +54,7 @@ class Gain(eqx.Module):
     coupling: float
     method: str = eqx.field(static=True)
     certificate: Certificate
-    # Kept, so that no step of a run solves with R, and a float32 run does not invert in float32.
+    # Stored, so that no step of a run solves with R, and a float32 run does not invert in float32.
     R_inverse: Array
     inner: Array | None
 
@@ -67,7 +67,7 @@ class Gain(eqx.Module):
         certificate: Certificate,
         inner: Array | None = None,
     ) -> None:
-        """Refuse P or R not symmetric positive definite, and a coupling that is not positive."""
+        """Reject P or R not symmetric positive definite, and a coupling that is not positive."""
         check_definite("P", P)
         check_definite("R", R)
         check_coupling(coupling)
@@ -76,14 +76,14 @@ class Gain(eqx.Module):
         self.inner = inner
 
     def inner_loop(self, model: ControlAffine, x: State, heading: Scalar | None = None) -> Input:
-        """Return kappa(x) = -K (x - x*), the inner loop, about a heading; zero without one."""
+        """Return kappa(x) = -K (x - x*), the inner loop, for a heading; zero without one."""
         if self.inner is None:
             return jnp.zeros(len(model.input_names), x.dtype)
         rest, K = jnp.asarray(model.trim[0], x.dtype), jnp.asarray(self.inner, x.dtype)
-        # About the trim, where the loop gives nothing: the trim input stays the law's to add.
+        # About the trim, where the loop returns 0: the law adds the trim input.
         if heading is None:
             return -K @ model.difference(x, rest)
-        # T x* - x turned back, and the input turned forth again.
+        # The deviation is rotated into the axes of the trim, and the input back.
         away = model.difference(x, rotate_state(model, rest, heading))
         return -input_turn(model)(K @ state_turn(model)(away, -heading), heading)
 
@@ -93,16 +93,16 @@ class Gain(eqx.Module):
         """Return c R^-1 (g(x) S)'P error, a normalized input (m,), in the axes of a heading."""
         P, R_inverse = (jnp.asarray(part, x.dtype) for part in (self.P, self.R_inverse))
         if heading is None:
-            # From the right: vectors only, and in the precision of the states.
-            pulled = model.normalized_input_map(x).T @ (P @ error)
-            return self.coupling * (R_inverse @ pulled)
+            # Products from the right: vectors only, in the precision of the states.
+            weighted_inputs = model.normalized_input_map(x).T @ (P @ error)
+            return self.coupling * (R_inverse @ weighted_inputs)
         turn, turn_input = state_turn(model), input_turn(model)
         weighted = turn(P @ turn(error, -heading), heading)
-        pulled = turn_input(model.normalized_input_map(x).T @ weighted, -heading)
-        return self.coupling * turn_input(R_inverse @ pulled, heading)
+        weighted_inputs = turn_input(model.normalized_input_map(x).T @ weighted, -heading)
+        return self.coupling * turn_input(R_inverse @ weighted_inputs, heading)
 
     def turns(self, model: ControlAffine) -> bool:
-        """Tell whether it is another one in the axes of another heading of the model."""
+        """Tell whether the gain depends on the heading in whose axes it acts."""
         if model.heading is None:
             return False
         G, E = state_turn(model).slope, input_turn(model).slope
@@ -113,15 +113,15 @@ class Gain(eqx.Module):
 
 
 class Feedback(NamedTuple):
-    """What a method finds for one agent: the law u = u_ff - c R^-1 g'P z, but for c.
+    """The result of a method for one agent: the law u = u_ff - c R^-1 g'P z without c.
 
     Attributes:
         P: (n, n) symmetric positive definite, acting on states.
         R: (m, m) symmetric positive definite, acting on normalized inputs.
         rho: the strength 2 c lambda_min from which on P A + A'P - rho P B R^-1 B'P <= 0 at the trim
-            is guaranteed, so that the edge of the coupling is rho / (2 lambda_min); 0 where any
-            coupling does, None where none is known.
-        region: what is promised on a domain; None where nothing is.
+            is guaranteed, so that the smallest coupling is rho / (2 lambda_min); 0 where any
+            coupling suffices, None where no bound is known.
+        region: the guarantee on a domain; None without one.
         inner: (m, n) feedback K of an inner loop, closed in A; None without.
     """
 
@@ -133,32 +133,32 @@ class Feedback(NamedTuple):
 
 
 class Method(eqx.Module):
-    """A way to synthesize a gain; its arguments are its keys in a scenario.
+    """A synthesis method; its arguments are its keys in a scenario.
 
     Args:
-        coupling: c > 0; chosen by the edge when left out.
+        coupling: c > 0; by default a multiple of the smallest coupling that is guaranteed.
     """
 
     name: ClassVar[str] = ""
-    """What scenarios, tables and files call it; every method must say it."""
+    """Its name in scenarios, tables and files; required of every method."""
 
     needs: ClassVar[tuple[str, ...]] = ()
-    """Arguments that a scenario must give, though Python may have a default for them."""
+    """Arguments that a scenario must set, even where Python has a default."""
 
-    usual: ClassVar[Mapping[str, Any]] = {}
-    """What `design` gives of these where the scenario does not."""
+    defaults: ClassVar[Mapping[str, Any]] = {}
+    """Their values in `design` where the scenario does not set them."""
 
     headroom: ClassVar[float] = 2.0
-    """Without a coupling it is so many times the edge: at twice, half of lambda_min may go."""
+    """Default coupling as a multiple of the smallest; with 2, half of lambda_min may be lost."""
 
     free_coupling: ClassVar[float] = 1.0
-    """What it is without one where any will do, or where no edge is known."""
+    """Default coupling where any one suffices, or where no bound is known."""
 
     coupling: float | None = eqx.field(default=None, kw_only=True)
 
     @abc.abstractmethod
     def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
-        """Return what is found for one agent of a checked model, `linear` near its trim.
+        """Return the gain of one agent of a checked model, `linear` near its trim.
 
         Raises:
             GainError: the method does not apply, with the reason.
@@ -173,39 +173,39 @@ class Method(eqx.Module):
         """
         if self.coupling is not None:
             check_coupling(self.coupling)
-        # Every method works on the same A and B, of normalized inputs: entries of like size.
+        # Every method uses the same A and B, of normalized inputs: entries of similar size.
         linear = linearize(model)
-        P, R, rho, region, inner = self._found(model, linear)
-        # Before the certificate, which solves with R, and takes eigenvalues of what P makes.
+        P, R, rho, region, inner = self._checked_feedback(model, linear)
+        # Before the certificate, which solves with R and needs eigenvalues of products with P.
         check_definite("P", P)
         check_definite("R", R)
         if not spectrum.low > 0.0:
             raise GainError(
-                "the graph switches, and at some time no sum of errors' squares is held by it; use "
-                "the law `stopping-point`, or graphs that reach everybody and are undirected."
+                "the graph switches, and at some time no sum of errors' squares decreases; use the "
+                "law `stopping-point`, or undirected graphs in which leaders reach all agents."
             )
         # Re lambda >= lambda_min, so 2 c lambda_min >= rho is enough for every mode (theory, T7).
         edge = None if rho is None else rho / (2.0 * spectrum.low)
-        # A coupling of zero was refused above, and an edge of zero means that any coupling does.
+        # A coupling of zero was rejected above; an edge of zero means that any coupling suffices.
         coupling = self.coupling or self.headroom * (edge or 0.0) or self.free_coupling
         check_strength(coupling * spectrum.high, linear, P, R)
-        promised = None if region is None else region(coupling, spectrum)
-        # The consensus law acts on what the inner loop leaves: c scales no part of that loop.
+        guarantee = None if region is None else region(coupling, spectrum)
+        # The consensus law acts around the inner loop, which c does not scale.
         closed = linear.with_inner(inner)
-        certificate = certify(closed, spectrum, P, R, coupling, edge, promised)
+        certificate = certify(closed, spectrum, P, R, coupling, edge, guarantee)
         return Gain(P, R, coupling, self.name, certificate, inner)
 
-    def _found(self, model: ControlAffine, linear: Linearization) -> Feedback:
-        """Return what the method finds, after checking that it is what a method returns."""
-        found, name = self.feedback(model, linear), type(self).__name__
-        if not isinstance(found, Feedback):
+    def _checked_feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
+        """Return the result of `feedback`, after checking its type and shapes."""
+        result, name = self.feedback(model, linear), type(self).__name__
+        if not isinstance(result, Feedback):
             raise GainError(
-                f"`feedback` of `{name}` returns a `{type(found).__name__}`, and must return a "
+                f"`feedback` of `{name}` returns a `{type(result).__name__}`, and must return a "
                 "`Feedback`."
             )
         n, m = linear.B.shape
         for what, shape in (("P", (n, n)), ("R", (m, m)), ("inner", (m, n))):
-            matrix = getattr(found, what)
+            matrix = getattr(result, what)
             if what == "inner" and matrix is None:
                 continue
             if (got := np.shape(matrix)) != shape:  # type: ignore[arg-type]
@@ -213,30 +213,30 @@ class Method(eqx.Module):
                     f"`{what}` that `feedback` of `{name}` returns has shape {got}, "
                     f"and must have shape {shape}."
                 )
-        if found.rho is not None and not 0.0 <= found.rho < np.inf:
+        if result.rho is not None and not 0.0 <= result.rho < np.inf:
             raise GainError(
-                f"`rho` that `feedback` of `{name}` returns is {found.rho}, and must be finite "
+                f"`rho` that `feedback` of `{name}` returns is {result.rho}, and must be finite "
                 "and not negative."
             )
-        return found
+        return result
 
 
 def check_strength(strength: float, linear: Linearization, P: Array, R: Array) -> None:
-    """Check that what is fed back at a strength c lambda can be computed with.
+    """Check that the feedback at a strength c lambda does not overflow.
 
     Raises:
-        GainError: it cannot.
+        GainError: it does.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         fed_back = strength * (linear.B @ np.linalg.solve(R, linear.B.T @ P))
         # Norms square P B R^-1 B'P.
-        known = np.isfinite((P @ fed_back) ** 2).all()
-    if not known:
+        finite = np.isfinite((P @ fed_back) ** 2).all()
+    if not finite:
         size = f"{strength:.3g}" if strength < np.inf else "beyond all numbers"
         raise GainError(
-            f"the feedback is too strong to compute with: the coupling times the graph's largest "
-            f"eigenvalue is {size}, P goes up to {np.abs(P).max():.3g}; make `coupling`, "
-            "the edges' weights or P smaller."
+            f"the feedback is too large for floats: the coupling times the largest eigenvalue of "
+            f"the graph is {size}, and the largest entry of P is {np.abs(P).max():.3g}; make "
+            "`coupling`, the weights of edges or P smaller."
         )
 
 
@@ -264,14 +264,14 @@ def synthesize(model: ControlAffine, graph: Graph, method: Method) -> Gain:
         raise GainError(f"`method` is {got}, and must be a gain method such as `Riccati()`.")
     if not method.name:
         raise GainError(f"`{type(method).__name__}` has no `name`, and every gain method must.")
-    # JAX would differentiate in float32, which no test of stabilizability at 1e-9 survives.
     check_kind("graph", graph, Graph, GraphError)
     lost = lost_at_times(graph)
     if lost:
         raise GainError(
-            f"a gain needs a graph that reaches everybody at all times, and {lost}; add an edge "
-            "there, or use the law `stopping-point`, which waits for it."
+            f"a gain needs a graph in which leaders reach all agents at all times, and {lost}; add "
+            "an edge there, or use the law `stopping-point`, which does not need it."
         )
+    # In float32 derivatives are too coarse for a test of stabilizability at 1e-9.
     with precision("float64"):
         check_model(model)
         return method.solve(model, graph.spectrum())

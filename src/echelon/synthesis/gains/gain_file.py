@@ -1,4 +1,4 @@
-"""Gains as files: everything that the law needs to run, and what the gain was made for."""
+"""Gain files: a gain with its certificate, and the model and graph for which it was made."""
 
 import dataclasses
 import json
@@ -24,17 +24,17 @@ FORMAT = "echelon gain 2"
 _SAME = 1e-9
 """Relative difference beyond which two models or spectra are not the same."""
 _MOST_EDGES = 2000
-"""The edges of a larger graph are left out; its eigenvalues stand for it."""
+"""The file of a graph with more edges has only its eigenvalues."""
 
 _ENDS = {"lower": -np.inf, "upper": np.inf, "input_lower": 0.0, "input_upper": 0.0}
-"""The bounds of a domain, and what None stands for in each."""
+"""The bounds of a domain, and the value of None in each."""
 
 
 def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str, Any]:
-    """Return a gain ready for JSON: the law, and all that its certificate rests on.
+    """Return a gain ready for JSON, with the data of its certificate.
 
-    That is the model, the graph with its eigenvalues, the domain and the corners of the hull of
-    Jacobians; `verify` recomputes every promise from them. A bound that is infinite is None.
+    These are the model, the graph with its eigenvalues, the domain and the corners of the hull of
+    Jacobians; `verify` recomputes every guarantee from them. A bound that is infinite is None.
     """
     return {
         "format": FORMAT,
@@ -48,7 +48,7 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
             "agents": graph.agents,
             "leaders": list(graph.leaders),
             "edges": _edges(graph),
-            # Stored beside the edges: the checker compares them, and of a large graph it is all.
+            # Stored with the edges: the verifier compares them; a large graph has nothing else.
             "directed": graph.directed,
             "switches": graph.schedule is not None,
             "spectrum": _reals(graph.spectrum().eigenvalues),
@@ -59,14 +59,14 @@ def gain_as_mapping(gain: Gain, model: ControlAffine, graph: Graph) -> dict[str,
 
 
 def _reals(values: Array) -> list[Any]:
-    """Return numbers as JSON has them; complex ones as pairs."""
+    """Return numbers for JSON, complex ones as pairs."""
     if not np.iscomplexobj(values):
         return values.tolist()
     return [[float(x.real), float(x.imag)] for x in values]
 
 
 def _sums(graph: Graph) -> list[float] | None:
-    """Return the weights of followers in the sum that falls; None where all are 1."""
+    """Return the weights of followers in the decreasing sum; None where all are 1."""
     sums = graph.spectrum().sums
     return None if sums is None else sums.tolist()
 
@@ -75,7 +75,7 @@ def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
     linear = linearize(model)
     return {
         "class": _public_path(type(model)),
-        # The checker makes a bundled model again from them; one of the user's own it never imports.
+        # The verifier rebuilds a bundled model from them; it never imports a user's model.
         "parameters": _parameters(model),
         "state_names": list(model.state_names),
         "input_names": list(model.input_names),
@@ -87,7 +87,7 @@ def _model_as_mapping(model: ControlAffine) -> dict[str, Any]:
 
 
 def _public_path(cls: type) -> str:
-    """Return where a class is found: a bundled one by its public name, which no move changes."""
+    """Return the import path of a class; of a bundled one its public name, which never changes."""
     if getattr(models, cls.__name__, None) is cls:
         return f"echelon.models:{cls.__name__}"
     return f"{cls.__module__}:{cls.__qualname__}"
@@ -99,7 +99,7 @@ def _parameters(model: ControlAffine) -> dict[str, Any] | None:
     stored = {name: getattr(model, name) for name in fields}
     try:
         return json.loads(
-            # By way of JSON itself, so that what is stored is what will be read.
+            # Through JSON itself, so that the values are those that will be read.
             json.dumps(stored, allow_nan=False, default=lambda x: np.asarray(x).tolist())
         )
     except (TypeError, ValueError):
@@ -134,7 +134,7 @@ def _region_as_mapping(region: RegionCertificate) -> dict[str, Any]:
         "rate": region.rate,
         "radius": region.radius,
         "strength": region.strength,
-        # JSON has no infinity, and a file that only Python can read would be no file for others.
+        # JSON has no infinity, which only Python would read.
         "domain": {name: _finite(getattr(domain, name)) for name in _ENDS},
         "hull": _pack(region.hull),
         "error": region.error.tolist(),
@@ -146,7 +146,7 @@ def _finite(bounds: Array) -> list[float | None]:
 
 
 def _pack(matrices: Array) -> dict[str, Any]:
-    """Return many matrices as one, and what of it changes: most entries are the same in all."""
+    """Return matrices as the first one and the entries that vary; most are the same in all."""
     # A vehicle's hull has thousands of corners that differ in a few entries of (n, n) or (n, 2n).
     places = np.argwhere((matrices != matrices[0]).any(axis=0))
     values = matrices[:, places[:, 0], places[:, 1]]
@@ -169,7 +169,7 @@ def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) ->
         OutputError: the file cannot be written.
     """
     stored = gain_as_mapping(gain, model, graph)
-    # A line a key: a diff then shows what changed. NaN is refused, since no promise rests on one.
+    # A line per key, so that a diff shows the change. NaN is rejected: no guarantee rests on one.
     lines = [f"{json.dumps(key)}: {json.dumps(stored[key], allow_nan=False)}" for key in stored]
     try:
         write_atomic(Path(path), "{\n" + ",\n".join(lines) + "\n}\n")
@@ -178,7 +178,7 @@ def save_gain(gain: Gain, model: ControlAffine, graph: Graph, path: PathLike) ->
 
 
 def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
-    """Return the gain of a file, for the model and the graph that it was made for.
+    """Return the gain of a file, for the model and the graph for which it was made.
 
     Raises:
         GainError: the file is no gain, holds a number that is not finite, or was made for another
@@ -189,9 +189,9 @@ def load_gain(path: PathLike, model: ControlAffine, graph: Graph) -> Gain:
         _check_model(path, stored["model"], model)
         _check_graph(path, stored["graph"], graph)
         gain = _gain(stored)
-    # What a hand has changed in the file fails somewhere in here, in one of these ways.
+    # An edited file fails here with one of these errors.
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise GainError(f"`{path}` is no gain that echelon wrote: {error}.") from error
+        raise GainError(f"`{path}` is no gain file of echelon: {error}.") from error
     check_strength(gain.coupling * graph.spectrum().high, linearize(model), gain.P, gain.R)
     return gain
 
@@ -215,16 +215,16 @@ def _read(path: PathLike) -> Mapping[str, Any]:
 
 
 def _mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a mapping; of two equal keys one reader takes the first and another the last."""
-    told = dict(pairs)
-    if len(told) < len(pairs):
+    """Return a mapping; readers differ in which of two equal keys they take, so it rejects them."""
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         names = [key for key, _ in pairs]
-        raise ValueError(f"`{next(k for k in names if names.count(k) > 1)}` stands there twice")
-    return told
+        raise ValueError(f"it has the key `{next(k for k in names if names.count(k) > 1)}` twice")
+    return mapping
 
 
 def _gain(stored: Mapping[str, Any]) -> Gain:
-    # `Gain` and `Certificate` take no words of the file on trust: names become members here.
+    # Names in the file become members of enumerations here, so that unknown ones are rejected.
     inner, certificate = stored["inner"], stored["certificate"]
     region = None if certificate["region"] is None else _region(certificate["region"])
     numbers = {
@@ -288,7 +288,7 @@ def _check_model(path: PathLike, stored: Mapping[str, Any], model: ControlAffine
                 f"the gain in `{path}` was made for `{made_for}` with {what} "
                 f"{list(stored[what])}, and the model is {name} with {list(ours)}."
             )
-    # Class and parameters may differ: near the trim a gain knows a model by these numbers alone.
+    # Class and parameters may differ: near the trim only these numbers matter to a gain.
     compared = {
         "input_scale": (stored["input_scale"], model.input_scale),
         "the trim input": (stored["trim"][1], model.trim[1]),
@@ -311,10 +311,10 @@ def _check_graph(path: PathLike, stored: Mapping[str, Any], graph: Graph) -> Non
     values, spectrum = stored["spectrum"], graph.spectrum()
     sizes = [abs(complex(*x)) if isinstance(x, list) else float(x) for x in values]
     low = values[0][0] if isinstance(values[0], list) else float(values[0])
-    # Of graphs that take turns it is no eigenvalue.
+    # For switching graphs it is no eigenvalue.
     low = spectrum.low if spectrum.weakest is not None else low
     ends = {"lambda_min": (low, spectrum.low), "lambda_max": (max(sizes), spectrum.high)}
-    # The ends bound every mode, so a coupling fits all networks that share them.
+    # The extreme eigenvalues bound every mode, so a coupling fits all graphs that share them.
     for what, (theirs, ours) in ends.items():
         if not abs(theirs - ours) <= _SAME * ours:
             raise GainError(

@@ -1,4 +1,4 @@
-"""An inner loop that makes the paper's Assumption 5 hold, and the monotone P that comes with it."""
+"""An inner loop with which the paper's Assumption 5 holds, and its monotone P."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from echelon.synthesis.gains.gain import Feedback, Method
 from echelon.synthesis.gains.weights import weights_of
 
 _SAMPLES = 16
-"""Random states; more than one, since a drift may be flat on one side of a threshold."""
+"""Random states; several, since a drift may be constant on one side of a threshold."""
 
 
 class InnerLoop(Method):
@@ -28,11 +28,11 @@ class InnerLoop(Method):
 
     Args:
         Q, R: weights of states and normalized inputs that shape the inner loop, by the Riccati
-            equation of the other states. With neither it is the model's own `damping`; the model's
-            own weights stand for what is left out otherwise, or where it has none.
-        coupling: c > 0; any is stable, and it sets the rate; 3 when left out.
-        symmetry_weight: weight of the symmetric states in P, one number each or one for all; the
-            model's own when left out.
+            equation of the other states. With neither it is the model's `damping`, if it has one;
+            a weight left out is the model's.
+        coupling: c > 0; any is stable, and it sets the rate; 3 by default.
+        symmetry_weight: weight of the symmetric states in P, one number each or one for all; by
+            default the model's.
     """
 
     name = "inner-loop"
@@ -43,7 +43,7 @@ class InnerLoop(Method):
     symmetry_weight: tuple[float, ...] | float | None = None
 
     def feedback(self, model: ControlAffine, linear: Linearization) -> Feedback:
-        """Return the inner loop, and a P that what it leaves of the drift does not expand.
+        """Return the inner loop, and a P that the drift with this loop does not expand.
 
         Raises:
             GainError: no state is symmetric, the other states cannot be stabilized, or a weight is
@@ -52,39 +52,39 @@ class InnerLoop(Method):
         fixed = symmetric_states(model)
         if not fixed:
             raise GainError(
-                f"`{type(model).__name__}` has no state that its dynamics ignore, so an inner loop "
-                "has nothing to leave alone; use `monotone` or `riccati`."
+                f"`{type(model).__name__}` has no symmetric state, one that does not enter its "
+                "dynamics, which the method `inner-loop` needs; use `monotone` or `riccati`."
             )
         K = self._feedback(model, linear, fixed)
         P = _monotone(model, linear.with_inner(K).A, fixed, self._weights(model, len(fixed)))
-        # P A + A'P <= 0 without any feedback, so that every coupling keeps it: rho is 0.
-        # Any R keeps that too; it bounds how fast an input answers where the agent is turned.
+        # P A + A'P <= 0 without any feedback, so it holds with every coupling: rho is 0. It holds
+        # with any R too, which limits how fast an input responds where the agent is tilted.
         R = np.diag(model.symmetry_inputs or np.ones(len(model.input_names)))
         return Feedback(P, R, rho=0.0, inner=K)
 
     def _feedback(self, model: ControlAffine, linear: Linearization, fixed: list[int]) -> Array:
         """Return K (m, n), zero in the columns of the symmetric states."""
-        # A Riccati equation knows no actuators' limits; a model's own damping minds them.
+        # A Riccati equation ignores actuator limits; the damping of a model respects them.
         if self.Q is None and self.R is None and model.damping is not None:
             return np.asarray(model.damping, float)
         free = _others(model, fixed)
         Q, R = weights_of(model, self.Q, self.R)
         A, B = linear.A[np.ix_(free, free)], linear.B[free]
-        # Zero columns: a loop that felt a position would make its offsets no symmetries (Lemma 4).
+        # Zero columns: with position feedback the offsets were no symmetries (Lemma 4).
         K = np.zeros((len(model.input_names), len(model.state_names)))
         K[:, free] = np.linalg.solve(R, B.T @ riccati(A, B, Q[np.ix_(free, free)], R))
         return K
 
     def _weights(self, model: ControlAffine, count: int) -> Array:
         """Return the weights of the symmetric states, (count,)."""
-        given = model.symmetry_weights if self.symmetry_weight is None else self.symmetry_weight
+        chosen = model.symmetry_weights if self.symmetry_weight is None else self.symmetry_weight
         try:
-            weights = np.asarray(1.0 if given is None else given, float)
+            weights = np.asarray(1.0 if chosen is None else chosen, float)
         except (TypeError, ValueError):
             weights = np.array(np.nan)
         if weights.shape not in ((), (count,)) or not ((weights > 0.0) & (weights < np.inf)).all():
             raise GainError(
-                f"`symmetry_weight` is {given}, and must be one positive number, or {count}, one "
+                f"`symmetry_weight` is {chosen}, and must be one positive number, or {count}, one "
                 "for each symmetric state."
             )
         return np.broadcast_to(weights, (count,))
@@ -93,10 +93,10 @@ class InnerLoop(Method):
 def symmetric_states(model: ControlAffine) -> list[int]:
     """Return the indices of states on which neither f nor g depends (tested at random states)."""
     base = np.asarray(model.trim[0], float)
-    # Half a unit about the trim stays inside the charts of angles; a fixed seed, one answer.
+    # Half a unit about the trim stays inside the charts of angles; a fixed seed for one answer.
     states = base + np.random.default_rng(0).uniform(-0.5, 0.5, (_SAMPLES, len(base)))
     slopes = np.asarray(_sensitivity(model, jnp.asarray(states)))
-    # Exactly zero: a state that the code does not use has a derivative of zero, without rounding.
+    # Exactly zero: the derivative in a state that the code does not use has no rounding.
     return [k for k in range(len(base)) if slopes[k] == 0.0]
 
 
@@ -118,11 +118,11 @@ def _others(model: ControlAffine, fixed: list[int]) -> list[int]:
 def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) -> Array:
     """Return P = T^-T diag(weights, P_s) T^-1, with P_s from a Lyapunov equation.
 
-    T^-1 takes the symmetric states to coordinates that stand still when the rest decays.
+    T^-1 maps the symmetric states to coordinates that stay constant while the rest decays.
     """
     free = _others(model, fixed)
     inner = A[np.ix_(free, free)]
-    # With no other states nothing is left to decay, and -1 stands for any mode that does.
+    # Without other states nothing needs to decay; -1 stands for a mode that does.
     slow = np.linalg.eigvals(inner).real.max() if free else -1.0
     if slow >= 0.0:
         names = listing(model.state_names[k] for k in free)
@@ -133,7 +133,7 @@ def _monotone(model: ControlAffine, A: Array, fixed: list[int], weights: Array) 
     # The columns of the symmetric states are zero in A, so y = x_f - A_fs A_ss^-1 x_s has ydot = 0.
     T_inverse[np.ix_(fixed, free)] = -A[np.ix_(fixed, free)] @ np.linalg.inv(inner)
     core = np.zeros_like(A)
-    # Any positive weights keep V from rising, since y stands still; they set rates alone.
+    # With any positive weights V does not rise, since y is constant; they only set rates.
     core[fixed, fixed] = weights
     core[np.ix_(free, free)] = scipy.linalg.solve_continuous_lyapunov(inner.T, -np.eye(len(free)))
     # P A + A'P = T^-T diag(0, -I) T^-1 <= 0. Rounding leaves it a little off symmetry.

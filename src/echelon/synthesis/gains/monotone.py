@@ -22,7 +22,7 @@ class Monotone(Method):
 
     Args:
         domain: half-widths, or (lower, upper), by state or group.
-        coupling: c > 0; any keeps V from rising, and it is 1 when left out.
+        coupling: c > 0; V does not rise with any; 1 by default.
     """
 
     name = "monotone"
@@ -39,9 +39,9 @@ class Monotone(Method):
             MissingExtraError: the solver is not installed.
         """
         domain = the_domain(model, self.domain)
-        found = jacobians(model, domain)
-        # Corners are enough: P A + A'P is affine in A, and the hull holds every Jacobian.
-        P = monotone(found.matrices, names=model.state_names).P
-        region = partial(drift_region, model, domain, found, P)
-        # The feedback only adds a negative square to V', whatever c and R are: rho = 0, R = I.
+        hull = jacobians(model, domain)
+        # Vertices suffice: P A + A'P is affine in A, and the hull contains every Jacobian.
+        P = monotone(hull.matrices, names=model.state_names).P
+        region = partial(drift_region, model, domain, hull, P)
+        # The feedback adds a negative square to V' for any c and R: rho = 0, R = I.
         return Feedback(P, np.eye(len(model.input_names)), 0.0, region)

@@ -16,9 +16,9 @@ class Riccati(Method):
     """P from A'P + P A + Q - P B R^-1 B'P = 0 at the trim, in normalized inputs.
 
     Args:
-        Q: state weight, n numbers or (n, n); the model's own when left out.
-        R: weight of the normalized input, m numbers or (m, m); the model's own when left out.
-        coupling: c > 0; 1/lambda_min when left out, twice the edge 1/(2 lambda_min) of the
+        Q: state weight, n numbers or (n, n); by default the model's.
+        R: weight of the normalized input, m numbers or (m, m); by default the model's.
+        coupling: c > 0; by default 1/lambda_min, twice the smallest 1/(2 lambda_min) of the
             guarantee for linear agents.
     """
 
@@ -43,9 +43,9 @@ class Riccati(Method):
 def _check_stabilizable(model: ControlAffine, linear: Linearization) -> None:
     """Name the first mode that no input can move and that does not decay by itself."""
     for eigenvalue, direction in uncontrollable_modes(*linear):
-        # A mode that decays by itself needs no input: (A, B) need not be controllable.
+        # A mode that decays needs no input: (A, B) need not be controllable.
         if eigenvalue.real >= 0.0:
-            # A combination w'x stays unmoved; entries of rounding's size would name every state.
+            # The mode is a combination w'x; entries of the size of rounding are left out.
             used = np.abs(direction) > 0.1 * np.abs(direction).max()
             states = listing(itertools.compress(model.state_names, used))
             raise GainError(

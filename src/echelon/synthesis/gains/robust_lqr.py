@@ -20,9 +20,9 @@ class RobustLQR(Method):
 
     Args:
         domain: half-widths, or (lower, upper), by state, group or normalized input.
-        Q: state weight; the model's own when left out.
-        R: weight of the normalized input; the model's own when left out.
-        coupling: c > 0; 1/lambda_min when left out, twice what the inequality needs.
+        Q: state weight; by default the model's.
+        R: weight of the normalized input; by default the model's.
+        coupling: c > 0; by default 1/lambda_min, twice what the inequality needs.
         exact: whether to prove the rate in exact arithmetic where g is constant.
     """
 
@@ -42,10 +42,10 @@ class RobustLQR(Method):
             MissingExtraError: the solver is not installed.
         """
         Q, R = weights_of(model, self.Q, self.R)
-        # The rate is at least half the least eigenvalue of P^-1 Q: a Q with a kernel promises none.
+        # The rate is at least half the smallest eigenvalue of P^-1 Q, which a singular Q makes 0.
         check_definite("Q", Q)
         pairs = pairs_on(model, self.domain, R)
-        # Where g varies, W replaces B R^-1 B' corner by corner: at the trim's alone the rate would
-        # be too good.
+        # Where g varies, W replaces B R^-1 B' at each corner: with that of the trim the rate would
+        # be too large.
         P = robust_lqr(pairs.A, linear.B, Q, R, pairs.W).P
         return Feedback(P, R, 1.0, partial(contracting_region, pairs, P, linear.B, R, self.exact))

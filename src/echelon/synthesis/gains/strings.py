@@ -1,4 +1,4 @@
-"""What a branch amplifies where each agent is fed its parent's input."""
+"""String stability: the amplification along a branch of a tree."""
 
 import numpy as np
 
@@ -15,21 +15,20 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
     A, B = linearize(model).with_inner(gain.inner)
     depth, parents = graph.depths(), graph.parents()
     i, j = graph.edges.T
-    heard = "heard one way" if graph.directed else "with the parent's input fed forward"
-    # An edge belongs to its end that is farther out; one between leaders lands on a leader, and
-    # leaders are left out below.
+    feedforward = "along arrows" if graph.directed else "with the parent's input fed forward"
+    # An edge belongs to its end farther from the leaders; leaders are left out below.
     weight = np.ones(graph.agents)
     weight[j if graph.directed else np.where(depth[i] > depth[j], i, j)] = graph.weights
     used = np.unique(weight[list(graph.followers)])
     try:
-        # Links of one weight are alike, and each gain is a sweep over frequencies.
+        # Links of equal weight have equal gains, and each gain needs a sweep over frequencies.
         gains = [
             string_gain(ClosedLoop(A, B, gain.P, gain.R, gain.coupling * w, used)).gain
             for w in used
         ]
     except GainError:
         return (
-            f"{heard}, coupling {gain.coupling:.4g} times an edge's "
+            f"{feedforward}, coupling {gain.coupling:.4g} times an edge's "
             f"weight, {used[0]:.4g}, is too weak: a mode of the formation does not decay.",
         )
     growth = np.ones(graph.agents)
@@ -39,7 +38,7 @@ def string_growth(gain: Gain, model: ControlAffine, graph: Graph) -> tuple[str, 
             growth[agent] = growth[parents[agent]] * gains[np.searchsorted(used, weight[agent])]
     worst = int(growth.argmax())
     return (
-        f"{heard}, each agent of a branch amplifies a push by up to "
+        f"{feedforward}, each agent of a branch amplifies a push by up to "
         f"||T|| = {max(gains):.3g}, and the {depth[worst]} agents up from agent {worst} by up to "
         f"{growth[worst]:.3g}; a stronger coupling brings ||T|| nearer to 1.",
     )

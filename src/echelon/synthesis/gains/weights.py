@@ -14,7 +14,7 @@ def weights_of(
     """Return Q (n, n) of the states and R (m, m) of the normalized inputs.
 
     Args:
-        model: whose own weights stand for what is left out.
+        model: its weights are the defaults.
         Q: n numbers (a diagonal) or (n, n).
         R: m numbers (a diagonal) or (m, m).
 
@@ -22,11 +22,11 @@ def weights_of(
         GainError: one has another size, Q is not symmetric positive semidefinite, or R is not
             symmetric positive definite.
     """
-    own_Q, own_R = model.weights
-    Q = as_matrix("Q", own_Q if Q is None else Q, len(model.state_names))
-    R = as_matrix("R", own_R if R is None else R, len(model.input_names))
+    default_Q, default_R = model.weights
+    Q = as_matrix("Q", default_Q if Q is None else Q, len(model.state_names))
+    R = as_matrix("R", default_R if R is None else R, len(model.input_names))
     check_definite("R", R)
-    # R must be inverted and so is definite; Q may leave states free that decay by themselves.
+    # R is inverted, so it must be definite; Q may have zero weights for states that decay.
     _check_semidefinite(Q)
     return Q, R
 
@@ -35,7 +35,7 @@ def _check_semidefinite(Q: Array) -> None:
     if not np.isfinite(Q).all() or not np.allclose(Q, Q.T, rtol=1e-9, atol=0.0):
         raise GainError("`Q` must be a symmetric matrix of finite numbers.")
     least = float(np.linalg.eigvalsh(Q)[0])
-    # A Q of lower rank, such as C'C, has eigenvalues that rounding makes a little negative.
+    # Rounding makes zero eigenvalues of a Q of lower rank, such as C'C, slightly negative.
     if least < -1e-12 * max(1.0, float(np.abs(Q).max())):
         raise GainError(
             f"`Q` is not positive semidefinite: its smallest eigenvalue is {least:.6g}."
