@@ -20,13 +20,22 @@ _AHEAD, _PLACES = 60.0, 121
 _BLOCK = 32
 """Frames for which V is computed at once: a constant, so that it is compiled once."""
 
+_NO_PROMISE: JsonObject = {
+    "promised": False,
+    "rate": None,
+    "theorem": None,
+    "sentence": "",
+    "kind": "",
+    "hypotheses": (),
+}
+
 
 def foreseen(
     parts: Parts,
     settings: Settings,
     states: Float[Array, "N n"],
     name: str,
-    promise: JsonObject,
+    promise: JsonObject = _NO_PROMISE,
 ) -> Recording:
     """Return a recording of agents that stay at their goals, by which the scene is sized.
 
@@ -35,7 +44,7 @@ def foreseen(
         settings: of the run.
         states: at the beginning.
         name: of the scenario.
-        promise: as `Promise.as_mapping` returns it.
+        promise: as `Promise.as_mapping` returns it; none by default.
     """
     model, graph = parts.model, parts.graph
     times = np.linspace(0.0, min(_AHEAD, max(settings.horizon, 10.0)), _PLACES)
